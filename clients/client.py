@@ -1,0 +1,262 @@
+"""A typed, asynchronous client of the gateway."""
+
+from __future__ import annotations
+
+import json
+from collections.abc import Mapping, Sequence
+from dataclasses import dataclass
+from types import TracebackType
+from typing import Any
+
+import httpx
+import numpy as np
+
+from clients.errors import GatewayUnreachable, ProtocolError, refusal
+from robosac import wire
+from robosac.boxes import FloatArray
+from robosac.detectors import Message
+
+MSGPACK = "application/vnd.msgpack"
+DEFAULT_TIMEOUT_S = 30.0
+
+
+@dataclass(frozen=True)
+class OpenedSession:
+    """A new session and the tokens of its vehicles."""
+
+    session_id: str
+    ego_token: str
+    teammate_tokens: Mapping[str, str]
+    detector: Mapping[str, Any]
+    defense: Mapping[str, Any]
+
+
+@dataclass(frozen=True)
+class FrameAnswer:
+    """The gateway's answer to a frame.
+
+    Attributes
+    ----------
+    frame : int
+    boxes : (n, 6) float64 ndarray
+        x, y, length, width, yaw, score; ego frame.
+    source : str
+        ``consensus``, ``trusted`` or ``ego_only``.
+    accepted : tuple of str
+    rejected : mapping of vehicle id to mapping
+        ``reason`` and evidence.
+    hypotheses : list of mapping
+        ``teammates``, ``jaccard_index``, ``verdict``.
+    sampling_steps : int
+    deadline_met : bool
+    timings_ms : mapping of stage to float
+    """
+
+    frame: int
+    boxes: FloatArray
+    source: str
+    accepted: tuple[str, ...]
+    rejected: Mapping[str, Mapping[str, Any]]
+    hypotheses: list[Mapping[str, Any]]
+    sampling_steps: int
+    deadline_met: bool
+    timings_ms: Mapping[str, float]
+
+    @classmethod
+    def parse(cls, fields: Mapping[str, Any]) -> FrameAnswer:
+        """Read a frame result.
+
+        Raises
+        ------
+        ProtocolError
+            If a field is missing or of the wrong kind.
+        """
+        try:
+            return cls(
+                frame=int(fields["frame"]),
+                boxes=np.array(fields["boxes"], dtype=np.float64).reshape(-1, 6),
+                source=str(fields["source"]),
+                accepted=tuple(fields["accepted"]),
+                rejected={entry["vehicle_id"]: entry for entry in fields["rejected"]},
+                hypotheses=list(fields["hypotheses"]),
+                sampling_steps=int(fields["sampling_steps"]),
+                deadline_met=bool(fields["deadline_met"]),
+                timings_ms=dict(fields["timings_ms"]),
+            )
+        except (KeyError, TypeError, ValueError) as error:
+            raise ProtocolError(f"not a frame result: {error!r}") from error
+
+
+class GatewayClient:
+    """A connection to a gateway; an asynchronous context manager.
+
+    Parameters
+    ----------
+    base_url : str
+    timeout_s : float
+        For one request.
+    transport : httpx.AsyncBaseTransport, optional
+        For tests: `httpx.ASGITransport` talks to an app without a socket.
+
+    Examples
+    --------
+    ::
+
+        async with GatewayClient("http://127.0.0.1:8000") as gateway:
+            session = await gateway.open_session("car-1", ["car-2", "rsu"])
+            ego = gateway.vehicle(session.session_id, "car-1", session.ego_token)
+            answer = await ego.post_frame(0, own_message, {"car-2": message})
+    """
+
+    def __init__(
+        self, base_url: str, timeout_s: float = DEFAULT_TIMEOUT_S, transport: httpx.AsyncBaseTransport | None = None
+    ) -> None:
+        limits = httpx.Limits(max_connections=None, max_keepalive_connections=256)
+        self._http = httpx.AsyncClient(
+            base_url=base_url, timeout=timeout_s, limits=limits, transport=transport, trust_env=False
+        )
+
+    async def __aenter__(self) -> GatewayClient:
+        return self
+
+    async def __aexit__(
+        self, kind: type[BaseException] | None, error: BaseException | None, trace: TracebackType | None
+    ) -> None:
+        await self.aclose()
+
+    async def aclose(self) -> None:
+        """Close all connections."""
+        await self._http.aclose()
+
+    async def ready(self) -> bool:
+        """Whether the gateway is up and warm."""
+        try:
+            return (await self._http.get("/readyz")).status_code == 200
+        except httpx.HTTPError:
+            return False
+
+    async def detectors(self) -> list[Mapping[str, Any]]:
+        """The gateway's detectors and their message layouts."""
+        return list(_json(await self._request("GET", "/v1/detectors"))["detectors"])
+
+    async def open_session(
+        self,
+        ego_id: str,
+        teammates: Sequence[str],
+        *,
+        detector: str | None = None,
+        defense: Mapping[str, Any] | None = None,
+        latency_budget_ms: float | None = None,
+        gather_ms: float | None = None,
+    ) -> OpenedSession:
+        """Open a session; what is None is left to the gateway."""
+        options = {
+            "detector": detector,
+            "defense": defense,
+            "latency_budget_ms": latency_budget_ms,
+            "gather_ms": gather_ms,
+        }
+        body: dict[str, Any] = {"ego_id": ego_id, "teammates": list(teammates)}
+        body |= {name: value for name, value in options.items() if value is not None}
+        fields = _json(await self._request("POST", "/v1/sessions", json=body))
+        try:
+            return OpenedSession(
+                fields["session_id"],
+                fields["ego_token"],
+                fields["teammate_tokens"],
+                fields["detector"],
+                fields["defense"],
+            )
+        except KeyError as error:
+            raise ProtocolError(f"not a new session: {error!r} is missing") from error
+
+    def vehicle(self, session_id: str, vehicle_id: str, token: str) -> VehicleClient:
+        """The client of one vehicle in a session."""
+        return VehicleClient(self._request, session_id, vehicle_id, token)
+
+    async def _request(self, method: str, path: str, **options: Any) -> httpx.Response:
+        try:
+            response = await self._http.request(method, path, **options)
+        except httpx.HTTPError as error:
+            raise GatewayUnreachable(f"{method} {path}: {type(error).__name__} {error}") from error
+        if response.is_success:
+            return response
+        try:
+            problem = response.json()
+        except ValueError:
+            problem = {}
+        retry = response.headers.get("retry-after", "")
+        raise refusal(response.status_code)(
+            response.status_code,
+            str(problem.get("type", "about:blank")),
+            str(problem.get("detail", response.reason_phrase)),
+            problem.get("field"),
+            float(retry) if retry.isdecimal() else None,
+        )
+
+
+class VehicleClient:
+    """One vehicle in a session, speaking with its own token.
+
+    Made by `GatewayClient.vehicle`. A teammate can only `send`; the ego may call everything.
+    """
+
+    def __init__(self, request: Any, session_id: str, vehicle_id: str, token: str) -> None:
+        self.session_id = session_id
+        self.vehicle_id = vehicle_id
+        self._request = request
+        self._path = f"/v1/sessions/{session_id}"
+        self._bearer = {"Authorization": f"Bearer {token}"}
+        self._tensors = {**self._bearer, "Content-Type": MSGPACK, "Accept": MSGPACK}
+
+    async def send(self, frame: int, message: Message) -> None:
+        """As a teammate: post the own message for a frame."""
+        await self.send_body(wire.pack_message(frame, self.vehicle_id, message))
+
+    async def send_body(self, body: bytes) -> None:
+        """As `send`, with a body that is packed already."""
+        await self._request("POST", f"{self._path}/messages", content=body, headers=self._tensors)
+
+    async def ask(self, frame: int, message: Message) -> FrameAnswer:
+        """As the ego: post the own message and get the frame's answer, once the teammates' messages are in."""
+        body = wire.pack_message(frame, self.vehicle_id, message)
+        return _answer(await self._request("POST", f"{self._path}/messages", content=body, headers=self._tensors))
+
+    async def post_frame(self, frame: int, ego: Message, teammates: Mapping[str, Message]) -> FrameAnswer:
+        """As the ego: post a whole frame."""
+        return await self.post_frame_body(wire.pack_frame(frame, ego, teammates))
+
+    async def post_frame_body(self, body: bytes) -> FrameAnswer:
+        """As `post_frame`, with a body that is packed already."""
+        return _answer(await self._request("POST", f"{self._path}/frames", content=body, headers=self._tensors))
+
+    async def state(self) -> Mapping[str, Any]:
+        """As the ego: the session's state."""
+        return _json(await self._request("GET", self._path, headers=self._bearer))
+
+    async def audit(self, after: int = 0) -> list[Mapping[str, Any]]:
+        """As the ego: audit records with a number above ``after``."""
+        response = await self._request("GET", f"{self._path}/audit", params={"after": after}, headers=self._bearer)
+        return [json.loads(line) for line in response.text.splitlines()]
+
+    async def close(self) -> None:
+        """As the ego: end the session."""
+        await self._request("DELETE", self._path, headers=self._bearer)
+
+
+def _answer(response: httpx.Response) -> FrameAnswer:
+    try:
+        fields = wire.unpack(response.content, max_items=2**20, max_string=2**20)
+    except wire.WireError as error:
+        raise ProtocolError(str(error)) from error
+    return FrameAnswer.parse(fields)
+
+
+def _json(response: httpx.Response) -> Mapping[str, Any]:
+    try:
+        fields = response.json()
+    except ValueError as error:
+        raise ProtocolError(f"not JSON: {error}") from error
+    if not isinstance(fields, dict):
+        raise ProtocolError("not a JSON object")
+    return fields

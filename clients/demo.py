@@ -1,0 +1,63 @@
+"""A gateway and a hostile fleet, from start to end: ``python -m clients.demo``."""
+
+from __future__ import annotations
+
+import asyncio
+import sys
+from pathlib import Path
+from typing import Annotated
+
+import typer
+from rich.console import Console
+
+from clients.errors import GatewayError
+from clients.fleet import FleetOptions, close_run, run_fleet
+from clients.local_gateway import local_gateway
+from clients.summary import FleetSummary
+
+CLEAN_SHARE = 0.95
+
+
+def main(
+    report: Annotated[Path, typer.Option(help="Folder for the summary, the picture and the gateway's log.")],
+    scenes: Annotated[int, typer.Option(min=1, help="Sequences.")] = 8,
+    frames: Annotated[int, typer.Option(min=1, help="Frames of a sequence.")] = 25,
+) -> None:
+    """Start a gateway, drive six vehicles through it, one of them a PGD attacker, and show what came of it.
+
+    Exits with 1 if anything failed, or if the attacker got into more than 5 % of the answers.
+    """
+    console = Console()
+    try:
+        options, summary = asyncio.run(_run(report, scenes, frames, console))
+    except (GatewayError, OSError) as error:
+        console.print(f"[red]The demo failed:[/red] {error}")
+        sys.exit(1)
+    close_run(options, summary, console)
+    if summary.clean_share < CLEAN_SHARE:
+        console.print(f"[red]The demo failed:[/red] expected no attacker in at least {CLEAN_SHARE:.0%} of the answers.")
+        sys.exit(1)
+
+
+async def _run(report: Path, scenes: int, frames: int, console: Console) -> tuple[FleetOptions, FleetSummary]:
+    console.print("Starting the gateway (uvicorn service.app:app) ...")
+    async with local_gateway(report / "gateway.log") as url:
+        console.print(f"It is ready at {url}. Six vehicles, one of them a PGD attacker, post feature maps at 5 Hz.")
+        options = FleetOptions(
+            url=url,
+            scenes=scenes,
+            frames=frames,
+            first_scene=0,
+            egos=1,
+            attackers=1,
+            attack="pgd",
+            defense={"kind": "sample_consensus", "attacker_ratio": 0.2, "sampling_budget": 7, "collaborators": 3},
+            seed=0,
+            real_time=False,
+            report=report,
+        )
+        return options, await run_fleet(options, console)
+
+
+if __name__ == "__main__":
+    typer.run(main)

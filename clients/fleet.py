@@ -1,0 +1,236 @@
+"""A simulated fleet as independent HTTP clients: ``python -m clients.fleet``."""
+
+from __future__ import annotations
+
+import asyncio
+import sys
+import time
+from collections import deque
+from dataclasses import dataclass
+from pathlib import Path
+from typing import Annotated, Any
+
+import typer
+from rich.console import Console, Group
+from rich.live import Live
+from rich.progress import BarColumn, MofNCompleteColumn, Progress, TextColumn, TimeRemainingColumn
+from rich.table import Table
+
+from clients.client import FrameAnswer, GatewayClient, OpenedSession
+from clients.errors import GatewayError
+from clients.simulation import EgoFrame, Fleet
+from clients.summary import FleetSummary
+from robosac.attacks import ATTACKS
+from robosac.detectors import load
+from robosac.scenes import FRAME_PERIOD_S, IntersectionScene
+
+RECENT = 12
+
+
+@dataclass(frozen=True)
+class FleetOptions:
+    """What a run does.
+
+    Attributes
+    ----------
+    url : str
+    scenes, frames : int
+        Sequences, and frames of each at 5 Hz of simulated time.
+    first_scene : int
+        Seed of the first scene; the others follow.
+    egos, attackers : int
+    attack : str
+    defense : mapping
+        The ``defense`` of the sessions.
+    seed : int
+        Of the choice of attackers and of their random starts.
+    real_time : bool
+        Hold the frames to 5 Hz of the clock, where the machine can keep up.
+    report : Path or None
+        Folder for the summary and the picture.
+    """
+
+    url: str
+    scenes: int
+    frames: int
+    first_scene: int
+    egos: int
+    attackers: int
+    attack: str
+    defense: dict[str, Any]
+    seed: int
+    real_time: bool
+    report: Path | None
+
+
+class _Screen:
+    """The live table."""
+
+    def __init__(self, console: Console, total: int) -> None:
+        self._progress = Progress(
+            TextColumn("{task.description}"), BarColumn(), MofNCompleteColumn(), TimeRemainingColumn(), console=console
+        )
+        self._task = self._progress.add_task("frames", total=total)
+        self._rows: deque[tuple[str, ...]] = deque(maxlen=RECENT)
+        self.live = Live(self._render(), console=console, refresh_per_second=8, transient=True)
+
+    def add(self, scene: int, frame: EgoFrame, answer: FrameAnswer, latency_ms: float) -> None:
+        """Show one answered frame; attackers are red."""
+
+        def names(vehicles: Any) -> str:
+            return " ".join(f"[red]{v}[/red]" if v in frame.attackers else v for v in vehicles) or "-"
+
+        dissent = [v for v, entry in answer.rejected.items() if entry["reason"] == "dissensus"]
+        best = max((h["jaccard_index"] for h in answer.hypotheses), default=float("nan"))
+        self._rows.append(
+            (
+                str(scene),
+                str(answer.frame),
+                frame.ego_id,
+                answer.source.replace("_", " "),
+                names(answer.accepted),
+                names(dissent),
+                str(answer.sampling_steps),
+                f"{best:.2f}",
+                f"{latency_ms:.0f}",
+            )
+        )
+        self._progress.advance(self._task)
+        self.live.update(self._render())
+
+    def _render(self) -> Group:
+        table = Table()
+        for heading in ("scene", "frame", "ego", "source", "accepted", "in dissensus", "steps", "best J", "ms"):
+            table.add_column(
+                heading, justify="right" if heading in ("scene", "frame", "steps", "best J", "ms") else "left"
+            )
+        for row in self._rows:
+            table.add_row(*row)
+        return Group(table, self._progress)
+
+
+class _Vehicle:
+    """One vehicle: its own connection to the gateway, and its tokens in the egos' sessions."""
+
+    def __init__(self, vehicle_id: str, url: str) -> None:
+        self.vehicle_id = vehicle_id
+        self.gateway = GatewayClient(url)
+        self._tokens: dict[str, tuple[str, str]] = {}
+
+    def enrol(self, ego_id: str, session: OpenedSession) -> None:
+        token = session.ego_token if ego_id == self.vehicle_id else session.teammate_tokens[self.vehicle_id]
+        self._tokens[ego_id] = (session.session_id, token)
+
+    async def send(self, frame: EgoFrame, index: int) -> None:
+        session_id, token = self._tokens[frame.ego_id]
+        await self.gateway.vehicle(session_id, self.vehicle_id, token).send(index, frame.sent[self.vehicle_id])
+
+    async def ask(self, frame: EgoFrame, index: int) -> tuple[FrameAnswer, float]:
+        session_id, token = self._tokens[frame.ego_id]
+        started = time.perf_counter()
+        answer = await self.gateway.vehicle(session_id, self.vehicle_id, token).ask(index, frame.message)
+        return answer, (time.perf_counter() - started) * 1e3
+
+
+async def run_fleet(options: FleetOptions, console: Console) -> FleetSummary:
+    """Drive the fleet through the gateway.
+
+    Raises
+    ------
+    clients.errors.GatewayError
+        If any message or frame is not accepted as it should be.
+    """
+    detector = load()
+    summary = FleetSummary(detector)
+    screen = _Screen(console, options.scenes * options.frames * options.egos)
+    with screen.live:
+        for seed in range(options.first_scene, options.first_scene + options.scenes):
+            scene = IntersectionScene(seed)
+            attack = ATTACKS[options.attack]()
+            fleet = Fleet(scene, detector, options.egos, options.attackers, attack, options.seed)
+            await _run_scene(options, fleet, summary, screen)
+    return summary
+
+
+async def _run_scene(options: FleetOptions, fleet: Fleet, summary: FleetSummary, screen: _Screen) -> None:
+    vehicles = {agent: _Vehicle(agent, options.url) for agent in fleet.scene.agents}
+    try:
+        for ego_id in fleet.egos:
+            session = await vehicles[ego_id].gateway.open_session(
+                ego_id, fleet.teammates(ego_id), defense=options.defense
+            )
+            for vehicle in vehicles.values():
+                vehicle.enrol(ego_id, session)
+        start = time.monotonic()
+        for index in range(options.frames):
+            frames = await asyncio.to_thread(fleet.sense, index)
+            if options.real_time:
+                await asyncio.sleep(max(0.0, start + index * FRAME_PERIOD_S - time.monotonic()))
+            answers = await asyncio.gather(*(_exchange(vehicles, frame, index) for frame in frames))
+            for frame, (answer, latency_ms) in zip(frames, answers, strict=True):
+                await asyncio.to_thread(summary.add, frame, answer, latency_ms)
+                screen.add(fleet.scene.seed, frame, answer, latency_ms)
+    finally:
+        await asyncio.gather(*(vehicle.gateway.aclose() for vehicle in vehicles.values()))
+
+
+async def _exchange(vehicles: dict[str, _Vehicle], frame: EgoFrame, index: int) -> tuple[FrameAnswer, float]:
+    """All vehicles post at the same time; the ego's post is answered."""
+    sending = [vehicles[name].send(frame, index) for name in frame.sent]
+    answered, _ = await asyncio.gather(vehicles[frame.ego_id].ask(frame, index), asyncio.gather(*sending))
+    return answered
+
+
+def main(
+    url: Annotated[str, typer.Option(help="The gateway.")] = "http://127.0.0.1:8000",
+    scenes: Annotated[int, typer.Option(min=1, help="Sequences, each a session of its own.")] = 4,
+    frames: Annotated[int, typer.Option(min=1, help="Frames of a sequence, at 5 Hz of simulated time.")] = 25,
+    first_scene: Annotated[int, typer.Option(min=0, help="Seed of the first scene; 0 to 999 are test scenes.")] = 0,
+    egos: Annotated[int, typer.Option(min=1, help="Vehicles that ask; the first cars.")] = 1,
+    attackers: Annotated[int, typer.Option(min=0, help="Vehicles that attack.")] = 1,
+    attack: Annotated[str, typer.Option(help=f"One of {', '.join(ATTACKS)}.")] = "pgd",
+    defense: Annotated[str, typer.Option(help="Kind of defence.")] = "sample_consensus",
+    attacker_ratio: Annotated[float | None, typer.Option(help="Ratio the defence assumes.")] = None,
+    sampling_budget: Annotated[int | None, typer.Option(help="Most hypotheses a frame.")] = None,
+    collaborators: Annotated[int | None, typer.Option(help="Teammates in a hypothesis.")] = None,
+    seed: Annotated[int, typer.Option(help="Of the attackers' choice and starts.")] = 0,
+    real_time: Annotated[bool, typer.Option(help="Hold frames to 5 Hz of the clock.")] = False,
+    report: Annotated[Path | None, typer.Option(help="Folder for summary.json and example.png.")] = None,
+) -> None:
+    """Drive a simulated fleet, some of it hostile, through a running gateway."""
+    console = Console()
+    if attack not in ATTACKS:
+        raise typer.BadParameter(f"unknown attack {attack!r}; known: {', '.join(ATTACKS)}", param_hint="--attack")
+    chosen = {"attacker_ratio": attacker_ratio, "sampling_budget": sampling_budget, "collaborators": collaborators}
+    options = FleetOptions(
+        url=url,
+        scenes=scenes,
+        frames=frames,
+        first_scene=first_scene,
+        egos=egos,
+        attackers=attackers,
+        attack=attack,
+        defense={"kind": defense, **{name: value for name, value in chosen.items() if value is not None}},
+        seed=seed,
+        real_time=real_time,
+        report=report,
+    )
+    try:
+        summary = asyncio.run(run_fleet(options, console))
+    except (GatewayError, ValueError) as error:
+        console.print(f"[red]The fleet stopped:[/red] {error}")
+        sys.exit(1)
+    close_run(options, summary, console)
+
+
+def close_run(options: FleetOptions, summary: FleetSummary, console: Console) -> None:
+    """Print the summary and write the report where one is wanted."""
+    summary.print(console)
+    if options.report is not None:
+        settings = {name: value for name, value in vars(options).items() if name not in ("report", "url")}
+        picture = summary.write(options.report, settings)
+        console.print(f"Report: {options.report / 'summary.json'} and {picture}")
+
+
+if __name__ == "__main__":
+    typer.run(main)

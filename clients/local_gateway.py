@@ -1,0 +1,65 @@
+"""A gateway of one's own for the length of a block: started as a child process on a free loopback port."""
+
+from __future__ import annotations
+
+import asyncio
+import contextlib
+import os
+import socket
+import subprocess
+import sys
+import time
+from collections.abc import AsyncIterator
+from pathlib import Path
+
+from clients.client import GatewayClient
+from clients.errors import GatewayUnreachable
+
+START_TIMEOUT_S = 120.0
+STOP_TIMEOUT_S = 20.0
+
+
+@contextlib.asynccontextmanager
+async def local_gateway(log: Path) -> AsyncIterator[str]:
+    """Start ``uvicorn service.app:app``, wait until it is ready, yield its URL, and stop it.
+
+    Parameters
+    ----------
+    log : Path
+        Takes what the gateway prints.
+
+    Raises
+    ------
+    GatewayUnreachable
+        If it ends or is not ready in time; the message holds the end of its log.
+    """
+    with socket.socket() as probe:
+        probe.bind(("127.0.0.1", 0))
+        port = probe.getsockname()[1]
+    url = f"http://127.0.0.1:{port}"
+    command = [sys.executable, "-m", "uvicorn", "service.app:app", "--host", "127.0.0.1", "--port", str(port)]
+    log.parent.mkdir(parents=True, exist_ok=True)
+    with log.open("wb") as output:
+        process = subprocess.Popen(
+            [*command, "--log-level", "warning"], stdout=output, stderr=subprocess.STDOUT, env=dict(os.environ)
+        )
+        try:
+            await _until_ready(url, process, log)
+            yield url
+        finally:
+            process.terminate()
+            try:
+                await asyncio.to_thread(process.wait, STOP_TIMEOUT_S)
+            except subprocess.TimeoutExpired:
+                process.kill()
+                process.wait()
+
+
+async def _until_ready(url: str, process: subprocess.Popen[bytes], log: Path) -> None:
+    end = time.monotonic() + START_TIMEOUT_S
+    async with GatewayClient(url, timeout_s=2.0) as gateway:
+        while not await gateway.ready():
+            if process.poll() is not None or time.monotonic() > end:
+                why = f"ended with status {process.poll()}" if process.poll() is not None else "was not ready in time"
+                raise GatewayUnreachable(f"the gateway {why}; its log ends:\n{log.read_text()[-2000:]}")
+            await asyncio.sleep(0.1)

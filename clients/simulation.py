@@ -1,0 +1,111 @@
+"""The fleet's side of the world: what every vehicle senses, and what an attacker sends instead."""
+
+from __future__ import annotations
+
+from collections.abc import Mapping
+from dataclasses import dataclass
+
+import numpy as np
+
+from robosac.attacks import IterativeAttack
+from robosac.boxes import FloatArray
+from robosac.detectors import Detector, Message
+from robosac.scenes import IntersectionScene, SceneFrame
+
+
+@dataclass(frozen=True)
+class EgoFrame:
+    """One frame from one ego's side.
+
+    Attributes
+    ----------
+    ego_id : str
+    attackers : frozenset of str
+    benign : mapping of teammate to Message
+    sent : mapping of teammate to Message
+        What each teammate really sends to this ego.
+    message : Message
+        The ego's own.
+    truth : (G, 5) ndarray
+        Ego frame.
+    points : (P, 3) ndarray
+        The ego's LiDAR returns.
+    """
+
+    ego_id: str
+    attackers: frozenset[str]
+    benign: Mapping[str, Message]
+    sent: Mapping[str, Message]
+    message: Message
+    truth: FloatArray
+    points: FloatArray
+
+
+class Fleet:
+    """Vehicles of one scene, some of them attackers.
+
+    An attacker knows the detector and overhears the others' messages of the frame (the white-box setting of the
+    literature); it makes a message for each ego, since what harms one need not harm another.
+
+    Parameters
+    ----------
+    scene : IntersectionScene
+    detector : Detector
+        The vehicles' own copy.
+    egos : int
+        The first cars are egos.
+    attackers : int
+        Chosen at random among the vehicles that are not egos.
+    attack : IterativeAttack
+    seed : int
+
+    Raises
+    ------
+    ValueError
+        If there are fewer vehicles than egos and attackers together need.
+    """
+
+    def __init__(
+        self,
+        scene: IntersectionScene,
+        detector: Detector,
+        egos: int,
+        attackers: int,
+        attack: IterativeAttack,
+        seed: int,
+    ) -> None:
+        others = scene.agents[egos:]
+        if not 1 <= egos <= scene.car_agents:
+            raise ValueError(f"egos must be between 1 and the {scene.car_agents} cars, got {egos}")
+        if not 0 <= attackers <= len(others):
+            raise ValueError(
+                f"attackers must be between 0 and the {len(others)} vehicles that are no egos, got {attackers}"
+            )
+        self.scene = scene
+        self.egos = scene.agents[:egos]
+        self._detector = detector
+        self._attack = attack
+        self._rng = np.random.default_rng([seed, scene.seed])
+        chosen = self._rng.choice(len(others), attackers, replace=False)
+        self.attackers = frozenset(others[i] for i in chosen)
+
+    def teammates(self, ego_id: str) -> list[str]:
+        """Everybody else."""
+        return [agent for agent in self.scene.agents if agent != ego_id]
+
+    def sense(self, index: int) -> list[EgoFrame]:
+        """Frame ``index`` from the side of each ego."""
+        frame = self.scene.frame(index)
+        messages = {name: self._detector.encode(view.points, view.pose) for name, view in frame.views.items()}
+        return [self._for_ego(ego_id, frame, messages) for ego_id in self.egos]
+
+    def _for_ego(self, ego_id: str, frame: SceneFrame, messages: Mapping[str, Message]) -> EgoFrame:
+        benign = {name: messages[name] for name in self.teammates(ego_id)}
+        surface = self._detector.attack_surface(messages[ego_id], benign)
+        adversarial = self._attack.run(surface, self.attackers, self._rng)
+        sent = {
+            name: self._detector.perturbed(message, adversarial[name]) if name in adversarial else message
+            for name, message in benign.items()
+        }
+        view = frame.views[ego_id]
+        return EgoFrame(ego_id, self.attackers, benign, sent, messages[ego_id], frame.truth(ego_id), view.points)

@@ -1,0 +1,172 @@
+"""What a fleet run amounts to: average precision, rejections, steps, latency; as tables, JSON and a picture."""
+
+from __future__ import annotations
+
+import json
+from collections import Counter
+from dataclasses import dataclass, field
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+from rich.console import Console
+from rich.table import Table
+
+from clients.client import FrameAnswer
+from clients.simulation import EgoFrame
+from robosac.boxes import FloatArray
+from robosac.detectors import Detector
+from robosac.evaluation import AveragePrecision
+from robosac.scenes.drawing import FOUND_COLOUR, TRUE_COLOUR, draw_boxes, draw_points, frame_axes
+
+GATEWAY = "gateway"
+BASELINES = ("all benign", "ego only", "no defence")
+
+
+@dataclass(frozen=True)
+class Example:
+    """A frame for the picture: who asked, what is true, and what came of it."""
+
+    frame: EgoFrame
+    undefended: FloatArray
+    answer: FrameAnswer
+
+
+@dataclass
+class FleetSummary:
+    """Collects answered frames beside what the same frames give without the gateway."""
+
+    detector: Detector
+    ap: dict[str, AveragePrecision] = field(
+        default_factory=lambda: {n: AveragePrecision() for n in (GATEWAY, *BASELINES)}
+    )
+    latencies_ms: list[float] = field(default_factory=list)
+    steps: list[int] = field(default_factory=list)
+    sources: Counter[str] = field(default_factory=Counter)
+    with_attacker: int = 0
+    in_time: int = 0
+    participation: dict[str, Counter[str]] = field(default_factory=dict)
+    example: Example | None = None
+    _harm: int = -1
+
+    @property
+    def frames(self) -> int:
+        """Answered frames."""
+        return len(self.steps)
+
+    @property
+    def clean_share(self) -> float:
+        """Share of answers without any attacker's message."""
+        return 1.0 - self.with_attacker / self.frames if self.frames else float("nan")
+
+    def add(self, frame: EgoFrame, answer: FrameAnswer, latency_ms: float) -> None:
+        """Count one answered frame."""
+        team = list(frame.sent)
+        received = self.detector.prepare(frame.message, frame.sent)
+        undefended = received.detect(team)
+        self.ap[GATEWAY].add(answer.boxes, frame.truth)
+        self.ap["all benign"].add(self.detector.prepare(frame.message, frame.benign).detect(team), frame.truth)
+        self.ap["ego only"].add(received.detect(), frame.truth)
+        self.ap["no defence"].add(undefended, frame.truth)
+        self.latencies_ms.append(latency_ms)
+        self.steps.append(answer.sampling_steps)
+        self.sources[answer.source] += 1
+        self.with_attacker += not frame.attackers.isdisjoint(answer.accepted)
+        self.in_time += answer.deadline_met
+        for role, members in (("attackers", frame.attackers), ("honest", set(team) - frame.attackers)):
+            tally = self.participation.setdefault(role, Counter())
+            for vehicle in members:
+                tally["accepted" if vehicle in answer.accepted else str(answer.rejected[vehicle]["reason"])] += 1
+        self._keep_example(Example(frame, undefended, answer))
+
+    def _keep_example(self, example: Example) -> None:
+        """The picture shows the frame in which the attack did most, with a verified answer where there is one."""
+        harm = abs(len(example.undefended) - len(example.frame.truth)) * 2 + (example.answer.source != "ego_only")
+        if harm > self._harm:
+            self._harm, self.example = harm, example
+
+    def as_dict(self) -> dict[str, Any]:
+        """Plain values for JSON."""
+        p50, p95, p99 = np.percentile(self.latencies_ms, [50, 95, 99])
+        return {
+            "frames": self.frames,
+            "average_precision": {name: {"ap50": ap.at(0.5), "ap70": ap.at(0.7)} for name, ap in self.ap.items()},
+            "clean_share": self.clean_share,
+            "answers_with_attacker": self.with_attacker,
+            "sources": dict(self.sources),
+            "participation": {role: dict(tally) for role, tally in self.participation.items()},
+            "sampling_steps": {"mean": float(np.mean(self.steps)), "max": int(np.max(self.steps))},
+            "latency_ms": {"p50": float(p50), "p95": float(p95), "p99": float(p99)},
+            "deadline_met_share": self.in_time / self.frames,
+        }
+
+    def print(self, console: Console) -> None:
+        """The closing summary."""
+        values = self.as_dict()
+        table = Table(title=f"Average precision on the same {self.frames} frames", title_justify="left")
+        for heading in ("perception", "AP at IoU 0.5", "AP at IoU 0.7"):
+            table.add_column(heading, justify="left" if heading == "perception" else "right")
+        labels = {
+            "all benign": "all teammates benign (the ideal)",
+            GATEWAY: "[bold]what the gateway answered[/bold]",
+            "ego only": "ego alone",
+            "no defence": "attacked, no defence",
+        }
+        for name, label in labels.items():
+            ap = values["average_precision"][name]
+            table.add_row(label, f"{ap['ap50']:.3f}", f"{ap['ap70']:.3f}")
+        console.print(table)
+        table = Table(title="Who was accepted, and why not (vehicle-frames)", title_justify="left")
+        reasons = sorted({reason for tally in self.participation.values() for reason in tally} - {"accepted"})
+        for heading in ("", "accepted", *reasons):
+            table.add_column(heading.replace("_", " "), justify="right" if heading else "left")
+        for role, tally in self.participation.items():
+            if tally:
+                table.add_row(role, *(str(tally[column]) for column in ("accepted", *reasons)))
+        console.print(table)
+        latency, steps = values["latency_ms"], values["sampling_steps"]
+        sources = ", ".join(f"{count} {source.replace('_', ' ')}" for source, count in self.sources.most_common())
+        console.print(
+            f"Answers: {sources}. Sampling steps: {steps['mean']:.2f} a frame, at most {steps['max']}.\n"
+            f"Latency over HTTP: median {latency['p50']:.1f} ms, 95 % {latency['p95']:.1f} ms, "
+            f"99 % {latency['p99']:.1f} ms; "
+            f"{values['deadline_met_share']:.1%} within the budget."
+        )
+        colour = "green" if self.clean_share >= 0.95 else "red"
+        console.print(f"[{colour}]No attacker accepted in {self.clean_share:.1%} of the frames.[/{colour}]")
+
+    def write(self, folder: Path, settings: dict[str, Any]) -> Path:
+        """Write ``summary.json`` and ``example.png`` to a folder; returns the picture's path."""
+        folder.mkdir(parents=True, exist_ok=True)
+        text = json.dumps({"settings": settings, **self.as_dict()}, indent=2)
+        (folder / "summary.json").write_text(text + "\n")
+        picture = folder / "example.png"
+        if self.example is not None:
+            _draw(self.example, picture)
+        return picture
+
+
+def _draw(example: Example, path: Path) -> None:
+    from matplotlib.figure import Figure  # noqa: PLC0415 (a second to import, and only pictures need it)
+
+    frame, answer = example.frame, example.answer
+    attackers = ", ".join(sorted(frame.attackers)) or "nobody"
+    panels = (
+        ("True boxes", frame.truth, TRUE_COLOUR, "true"),
+        (f"Fusion of all, attacked by {attackers}", example.undefended, "#b2182b", "found"),
+        (
+            f"Gateway: {answer.source.replace('_', ' ')} with {', '.join(answer.accepted) or 'nobody'}",
+            answer.boxes,
+            FOUND_COLOUR,
+            "found",
+        ),
+    )
+    figure = Figure(figsize=(21, 7.6), layout="constrained")
+    for axes, (title, boxes, colour, label) in zip(figure.subplots(1, 3), panels, strict=True):
+        draw_points(axes, frame.points)
+        if boxes is not frame.truth:
+            draw_boxes(axes, frame.truth, TRUE_COLOUR, "true", dashed=True, width=1.0)
+        draw_boxes(axes, boxes, colour, label)
+        frame_axes(axes, title)
+    figure.suptitle(f"Frame {answer.frame} of {frame.ego_id}")
+    figure.savefig(path, dpi=90)

@@ -1,0 +1,148 @@
+"""How a defence talks to whoever runs it.
+
+A defence is a conversation: a generator that yields a batch of hypotheses (subsets of the team), is sent an `Outcome`
+for each that was tested, and returns a `Decision`. It knows nothing of detectors or clocks. If it is sent fewer
+outcomes than it proposed hypotheses, the time is up: it must return its decision from what it knows.
+
+What a defence remembers between frames is its *state*, a plain dict of JSON values that the caller keeps per session.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Collection, Generator, Mapping, Sequence
+from dataclasses import dataclass, field
+from enum import StrEnum
+from typing import Any, ClassVar, Protocol
+
+import numpy as np
+
+from robosac.consensus import Verdict
+
+Hypothesis = tuple[str, ...]
+State = Mapping[str, Any]
+
+
+class Source(StrEnum):
+    """Where the boxes of an answer come from."""
+
+    CONSENSUS = "consensus"
+    TRUSTED = "trusted"
+    EGO_ONLY = "ego_only"
+
+
+class Reason(StrEnum):
+    """Why a teammate was left out of an answer.
+
+    ``not_sampled`` also stands where a teammate was in tested hypotheses but no verdict was reached, because ego and
+    fusion were both empty.
+    """
+
+    DISSENSUS = "dissensus"
+    NOT_SAMPLED = "not_sampled"
+    DISTRUSTED = "distrusted"
+    MISSING = "missing"
+    LATE = "late"
+    MALFORMED = "malformed"
+    STALE = "stale"
+    UNAUTHENTICATED = "unauthenticated"
+    REPLAYED = "replayed"
+
+
+@dataclass(frozen=True)
+class Outcome:
+    """A tested hypothesis.
+
+    Attributes
+    ----------
+    teammates : tuple of str
+    jaccard_index : float
+        Against the reference, in [0, 1].
+    verdict : Verdict
+    """
+
+    teammates: Hypothesis
+    jaccard_index: float
+    verdict: Verdict
+
+
+@dataclass(frozen=True)
+class Rejection:
+    """Why one teammate was left out.
+
+    Attributes
+    ----------
+    reason : Reason
+    evidence : mapping
+        JSON values; for ``dissensus`` the indices of the hypotheses that speak against the teammate and their lowest
+        Jaccard index.
+    """
+
+    reason: Reason
+    evidence: Mapping[str, Any] = field(default_factory=dict)
+
+
+@dataclass(frozen=True)
+class Decision:
+    """What a defence concludes about a frame.
+
+    Attributes
+    ----------
+    accepted : tuple of str
+        The subset whose fusion is the answer; empty for ``ego_only``. It must be one that was tested in this frame.
+    source : Source
+    rejected : mapping of teammate id to Rejection
+        Every teammate of the frame that is not accepted.
+    attacker_ratio : float or None
+        Assumed or estimated share of attackers in the team.
+    state : mapping
+        To be handed to the next frame's conversation.
+    """
+
+    accepted: Hypothesis
+    source: Source
+    rejected: Mapping[str, Rejection]
+    attacker_ratio: float | None
+    state: State
+
+
+Conversation = Generator[Sequence[Hypothesis], Sequence[Outcome], Decision]
+
+
+class Defense(Protocol):
+    """A defence's settings and its conversation. Implementations are immutable."""
+
+    kind: ClassVar[str]
+
+    @property
+    def consensus_threshold(self) -> float:
+        """Jaccard index from which on a hypothesis is in consensus."""
+        ...
+
+    def initial_state(self) -> State:
+        """State of a session before its first frame."""
+        ...
+
+    def check_team(self, team_size: int) -> None:
+        """Raise `robosac.budget.DomainError` if the settings make no sense for a team of this size."""
+        ...
+
+    def converse(self, team: Sequence[str], state: State, rng: np.random.Generator) -> Conversation:
+        """The conversation about one frame with the teammates present in it."""
+        ...
+
+
+def explain_rejections(
+    team: Sequence[str], accepted: Collection[str], outcomes: Sequence[Outcome]
+) -> dict[str, Rejection]:
+    """A reason for every teammate that is not accepted, from the outcomes of the frame."""
+    rejected = {}
+    for teammate in team:
+        if teammate in accepted:
+            continue
+        against = [i for i, o in enumerate(outcomes) if teammate in o.teammates and o.verdict is Verdict.DISSENSUS]
+        if against:
+            lowest = min(outcomes[i].jaccard_index for i in against)
+            rejected[teammate] = Rejection(Reason.DISSENSUS, {"hypotheses": against, "lowest_jaccard_index": lowest})
+        else:
+            rejected[teammate] = Rejection(Reason.NOT_SAMPLED)
+    return rejected

@@ -1,0 +1,127 @@
+"""What a collaborative detector is to the rest of the project.
+
+A detector turns a LiDAR scan into a *message*, and an ego's message with any subset of its teammates' into boxes in the
+ego's frame. All that does not depend on the subset is done once per frame (`Detector.prepare`); each hypothesis then
+costs one fusion and one decoder pass (`PreparedFrame.detect`).
+"""
+
+from __future__ import annotations
+
+from collections.abc import Collection, Mapping
+from dataclasses import dataclass
+from typing import Any, Literal, Protocol
+
+import numpy as np
+import torch
+
+from robosac.boxes import FloatArray
+
+Role = Literal["ego", "teammate"]
+
+
+@dataclass(frozen=True)
+class TensorSpec:
+    """Type and shape of one tensor of a message: a numpy dtype name, and C order."""
+
+    dtype: str
+    shape: tuple[int, ...]
+
+
+@dataclass(frozen=True)
+class DetectorInfo:
+    """A detector's public face.
+
+    Attributes
+    ----------
+    name : str
+    tensors : mapping of role to mapping of tensor name to TensorSpec
+        What the ego and a teammate have to send.
+    area_m : (xmin, ymin, xmax, ymax)
+        Where boxes are found, ego frame, metres.
+    cell_m : float
+        Edge of a feature cell, metres.
+    weights_digest : str
+        SHA-256 of the weights file, hexadecimal.
+    consensus_score : float
+        Boxes from this score on take part in the consensus test.
+    """
+
+    name: str
+    tensors: Mapping[Role, Mapping[str, TensorSpec]]
+    area_m: tuple[float, float, float, float]
+    cell_m: float
+    weights_digest: str
+    consensus_score: float
+
+
+@dataclass(frozen=True)
+class Message:
+    """What one vehicle shares in one frame.
+
+    Attributes
+    ----------
+    pose : (4, 4) float64 ndarray
+        world_from_sensor.
+    tensors : mapping of name to ndarray
+        As the detector declares for the sender's role.
+    """
+
+    pose: FloatArray
+    tensors: Mapping[str, np.ndarray[Any, np.dtype[Any]]]
+
+
+class PreparedFrame(Protocol):
+    """One frame, encoded and warped once, to be decoded for many subsets of teammates."""
+
+    def detect(self, teammates: Collection[str] = ()) -> FloatArray:
+        """Fuse the ego with these teammates and decode.
+
+        Returns
+        -------
+        (n, 6) float64 ndarray
+            x, y, length, width, yaw, score; ego frame, best first. Empty subset: the ego's own perception.
+
+        Raises
+        ------
+        KeyError
+            If a teammate is not in the frame.
+        """
+        ...
+
+
+class AttackSurface(Protocol):
+    """A detector as a white-box attacker sees it: differentiable from messages to the ego's class logits."""
+
+    @property
+    def messages(self) -> Mapping[str, torch.Tensor]:
+        """The benign messages of all teammates, float32, without batch dimension."""
+        ...
+
+    def class_logits(self, messages: Mapping[str, torch.Tensor]) -> torch.Tensor:
+        """Class logits of the ego fused with these messages; with none, of the ego alone."""
+        ...
+
+
+class Detector(Protocol):
+    """A collaborative detector. Implementations hold no state but their weights, and may be used from one thread at
+    a time.
+    """
+
+    @property
+    def info(self) -> DetectorInfo: ...
+
+    def encode(self, points: FloatArray, pose: FloatArray) -> Message:
+        """The message for a LiDAR scan (P, 3) in the sensor's frame, taken at ``pose`` (world_from_sensor)."""
+        ...
+
+    def prepare(self, ego: Message, teammates: Mapping[str, Message]) -> PreparedFrame:
+        """Do once what all hypotheses of a frame share. Messages must already be checked against `info`."""
+        ...
+
+    def attack_surface(self, ego: Message, teammates: Mapping[str, Message]) -> AttackSurface:
+        """The same frame for an attacker."""
+        ...
+
+    def perturbed(self, message: Message, tensor: torch.Tensor) -> Message:
+        """The teammate's message with its features replaced by ``tensor`` (as in `AttackSurface.messages`)."""
+        ...

@@ -1,0 +1,74 @@
+"""The network of the embedded detector: a small convolutional encoder and decoder around a mean of feature maps.
+
+Nothing passes around the message (there is no skip connection), so the ego shares the same tensor as a teammate. All
+convolutions of the decoder act on the fused map; the first one follows the mean directly.
+"""
+
+from __future__ import annotations
+
+import math
+
+import torch
+from torch import nn
+
+from robosac.detectors.voxels import LAYERS
+
+FEATURES = 64
+MAP = 32
+HEAD = 64
+BOX_CHANNELS = 6
+"""Offset x, y (m), log length, log width, cos and sin of twice the yaw."""
+
+
+def _block(inputs: int, outputs: int, stride: int = 1) -> nn.Sequential:
+    return nn.Sequential(
+        nn.Conv2d(inputs, outputs, 3, stride=stride, padding=1, bias=False),
+        nn.BatchNorm2d(outputs),
+        nn.ReLU(inplace=True),
+    )
+
+
+class MeanFusionNetwork(nn.Module):
+    """Encoder 6 x 128 x 128 -> 64 x 32 x 32, decoder 64 x 32 x 32 -> (1 + 6) x 64 x 64; 0.2 M parameters."""
+
+    def __init__(self) -> None:
+        super().__init__()
+        self.encoder = nn.Sequential(
+            nn.PixelUnshuffle(2), _block(LAYERS * 4, 48), _block(48, FEATURES, stride=2), _block(FEATURES, FEATURES)
+        )
+        self.decoder = nn.Sequential(
+            _block(FEATURES, FEATURES),
+            _block(FEATURES, FEATURES),
+            _block(FEATURES, FEATURES),
+            nn.Conv2d(FEATURES, 4 * 40, 1, bias=False),
+            nn.PixelShuffle(2),
+            nn.BatchNorm2d(40),
+            nn.ReLU(inplace=True),
+            _block(40, 40),
+        )
+        self.class_head = nn.Conv2d(40, 1, 1)
+        self.box_head = nn.Conv2d(40, BOX_CHANNELS, 1)
+        nn.init.constant_(self.class_head.bias, -math.log(99.0))  # type: ignore[arg-type]
+
+    def encode(self, grids: torch.Tensor) -> torch.Tensor:
+        """Occupancy (n, 6, 128, 128), float -> features (n, 64, 32, 32), not negative."""
+        features: torch.Tensor = self.encoder(grids)
+        return features
+
+    def decode(self, fused: torch.Tensor) -> tuple[torch.Tensor, torch.Tensor]:
+        """Fused features (n, 64, 32, 32) -> class logits (n, 64, 64) and box codes (n, 6, 64, 64)."""
+        shared = self.decoder(fused)
+        return self.class_head(shared)[:, 0], self.box_head(shared)
+
+
+def fold_batchnorm(module: nn.Module) -> nn.Module:
+    """Merge every convolution with the batch norm that follows it directly; for inference only, in place."""
+    for child in module.children():
+        fold_batchnorm(child)
+    if isinstance(module, nn.Sequential):
+        for i in range(len(module) - 1):
+            conv, norm = module[i], module[i + 1]
+            if isinstance(conv, nn.Conv2d) and isinstance(norm, nn.BatchNorm2d):
+                module[i] = torch.nn.utils.fuse_conv_bn_eval(conv.eval(), norm.eval())
+                module[i + 1] = nn.Identity()
+    return module

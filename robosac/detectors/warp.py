@@ -1,0 +1,36 @@
+"""Moving a feature map from one sensor's frame to another's."""
+
+from __future__ import annotations
+
+import numpy as np
+import torch
+from torch.nn import functional
+
+from robosac.boxes import FloatArray
+
+
+def sampling_matrix(ego_pose: FloatArray, pose: FloatArray, half_extent_m: float) -> FloatArray:
+    """Where to look in a teammate's map for each place of the ego's.
+
+    Parameters
+    ----------
+    ego_pose, pose : (4, 4) ndarray
+        world_from_sensor of the ego and of the teammate; their motion in the plane counts.
+    half_extent_m : float
+        Maps cover +- this, in metres, in both directions.
+
+    Returns
+    -------
+    (2, 3) float64 ndarray
+        For `torch.nn.functional.affine_grid`: normalised ego coordinates (x, y) to normalised teammate coordinates.
+    """
+    relative = np.linalg.inv(pose) @ ego_pose
+    matrix = relative[:2, [0, 1, 3]].copy()
+    matrix[:, 2] /= half_extent_m
+    return matrix
+
+
+def warp(features: torch.Tensor, matrices: torch.Tensor) -> torch.Tensor:
+    """Resample maps (n, C, H, W), rows along +y and columns along +x, by matrices (n, 2, 3): bilinear, zero outside."""
+    grid = functional.affine_grid(matrices, list(features.shape), align_corners=False)
+    return functional.grid_sample(features, grid, mode="bilinear", padding_mode="zeros", align_corners=False)

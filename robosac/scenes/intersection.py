@@ -1,0 +1,152 @@
+"""The synthetic intersection: sequences of sensor views with true boxes, deterministic by seed."""
+
+from __future__ import annotations
+
+from collections.abc import Iterator, Mapping
+from dataclasses import dataclass, field
+from functools import cached_property
+
+import numpy as np
+
+from robosac.boxes import FloatArray, from_world, pose_matrix
+from robosac.scenes.lidar import IntArray, Lidar
+from robosac.scenes.world import CAR_SENSOR_HEIGHT_M, RSU_HEIGHT_M, Traffic, build_traffic
+
+FRAME_PERIOD_S = 0.2
+TRUTH_MIN_HITS = 6
+TRUTH_RANGE_M = 31.0
+
+
+@dataclass(frozen=True)
+class AgentView:
+    """What one agent senses in one frame.
+
+    Attributes
+    ----------
+    pose : (4, 4) ndarray
+        world_from_sensor; its translation's z is the sensor's height above ground.
+    points : (P, 3) float32 ndarray
+        LiDAR returns in the sensor's frame, metres.
+    hits : (V,) int ndarray
+        Returns from each vehicle of the scene.
+    """
+
+    pose: FloatArray
+    points: FloatArray
+    hits: IntArray
+
+
+@dataclass(frozen=True)
+class SceneFrame:
+    """One instant of a scene.
+
+    Attributes
+    ----------
+    index : int
+    vehicles : (V, 5) ndarray
+        x, y, length, width, yaw of every vehicle; world frame.
+    views : mapping of agent id to AgentView
+    carriers : mapping of agent id to int
+        The vehicle that carries the agent's sensor; absent for the roadside unit.
+    """
+
+    index: int
+    vehicles: FloatArray
+    views: Mapping[str, AgentView]
+    carriers: Mapping[str, int]
+
+    def truth(self, ego: str) -> FloatArray:
+        """True boxes for an ego: every other vehicle within +-31 m that some agent hits at least 6 times.
+
+        Returns
+        -------
+        (G, 5) ndarray
+            x, y, length, width, yaw in the ego's frame.
+        """
+        hits = np.max([view.hits for view in self.views.values()], axis=0)
+        boxes, index = self.nearby(ego)
+        seen: FloatArray = boxes[hits[index] >= TRUTH_MIN_HITS]
+        return seen
+
+    def nearby(self, ego: str) -> tuple[FloatArray, IntArray]:
+        """All other vehicles within +-31 m of an ego, seen or not: boxes (K, 5) in its frame, and their indices
+        (K,).
+        """
+        boxes = from_world(self.vehicles, self.views[ego].pose)
+        near = np.all(np.abs(boxes[:, :2]) <= TRUTH_RANGE_M, axis=1)
+        if ego in self.carriers:
+            near[self.carriers[ego]] = False
+        index = np.flatnonzero(near)
+        return boxes[index], index
+
+
+@dataclass(frozen=True)
+class IntersectionScene:
+    """A sequence at 5 Hz with several cars and one roadside unit as agents.
+
+    Any frame can be computed by itself; the same seed and index give the same frame, bit for bit. Agents are named
+    ``car-1``, ``car-2``, ... and ``rsu``.
+
+    Parameters
+    ----------
+    seed : int
+        Any non-negative integer.
+    car_agents : int, default 5
+        Cars that carry a sensor.
+    lidar : Lidar
+
+    Examples
+    --------
+    >>> frame = IntersectionScene(seed=8).frame(0)
+    >>> sorted(frame.views)
+    ['car-1', 'car-2', 'car-3', 'car-4', 'car-5', 'rsu']
+    """
+
+    seed: int
+    car_agents: int = 5
+    lidar: Lidar = field(default_factory=Lidar)
+
+    @cached_property
+    def _traffic(self) -> Traffic:
+        return build_traffic(np.random.default_rng([self.seed, 0]), self.car_agents)
+
+    @property
+    def agents(self) -> tuple[str, ...]:
+        """Ids of all agents, the cars first."""
+        return (*(f"car-{i + 1}" for i in range(self.car_agents)), "rsu")
+
+    def frame(self, index: int) -> SceneFrame:
+        """The views of all agents at time ``index * 0.2 s``.
+
+        Raises
+        ------
+        ValueError
+            If the index is negative.
+        """
+        if index < 0:
+            raise ValueError(f"frame index must not be negative, got {index}")
+        traffic = self._traffic
+        vehicles = traffic.vehicles_at(index * FRAME_PERIOD_S)
+        obstacles = np.vstack([np.column_stack([vehicles, traffic.size[:, 2]]), traffic.buildings])
+        carriers = {f"car-{i + 1}": int(v) for i, v in enumerate(traffic.agent_vehicles)}
+        views = {}
+        for number, agent in enumerate(self.agents):
+            rng = np.random.default_rng([self.seed, 1 + index, number])
+            if agent in carriers:
+                carrier = carriers[agent]
+                x, y, yaw = vehicles[carrier, [0, 1, 4]]
+                height = CAR_SENSOR_HEIGHT_M
+                others = np.arange(len(obstacles)) != carrier
+            else:
+                (x, y, yaw), height = traffic.rsu_pose, RSU_HEIGHT_M
+                others = np.ones(len(obstacles), dtype=bool)
+            points, hits = self.lidar.scan(obstacles[others], (x, y, height, yaw), rng)
+            all_hits = np.zeros(len(obstacles), dtype=np.int64)
+            all_hits[others] = hits
+            views[agent] = AgentView(pose_matrix(x, y, height, yaw), points, all_hits[: len(vehicles)])
+        return SceneFrame(index, vehicles, views, carriers)
+
+    def frames(self, count: int, start: int = 0, stride: int = 1) -> Iterator[SceneFrame]:
+        """``count`` frames from ``start``, every ``stride``-th."""
+        for i in range(count):
+            yield self.frame(start + i * stride)

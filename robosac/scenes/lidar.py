@@ -1,0 +1,141 @@
+"""A spinning LiDAR by ray casting against upright boxes and the ground.
+
+Rays are cast in two stages. Seen from above, a ray is a half-line, and most boxes are missed by most azimuths; only for
+the (azimuth, box) pairs that meet is the height of each beam compared with the box. That keeps a scan of 25,200 rays
+among 70 boxes near a millisecond without any compiled code.
+"""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+
+import numpy as np
+
+from robosac.boxes import FloatArray
+
+_PARALLEL = 1e-12
+
+IntArray = np.ndarray[tuple[int, ...], np.dtype[np.int64]]
+
+
+@dataclass(frozen=True)
+class Lidar:
+    """Geometry and noise of the sensor.
+
+    Attributes
+    ----------
+    azimuths, beams : int
+        Rays per turn and channels.
+    lowest_deg, highest_deg : float
+        Elevation of the outermost channels.
+    range_m : float
+        Returns from beyond this are lost.
+    dropout : float
+        Share of returns lost at random.
+    noise_m : float
+        Standard deviation of the measured range.
+    """
+
+    azimuths: int = 900
+    beams: int = 28
+    lowest_deg: float = -28.0
+    highest_deg: float = 4.0
+    range_m: float = 60.0
+    dropout: float = 0.05
+    noise_m: float = 0.03
+
+    def scan(
+        self, obstacles: FloatArray, origin: tuple[float, float, float, float], rng: np.random.Generator
+    ) -> tuple[FloatArray, IntArray]:
+        """Cast all rays of one turn.
+
+        Parameters
+        ----------
+        obstacles : (B, 6) ndarray
+            x, y, length, width, yaw, height; world frame, standing on the ground.
+        origin : (x, y, z, yaw)
+            Pose of the sensor in the world; z above ground.
+        rng : numpy.random.Generator
+            For dropout and range noise.
+
+        Returns
+        -------
+        points : (P, 3) float32 ndarray
+            Returns in the sensor's frame, metres.
+        hits : (B,) int ndarray
+            Returns from each obstacle.
+        """
+        x, y, z, yaw = origin
+        azimuth = np.arange(self.azimuths) * (2 * np.pi / self.azimuths)
+        slope = np.tan(np.deg2rad(np.linspace(self.lowest_deg, self.highest_deg, self.beams))).astype(np.float32)
+        with np.errstate(divide="ignore"):
+            ground = np.where(slope < 0, -z / slope, np.inf).astype(np.float32)
+        nearest = np.broadcast_to(ground, (self.azimuths, self.beams)).copy()
+        owner = np.full((self.azimuths, self.beams), -1, dtype=np.int64)
+
+        ray, box, enter, leave = _crossings(obstacles, x, y, azimuth + yaw)
+        if len(ray):
+            distance = _beam_ranges(enter, leave, obstacles[box, 5].astype(np.float32), z, slope)
+            first = np.flatnonzero(np.r_[True, ray[1:] != ray[:-1]])
+            rows = ray[first]
+            closest = np.minimum.reduceat(distance, first, axis=0)
+            blocked = closest < nearest[rows]
+            nearest[rows] = np.where(blocked, closest, nearest[rows])
+            visible = (distance == nearest[ray]) & np.isfinite(distance)
+            pair, beam = np.nonzero(visible)
+            owner[ray[pair], beam] = box[pair]
+
+        kept = (nearest <= self.range_m) & (rng.random(nearest.shape, dtype=np.float32) >= self.dropout)
+        ray_index, beam_index = np.nonzero(kept)
+        flat = nearest[ray_index, beam_index]
+        flat = flat + rng.standard_normal(len(flat), dtype=np.float32) * np.float32(self.noise_m)
+        cos, sin = np.cos(azimuth).astype(np.float32), np.sin(azimuth).astype(np.float32)
+        points = np.column_stack([flat * cos[ray_index], flat * sin[ray_index], flat * slope[beam_index]])
+        owners = owner[ray_index, beam_index]
+        return points, np.bincount(owners[owners >= 0], minlength=len(obstacles))
+
+
+def _crossings(
+    obstacles: FloatArray, x: float, y: float, azimuth: FloatArray
+) -> tuple[
+    IntArray, IntArray, np.ndarray[tuple[int], np.dtype[np.float32]], np.ndarray[tuple[int], np.dtype[np.float32]]
+]:
+    """Pairs of ray and box that meet seen from above, sorted by ray, with the ranges of entry and exit (slab
+    method).
+    """
+    cos, sin = np.cos(obstacles[:, 4]), np.sin(obstacles[:, 4])
+    dx, dy = x - obstacles[:, 0], y - obstacles[:, 1]
+    start_u = (cos * dx + sin * dy).astype(np.float32)
+    start_v = (-sin * dx + cos * dy).astype(np.float32)
+    turn = azimuth[:, None] - obstacles[None, :, 4]
+    half_u = (obstacles[:, 2] / 2).astype(np.float32)
+    half_v = (obstacles[:, 3] / 2).astype(np.float32)
+    inv_u, inv_v = 1 / _not_zero(np.cos(turn)), 1 / _not_zero(np.sin(turn))
+    mid_u, mid_v = -start_u * inv_u, -start_v * inv_v
+    reach_u, reach_v = half_u * np.abs(inv_u), half_v * np.abs(inv_v)
+    enter = np.maximum(mid_u - reach_u, mid_v - reach_v)
+    leave = np.minimum(mid_u + reach_u, mid_v + reach_v)
+    ray, box = np.nonzero((enter < leave) & (enter > 0))
+    return ray, box, enter[ray, box], leave[ray, box]
+
+
+def _not_zero(direction: FloatArray) -> np.ndarray[tuple[int, int], np.dtype[np.float32]]:
+    """Directions with those along a side of the box turned a little, so that their reciprocal is a number."""
+    return np.where(np.abs(direction) < _PARALLEL, _PARALLEL, direction).astype(np.float32)
+
+
+def _beam_ranges(
+    enter: np.ndarray[tuple[int], np.dtype[np.float32]],
+    leave: np.ndarray[tuple[int], np.dtype[np.float32]],
+    height: np.ndarray[tuple[int], np.dtype[np.float32]],
+    z: float,
+    slope: np.ndarray[tuple[int], np.dtype[np.float32]],
+) -> np.ndarray[tuple[int, int], np.dtype[np.float32]]:
+    """Horizontal range at which each beam meets the box of its pair: at the side, on the roof, or never (inf)."""
+    side_z = z + enter[:, None] * slope
+    far_z = z + leave[:, None] * slope
+    top = height[:, None]
+    with np.errstate(divide="ignore", invalid="ignore"):
+        roof = (top - np.float32(z)) / slope
+    hit = np.where(side_z <= top, enter[:, None], np.where(far_z < top, roof, np.float32(np.inf)))
+    return np.where(side_z >= 0, hit, np.float32(np.inf))

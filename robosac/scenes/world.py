@@ -1,0 +1,199 @@
+"""Traffic at a synthetic intersection: where every vehicle and building is at a given time.
+
+Two roads cross at the origin. On one axis the traffic flows; on the other it queues behind the stop lines; cars are
+parked along both, and a building stands at each corner. All of it follows from one integer seed, and a position is a
+closed formula of time, so that any frame can be had without the ones before it.
+
+World frame: right-handed, metres, z up, ground at z = 0, origin at the centre of the crossing. The axes of the roads
+are rotated by a random angle, so that nothing in the frame is aligned with the grid by construction.
+"""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+
+import numpy as np
+
+from robosac.boxes import FloatArray
+
+LANES_M = (1.75, 5.25)
+PARKED_ROW_M = 8.4
+ROAD_LENGTH_M = 150.0
+STOP_LINE_M = 10.0
+TRUCK_SHARE = 0.15
+AGENT_RANGE_M = 30.0
+MOVING_AGENT_RANGE_M = 12.0
+MID_SCENE_S = 2.5
+CAR_SENSOR_HEIGHT_M = 1.7
+RSU_HEIGHT_M = 5.0
+
+
+@dataclass(frozen=True)
+class Traffic:
+    """Vehicles and buildings of one scene, and the agents among them.
+
+    Attributes
+    ----------
+    along, lateral : (V,) ndarray
+        Position at time 0 along the road and to the left of its direction, metres.
+    road_yaw : (V,) ndarray
+        Direction of the lane in the world, radians.
+    yaw_offset : (V,) ndarray
+        Deviation of the vehicle's heading from its lane, radians.
+    speed : (V,) ndarray
+        Metres per second; 0 in the queue and at the kerb.
+    size : (V, 3) ndarray
+        Length, width, height in metres.
+    buildings : (B, 6) ndarray
+        x, y, length, width, yaw, height; world frame.
+    agent_vehicles : (A,) ndarray of int
+        Vehicles that carry a sensor.
+    rsu_pose : (x, y, yaw)
+        The roadside unit, world frame.
+    """
+
+    along: FloatArray
+    lateral: FloatArray
+    road_yaw: FloatArray
+    yaw_offset: FloatArray
+    speed: FloatArray
+    size: FloatArray
+    buildings: FloatArray
+    agent_vehicles: np.ndarray[tuple[int], np.dtype[np.int64]]
+    rsu_pose: tuple[float, float, float]
+
+    def vehicles_at(self, time_s: float) -> FloatArray:
+        """Boxes of all vehicles.
+
+        Returns
+        -------
+        (V, 5) ndarray
+            x, y, length, width, yaw in the world frame.
+        """
+        half = ROAD_LENGTH_M / 2
+        along = np.mod(self.along + self.speed * time_s + half, ROAD_LENGTH_M) - half
+        cos, sin = np.cos(self.road_yaw), np.sin(self.road_yaw)
+        x = cos * along - sin * self.lateral
+        y = sin * along + cos * self.lateral
+        return np.column_stack([x, y, self.size[:, :2], self.road_yaw + self.yaw_offset])
+
+
+def build_traffic(rng: np.random.Generator, car_agents: int) -> Traffic:
+    """Draw the traffic of one scene.
+
+    Parameters
+    ----------
+    rng : numpy.random.Generator
+    car_agents : int
+        Cars that carry a sensor, at least 1. At most two of them drive on the flowing axis, and those are within 12 m
+        of the centre in the middle of a 5 s sequence; the others stand in the queue or at the kerb, within 30 m.
+
+    Raises
+    ------
+    ValueError
+        If ``car_agents`` is below 1.
+    """
+    if car_agents < 1:
+        raise ValueError(f"car_agents must be at least 1, got {car_agents}")
+    while True:
+        traffic = _draw(rng, car_agents)
+        if traffic is not None:
+            return traffic
+
+
+def _draw(rng: np.random.Generator, car_agents: int) -> Traffic | None:
+    world_yaw = rng.uniform(-np.pi, np.pi)
+    rows: list[tuple[float, float, float, float, bool]] = []  # along, lateral, road_yaw, speed, may be a truck
+    for direction in (0.0, np.pi):
+        for lane in LANES_M:
+            rows += [(s, -lane, world_yaw + direction, v, True) for s, v in _flowing_lane(rng)]
+            rows += [(s, -lane, world_yaw + direction + np.pi / 2, 0.0, True) for s in _queue_lane(rng)]
+        for axis in (0.0, np.pi / 2):
+            rows += [(s, -PARKED_ROW_M, world_yaw + direction + axis, 0.0, False) for s in _parked_row(rng)]
+    along, lateral, road_yaw, speed = (
+        np.array(column, dtype=np.float64) for column in list(zip(*rows, strict=True))[:4]
+    )
+    may_be_truck = np.array([row[4] for row in rows])
+    truck = may_be_truck & (rng.random(len(rows)) < TRUCK_SHARE)
+    size = _sizes(rng, truck)
+    parked = np.abs(lateral) == PARKED_ROW_M
+    traffic = Traffic(
+        along=along,
+        lateral=lateral + rng.normal(0.0, 0.12, len(rows)),
+        road_yaw=road_yaw,
+        yaw_offset=rng.normal(0.0, np.where(parked, 0.045, 0.025)),
+        speed=speed,
+        size=size,
+        buildings=_buildings(rng, world_yaw),
+        agent_vehicles=np.empty(0, dtype=np.int64),
+        rsu_pose=_rsu(rng, world_yaw),
+    )
+    agents = _choose_agents(rng, traffic, ~truck, car_agents)
+    return None if agents is None else Traffic(**{**traffic.__dict__, "agent_vehicles": agents})
+
+
+def _flowing_lane(rng: np.random.Generator) -> list[tuple[float, float]]:
+    speed = rng.uniform(4.0, 9.0)
+    position = -ROAD_LENGTH_M / 2 + rng.uniform(0.0, 10.0)
+    lane = []
+    while position < ROAD_LENGTH_M / 2 - 12.0:
+        lane.append((position, speed))
+        position += 12.0 + rng.exponential(7.0)
+    return lane
+
+
+def _queue_lane(rng: np.random.Generator) -> list[float]:
+    lane = []
+    position = -STOP_LINE_M - rng.uniform(3.0, 5.5)
+    for _ in range(rng.integers(2, 6)):
+        lane.append(position)
+        position -= 10.0 + rng.exponential(0.7)
+    if rng.random() < 0.5:  # the tail of the next junction's queue
+        lane += [STOP_LINE_M + rng.uniform(12.0, 18.0), STOP_LINE_M + rng.uniform(28.5, 36.0)]
+    return lane
+
+
+def _parked_row(rng: np.random.Generator) -> list[float]:
+    slots = np.arange(17.0, 48.0, 6.6)
+    slots = np.concatenate([-slots, slots])
+    return [float(s) for s in slots[rng.random(len(slots)) < 0.3] + rng.uniform(-0.4, 0.4)]
+
+
+def _sizes(rng: np.random.Generator, truck: np.ndarray[tuple[int], np.dtype[np.bool_]]) -> FloatArray:
+    n = len(truck)
+    car = np.column_stack([rng.uniform(3.9, 5.0, n), rng.uniform(1.7, 2.0, n), rng.uniform(1.4, 1.75, n)])
+    lorry = np.column_stack([rng.uniform(6.5, 9.5, n), rng.uniform(2.3, 2.55, n), rng.uniform(2.7, 3.6, n)])
+    return np.where(truck[:, None], lorry, car)
+
+
+def _buildings(rng: np.random.Generator, world_yaw: float) -> FloatArray:
+    cos, sin = np.cos(world_yaw), np.sin(world_yaw)
+    boxes = []
+    for sx in (-1.0, 1.0):
+        for sy in (-1.0, 1.0):
+            near = rng.uniform(10.5, 13.0, 2)
+            extent = rng.uniform(25.0, 50.0, 2)
+            cx, cy = sx * (near[0] + extent[0] / 2), sy * (near[1] + extent[1] / 2)
+            boxes.append([cos * cx - sin * cy, sin * cx + cos * cy, *extent, world_yaw, rng.uniform(6.0, 15.0)])
+    return np.array(boxes)
+
+
+def _rsu(rng: np.random.Generator, world_yaw: float) -> tuple[float, float, float]:
+    corner = rng.integers(4)
+    angle = world_yaw + np.pi / 4 + corner * np.pi / 2
+    radius = rng.uniform(12.8, 14.0)  # between the kerb and the nearest corner a building may have
+    return float(radius * np.cos(angle)), float(radius * np.sin(angle)), float(rng.uniform(-np.pi, np.pi))
+
+
+def _choose_agents(
+    rng: np.random.Generator, traffic: Traffic, is_car: np.ndarray[tuple[int], np.dtype[np.bool_]], count: int
+) -> np.ndarray[tuple[int], np.dtype[np.int64]] | None:
+    mid = traffic.vehicles_at(MID_SCENE_S)
+    distance = np.hypot(mid[:, 0], mid[:, 1])
+    flowing = traffic.speed > 0
+    moving = np.flatnonzero(is_car & flowing & (distance < MOVING_AGENT_RANGE_M))
+    moving = rng.permutation(moving)[: min(2, count - 1)]
+    standing = np.flatnonzero(is_car & ~flowing & (distance < AGENT_RANGE_M))
+    standing = rng.permutation(standing)[: count - len(moving)]
+    chosen = np.concatenate([moving, standing])
+    return rng.permutation(chosen) if len(chosen) == count else None

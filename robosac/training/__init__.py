@@ -1,0 +1,1 @@
+"""Training of the embedded detector on generated scenes."""

@@ -1,0 +1,162 @@
+"""Training of the embedded detector: seeded, resumable, on one CPU thread."""
+
+from __future__ import annotations
+
+from collections.abc import Callable
+from dataclasses import asdict, dataclass
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+import torch
+
+from robosac.detectors.network import MeanFusionNetwork
+from robosac.detectors.voxels import AREA_M
+from robosac.detectors.warp import sampling_matrix, warp
+from robosac.scenes.splits import TRAINING_SEEDS
+from robosac.training.data import TrainingFrame, generate
+from robosac.training.loss import detection_loss, stack, targets
+
+CHECKPOINT_EVERY = 200
+
+Progress = Callable[[str, int, int, str], None]
+"""Told the stage, the steps done, the steps in all, and a remark."""
+
+
+@dataclass(frozen=True)
+class TrainingConfig:
+    """Everything that decides what the training yields.
+
+    Attributes
+    ----------
+    seed : int
+        Of the initial weights and of every draw.
+    scenes, frames_per_scene : int
+        Data: that many scenes from the start of the training seeds, frames 1 s apart.
+    steps : int
+    frames_per_step, egos_per_frame : int
+        Each step encodes all agents of some frames and decodes some of them as ego.
+    learning_rate, weight_decay : float
+        AdamW; one cycle with cosine decay to zero.
+    ego_only_share : float
+        Share of egos decoded alone; the others get a uniform number of teammates, at least one.
+    """
+
+    seed: int = 1
+    scenes: int = 800
+    frames_per_scene: int = 5
+    steps: int = 2600
+    frames_per_step: int = 4
+    egos_per_frame: int = 3
+    learning_rate: float = 3e-3
+    weight_decay: float = 1e-2
+    ego_only_share: float = 0.2
+
+
+def train_network(config: TrainingConfig, checkpoint: Path, progress: Progress) -> MeanFusionNetwork:
+    """Train, or go on from ``checkpoint`` if it is there.
+
+    Parameters
+    ----------
+    config : TrainingConfig
+    checkpoint : Path
+        Written every 200 steps and at the end; read first if it exists.
+    progress : callable
+
+    Returns
+    -------
+    MeanFusionNetwork
+        In evaluation mode.
+
+    Raises
+    ------
+    ValueError
+        If the checkpoint was made with another configuration.
+    """
+    torch.manual_seed(config.seed)
+    network = MeanFusionNetwork()
+    network.to(memory_format=torch.channels_last)  # type: ignore[call-overload]
+    optimiser = torch.optim.AdamW(network.parameters(), lr=config.learning_rate, weight_decay=config.weight_decay)
+    schedule = torch.optim.lr_scheduler.OneCycleLR(
+        optimiser, config.learning_rate, total_steps=config.steps, pct_start=0.05
+    )
+    parts = {"network": network, "optimiser": optimiser, "schedule": schedule}
+    done = _resume(checkpoint, config, parts)
+    if done < config.steps:
+        frames = _training_frames(config, progress)
+        for step in range(done, config.steps):
+            loss = _step(network, optimiser, frames, config, np.random.default_rng([config.seed, step]))
+            schedule.step()
+            progress("train", step + 1, config.steps, f"loss {loss:.3f}")
+            if (step + 1) % CHECKPOINT_EVERY == 0 or step + 1 == config.steps:
+                _save(checkpoint, config, parts, step + 1)
+    network.eval()
+    return network
+
+
+def _training_frames(config: TrainingConfig, progress: Progress) -> list[TrainingFrame]:
+    total = config.scenes * config.frames_per_scene
+    made = 0
+
+    def tick() -> None:
+        nonlocal made
+        made += 1
+        progress("generate", made, total, "")
+
+    return generate(TRAINING_SEEDS[: config.scenes], config.frames_per_scene, tick)
+
+
+def _step(
+    network: MeanFusionNetwork,
+    optimiser: torch.optim.Optimizer,
+    frames: list[TrainingFrame],
+    config: TrainingConfig,
+    rng: np.random.Generator,
+) -> float:
+    network.train()
+    chosen = [frames[i] for i in rng.integers(0, len(frames), config.frames_per_step)]
+    grids = torch.from_numpy(np.concatenate([frame.grids() for frame in chosen])).float()
+    features = network.encode(grids.contiguous(memory_format=torch.channels_last))
+    fused, goals, first = [], [], 0
+    for frame in chosen:
+        agents = len(frame.poses)
+        for ego in rng.permutation(agents)[: config.egos_per_frame]:
+            others = rng.permutation(np.delete(np.arange(agents), ego))
+            count = 0 if rng.random() < config.ego_only_share else int(rng.integers(1, agents))
+            selected = others[:count]
+            fused.append(_fuse(features[first : first + agents], frame, int(ego), selected))
+            goals.append(targets(frame.near[ego], frame.hits[ego][np.append(selected, ego)].sum(axis=0)))
+        first += agents
+    logits, codes = network.decode(torch.stack(fused))
+    loss = detection_loss(logits, codes, stack(goals))
+    optimiser.zero_grad()
+    loss.backward()  # type: ignore[no-untyped-call]
+    optimiser.step()
+    return float(loss.detach())
+
+
+def _fuse(features: torch.Tensor, frame: TrainingFrame, ego: int, selected: np.ndarray[Any, Any]) -> torch.Tensor:
+    own = features[ego : ego + 1]
+    if not len(selected):
+        return own[0]
+    matrices = np.stack([sampling_matrix(frame.poses[ego], frame.poses[j], AREA_M) for j in selected])
+    warped = warp(features[torch.from_numpy(selected)], torch.from_numpy(matrices).float())
+    return torch.cat([own, warped]).mean(dim=0)
+
+
+def _save(checkpoint: Path, config: TrainingConfig, parts: dict[str, Any], step: int) -> None:
+    state = {name: part.state_dict() for name, part in parts.items()}
+    temporary = checkpoint.with_suffix(".part")
+    torch.save({**state, "config": asdict(config), "step": step}, temporary)
+    temporary.replace(checkpoint)
+
+
+def _resume(checkpoint: Path, config: TrainingConfig, parts: dict[str, Any]) -> int:
+    if not checkpoint.exists():
+        return 0
+    state = torch.load(checkpoint, weights_only=True)
+    if state["config"] != asdict(config):
+        raise ValueError(f"{checkpoint} was made with another configuration: {state['config']}")
+    for name, part in parts.items():
+        part.load_state_dict(state[name])
+    return int(state["step"])

@@ -1,0 +1,265 @@
+"""Messages and frames as msgpack: the one codec, for service and clients alike.
+
+A tensor travels as ``{dtype, shape, data}`` with its bytes little-endian in C order; a pose as 16 numbers, row-major.
+What is read is never trusted: sizes are bounded before anything is allocated, and types, shapes, lengths and
+finiteness are checked against what the detector declares. Each refusal is a `WireError` with a stable code and the
+field it is about.
+"""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Mapping
+from dataclasses import dataclass
+from typing import Any
+
+import msgpack
+import numpy as np
+
+from robosac.boxes import FloatArray
+from robosac.detectors.base import DetectorInfo, Message, Role, TensorSpec
+
+MAX_FRAME = 2**53 - 1
+"""Largest frame number: what every JSON reader can hold exactly."""
+MAX_KEYS = 1024
+MAX_STRING = 256
+RIGID_TOLERANCE = 1e-3
+
+
+class WireError(ValueError):
+    """A body that cannot be accepted.
+
+    Attributes
+    ----------
+    code : str
+        Stable and machine-readable: ``malformed-msgpack``, ``missing-field``, ``wrong-type``, ``wrong-dtype``,
+        ``wrong-shape``, ``wrong-length``, ``non-finite``, ``bad-pose``, ``out-of-range``, ``unknown-tensor``.
+    field : str
+        Path of the offending part, such as ``tensors.features.data``; empty for the body itself.
+    detail : str
+        What was wrong, for a human.
+    """
+
+    def __init__(self, code: str, field: str, detail: str) -> None:
+        super().__init__(f"{field or 'body'}: {detail}")
+        self.code = code
+        self.field = field
+        self.detail = detail
+
+
+@dataclass(frozen=True)
+class MessageEnvelope:
+    """A vehicle's own message, its sender known and its content not yet checked."""
+
+    frame: int
+    vehicle_id: str
+    payload: Mapping[Any, Any]
+
+
+@dataclass(frozen=True)
+class FrameEnvelope:
+    """A whole frame, the contents of its messages not yet checked."""
+
+    frame: int
+    ego: Any
+    teammates: Mapping[str, Any]
+
+
+def pack_message(frame: int, vehicle_id: str, message: Message) -> bytes:
+    """The body of a vehicle's own message."""
+    return _pack({"frame": frame, "vehicle_id": vehicle_id, **_message_fields(message)})
+
+
+def pack_frame(frame: int, ego: Message, teammates: Mapping[str, Message]) -> bytes:
+    """The body of a whole frame."""
+    fields = {name: _message_fields(message) for name, message in teammates.items()}
+    return _pack({"frame": frame, "ego": _message_fields(ego), "teammates": fields})
+
+
+def pack(value: Any) -> bytes:
+    """Any value of plain types, such as a frame result."""
+    return _pack(value)
+
+
+def unpack(body: bytes, max_items: int = MAX_KEYS, max_string: int = MAX_STRING) -> Any:
+    """A body of plain types, within limits.
+
+    Parameters
+    ----------
+    body : bytes
+    max_items : int
+        Entries of one array or map.
+    max_string : int
+        Bytes of one string.
+
+    Raises
+    ------
+    WireError
+        ``malformed-msgpack`` if the body is truncated, has bytes left over, nests too deeply, or holds what msgpack or
+        the limits do not allow.
+    """
+    limit = len(body)
+    try:
+        return msgpack.unpackb(
+            body,
+            raw=False,
+            strict_map_key=True,
+            max_bin_len=limit,
+            max_str_len=min(limit, max_string),
+            max_array_len=min(limit, max_items),
+            max_map_len=min(limit, max_items),
+            max_ext_len=0,
+        )
+    except Exception as error:  # msgpack raises many unrelated types, ValueError and its own among them
+        reason = str(error) or type(error).__name__
+        raise WireError("malformed-msgpack", "", f"not a msgpack value within the limits: {reason}") from error
+
+
+def read_message(body: bytes) -> MessageEnvelope:
+    """Who sent a message and for which frame; the rest is left to `check_message`."""
+    fields = _mapping(unpack(body), "")
+    return MessageEnvelope(_frame(fields), _string(_get(fields, "vehicle_id", ""), "vehicle_id"), fields)
+
+
+def read_frame(body: bytes) -> FrameEnvelope:
+    """The parts of a whole frame; each is left to `check_message`."""
+    fields = _mapping(unpack(body), "")
+    teammates = _mapping(_get(fields, "teammates", ""), "teammates")
+    for name in teammates:
+        _string(name, "teammates")
+    return FrameEnvelope(_frame(fields), _get(fields, "ego", ""), teammates)
+
+
+def check_message(payload: Any, info: DetectorInfo, role: Role, path: str = "") -> Message:
+    """Check pose and tensors of a message against what the detector declares.
+
+    Parameters
+    ----------
+    payload : object
+        What should be a mapping with ``pose`` and ``tensors``.
+    info : DetectorInfo
+    role : {"ego", "teammate"}
+    path : str
+        Where the payload stands in the body, for errors.
+
+    Raises
+    ------
+    WireError
+        For the first thing that is wrong.
+    """
+    fields = _mapping(payload, path)
+    pose = _pose(_get(fields, "pose", path), _join(path, "pose"))
+    where = _join(path, "tensors")
+    tensors = _mapping(_get(fields, "tensors", path), where)
+    specs = info.tensors[role]
+    unknown = [str(name) for name in tensors if name not in specs]
+    if unknown:
+        raise WireError(
+            "unknown-tensor", where, f"unexpected {_quoted(unknown)}; detector {info.name} wants {_quoted(specs)}"
+        )
+    checked = {name: _tensor(_get(tensors, name, where), spec, _join(where, name)) for name, spec in specs.items()}
+    return Message(pose, checked)
+
+
+def _pack(value: Any) -> bytes:
+    packed: bytes = msgpack.packb(value, use_bin_type=True)
+    return packed
+
+
+def _message_fields(message: Message) -> dict[str, Any]:
+    tensors = {}
+    for name, array in message.tensors.items():
+        little = np.ascontiguousarray(array, dtype=array.dtype.newbyteorder("<"))
+        tensors[name] = {"dtype": array.dtype.name, "shape": list(array.shape), "data": little.tobytes()}
+    return {"pose": [float(value) for value in message.pose.reshape(-1)], "tensors": tensors}
+
+
+def _tensor(value: Any, spec: TensorSpec, path: str) -> np.ndarray[Any, np.dtype[Any]]:
+    fields = _mapping(value, path)
+    name = _string(_get(fields, "dtype", path), _join(path, "dtype"))
+    if name != spec.dtype:
+        raise WireError("wrong-dtype", _join(path, "dtype"), f"must be {spec.dtype!r}, got {name!r}")
+    shape = _get(fields, "shape", path)
+    if not isinstance(shape, list) or not all(type(n) is int for n in shape):
+        raise WireError("wrong-type", _join(path, "shape"), "must be an array of integers")
+    if tuple(shape) != spec.shape:
+        raise WireError("wrong-shape", _join(path, "shape"), f"must be {list(spec.shape)}, got {shape[:8]}")
+    data = _get(fields, "data", path)
+    if not isinstance(data, bytes):
+        raise WireError("wrong-type", _join(path, "data"), f"must be binary, got {_type(data)}")
+    dtype = np.dtype(spec.dtype).newbyteorder("<")
+    expected = math.prod(spec.shape) * dtype.itemsize
+    if len(data) != expected:
+        raise WireError("wrong-length", _join(path, "data"), f"must be {expected} bytes, got {len(data)}")
+    array = np.frombuffer(data, dtype=dtype).reshape(spec.shape)
+    if dtype.kind == "f" and not _all_finite(array):
+        raise WireError("non-finite", _join(path, "data"), "holds NaN or infinity")
+    return array
+
+
+def _all_finite(array: np.ndarray[Any, np.dtype[Any]]) -> bool:
+    if array.dtype == np.dtype("<f2"):  # numpy widens half floats one by one; their exponent bits tell as well
+        return bool(np.all((array.view("<u2") & 0x7C00) != 0x7C00))
+    return bool(np.isfinite(array).all())
+
+
+def _pose(value: Any, path: str) -> FloatArray:
+    if not isinstance(value, list) or len(value) != 16:
+        got = f"{len(value)} of them" if isinstance(value, list) else _type(value)
+        raise WireError("bad-pose", path, f"must be an array of 16 numbers, got {got}")
+    if not all(type(v) in (int, float) for v in value):
+        raise WireError("bad-pose", path, "must be an array of 16 numbers")
+    try:
+        pose = np.array(value, dtype=np.float64).reshape(4, 4)
+    except OverflowError as error:
+        raise WireError("bad-pose", path, "a number is too large") from error
+    if not np.isfinite(pose).all():
+        raise WireError("non-finite", path, "holds NaN or infinity")
+    rotation = pose[:3, :3]
+    rigid = (np.abs(rotation) <= 1 + RIGID_TOLERANCE).all() and np.allclose(
+        rotation @ rotation.T, np.eye(3), atol=RIGID_TOLERANCE
+    )
+    if not rigid or np.linalg.det(rotation) < 0 or not np.allclose(pose[3], (0, 0, 0, 1), atol=1e-9):
+        raise WireError("bad-pose", path, "must be a rigid transform: a rotation, a translation, last row 0 0 0 1")
+    return pose
+
+
+def _frame(fields: Mapping[Any, Any]) -> int:
+    frame = _get(fields, "frame", "")
+    if type(frame) is not int:
+        raise WireError("wrong-type", "frame", f"must be an integer, got {_type(frame)}")
+    if not 0 <= frame <= MAX_FRAME:
+        raise WireError("out-of-range", "frame", f"must be between 0 and {MAX_FRAME}")
+    return frame
+
+
+def _get(fields: Mapping[Any, Any], name: str, path: str) -> Any:
+    if name not in fields:
+        raise WireError("missing-field", _join(path, name), "is missing")
+    return fields[name]
+
+
+def _mapping(value: Any, path: str) -> Mapping[Any, Any]:
+    if not isinstance(value, dict):
+        raise WireError("wrong-type", path, f"must be a map, got {_type(value)}")
+    return value
+
+
+def _string(value: Any, path: str) -> str:
+    if not isinstance(value, str):
+        raise WireError("wrong-type", path, f"must be a string, got {_type(value)}")
+    return value
+
+
+def _join(path: str, name: str) -> str:
+    return f"{path}.{name}" if path else name
+
+
+def _quoted(names: Any) -> str:
+    return ", ".join(repr(str(name)) for name in names)
+
+
+def _type(value: Any) -> str:
+    return {dict: "a map", list: "an array", str: "a string", bytes: "binary", type(None): "nil"}.get(
+        type(value), type(value).__name__
+    )

@@ -1,0 +1,66 @@
+"""The ASGI application: ``uvicorn service.app:app``."""
+
+from __future__ import annotations
+
+from service.runtime import tune_process
+
+tune_process()  # before anything imports torch
+
+import asyncio  # noqa: E402
+import contextlib  # noqa: E402
+from collections.abc import AsyncIterator, Callable  # noqa: E402
+from importlib.metadata import version  # noqa: E402
+
+from fastapi import FastAPI  # noqa: E402
+
+from service import problems  # noqa: E402
+from service.engine import Engine  # noqa: E402
+from service.gateway import Gateway  # noqa: E402
+from service.limits import BodyLimit  # noqa: E402
+from service.metrics import Metrics  # noqa: E402
+from service.routes import operations, v1  # noqa: E402
+from service.settings import Settings  # noqa: E402
+from service.store import MemoryStore  # noqa: E402
+
+
+def create_app(settings: Settings | None = None, new_seed: Callable[[], int] | None = None) -> FastAPI:
+    """A gateway.
+
+    Parameters
+    ----------
+    settings : Settings, optional
+        From the environment by default.
+    new_seed : callable, optional
+        Seed of each frame's draws; from the operating system by default. Set it only for replays and tests: whoever
+        knows the seed knows which subsets will be sampled.
+    """
+    settings = settings or Settings()
+    engine = Engine(settings.torch_threads)
+    seeding = {} if new_seed is None else {"new_seed": new_seed}
+    gateway = Gateway(settings, MemoryStore(), engine, Metrics(), **seeding)
+
+    @contextlib.asynccontextmanager
+    async def lifespan(_: FastAPI) -> AsyncIterator[None]:
+        await engine.start()
+        sweeper = asyncio.create_task(gateway.expire_idle_sessions())
+        try:
+            yield
+        finally:
+            sweeper.cancel()
+            engine.stop()
+
+    app = FastAPI(
+        title="Defense gateway for collaborative perception",
+        summary="Fuses teammates' feature maps that the ego's own perception does not contradict.",
+        version=version("robosac"),
+        lifespan=lifespan,
+    )
+    app.state.gateway = gateway
+    problems.install(app)
+    app.add_middleware(BodyLimit, limit=settings.max_body_bytes)
+    app.include_router(v1)
+    app.include_router(operations)
+    return app
+
+
+app = create_app()

@@ -1,0 +1,89 @@
+"""Detectors and the one thread they run on."""
+
+from __future__ import annotations
+
+import asyncio
+import time
+from collections.abc import Callable, Mapping
+from concurrent.futures import ThreadPoolExecutor
+from functools import partial
+from typing import TypeVar
+
+import numpy as np
+import torch
+
+from robosac.boxes import pose_matrix
+from robosac.defenses import Defense, State
+from robosac.detectors import Detector, Message, available, load
+from robosac.fusion import FusionResult, fuse
+
+T = TypeVar("T")
+
+
+class Engine:
+    """Runs fusions one after another on a thread of its own, so that the event loop never waits for torch.
+
+    Parameters
+    ----------
+    threads : int
+        Torch threads of one pass.
+    """
+
+    def __init__(self, threads: int) -> None:
+        self._executor = ThreadPoolExecutor(1, "fusion", initializer=torch.set_num_threads, initargs=(threads,))
+        self._detectors: dict[str, Detector] = {}
+        self.ready = False
+
+    @property
+    def detectors(self) -> Mapping[str, Detector]:
+        """Loaded detectors by name; empty before `start`."""
+        return self._detectors
+
+    async def start(self) -> None:
+        """Load every detector and run one frame through each, so that the first answer is as fast as the next."""
+        self._detectors = await self._submit(lambda: {name: load(name) for name in available()})
+        for detector in self._detectors.values():
+            await self._submit(partial(_warm_up, detector))
+        self.ready = True
+
+    async def fuse(
+        self,
+        detector: Detector,
+        defense: Defense,
+        ego: Message,
+        teammates: Mapping[str, Message],
+        *,
+        seed: int,
+        state: State,
+        deadline: float,
+    ) -> tuple[FusionResult, float]:
+        """`robosac.fusion.fuse` on the engine's thread; also the milliseconds that the frame waited for it."""
+        submitted = time.perf_counter()
+
+        def work() -> tuple[FusionResult, float]:
+            waited_ms = (time.perf_counter() - submitted) * 1e3
+            rng = np.random.default_rng(seed)
+            return fuse(detector, defense, ego, teammates, rng=rng, state=state, deadline=deadline), waited_ms
+
+        return await self._submit(work)
+
+    def stop(self) -> None:
+        """Finish what was submitted."""
+        self.ready = False
+        self._executor.shutdown(wait=True)
+
+    async def _submit(self, work: Callable[[], T]) -> T:
+        return await asyncio.get_running_loop().run_in_executor(self._executor, work)
+
+
+def _warm_up(detector: Detector) -> None:
+    blank = {
+        role: Message(
+            pose_matrix(0, 0, 0, 0), {name: np.zeros(spec.shape, dtype=spec.dtype) for name, spec in specs.items()}
+        )
+        for role, specs in detector.info.tensors.items()
+    }
+    for _ in range(2):
+        prepared = detector.prepare(blank["ego"], {"a": blank["teammate"], "b": blank["teammate"]})
+        prepared.detect()
+        prepared.detect(["a", "b"])

@@ -1,0 +1,56 @@
+"""What the gateway counts, in Prometheus' terms."""
+
+from __future__ import annotations
+
+from collections.abc import Mapping
+
+from prometheus_client import CollectorRegistry, Counter, Gauge, Histogram, generate_latest
+
+from robosac.fusion import FusionResult
+
+_SECONDS = (0.001, 0.0025, 0.005, 0.01, 0.025, 0.05, 0.1, 0.2, 0.5, 1.0, 2.5)
+
+
+class Metrics:
+    """One registry per app, so that several apps of a process do not mix."""
+
+    def __init__(self) -> None:
+        self.registry = CollectorRegistry()
+        self.sessions = Gauge("robosac_sessions", "Open sessions", registry=self.registry)
+        self._frames = Counter("robosac_frames_total", "Answered frames", ["source"], registry=self.registry)
+        self._degraded = Counter("robosac_degraded_frames_total", "Frames cut short", ["by"], registry=self.registry)
+        self._late = Counter("robosac_late_frames_total", "Frames answered after their budget", registry=self.registry)
+        self._hypotheses = Counter("robosac_hypotheses_total", "Tested hypotheses", ["verdict"], registry=self.registry)
+        self._rejected = Counter(
+            "robosac_rejected_teammates_total", "Teammates left out of an answer", ["reason"], registry=self.registry
+        )
+        self._refused = Counter(
+            "robosac_refused_messages_total", "Refused messages", ["reason"], registry=self.registry
+        )
+        self._stages = Histogram(
+            "robosac_stage_seconds", "Time of a frame by stage", ["stage"], buckets=_SECONDS, registry=self.registry
+        )
+
+    def frame(
+        self, result: FusionResult, reasons: list[str], degraded_by: str | None, timings_ms: Mapping[str, float]
+    ) -> None:
+        """Count an answered frame."""
+        self._frames.labels(result.source.value).inc()
+        if degraded_by is not None:
+            self._degraded.labels(degraded_by).inc()
+        if not result.deadline_met:
+            self._late.inc()
+        for outcome in result.hypotheses:
+            self._hypotheses.labels(outcome.verdict.value).inc()
+        for reason in reasons:
+            self._rejected.labels(reason).inc()
+        for stage, milliseconds in timings_ms.items():
+            self._stages.labels(stage).observe(milliseconds / 1e3)
+
+    def refused(self, reason: str) -> None:
+        """Count a refused message."""
+        self._refused.labels(reason).inc()
+
+    def render(self) -> bytes:
+        """The exposition text."""
+        return generate_latest(self.registry)

@@ -1,0 +1,149 @@
+"""The HTTP face of the gateway."""
+
+from __future__ import annotations
+
+import json
+from typing import Annotated, Any
+
+from fastapi import APIRouter, Depends, Header, Query, Request, Response
+from fastapi.security import HTTPAuthorizationCredentials, HTTPBearer
+
+from robosac import wire
+from service.gateway import Caller, Gateway
+from service.problems import Problem
+from service.schemas import DetectorList, FrameResult, Receipt, SessionCreated, SessionRequest, SessionState
+
+MSGPACK = "application/vnd.msgpack"
+MSGPACK_TYPES = (MSGPACK, "application/msgpack", "application/x-msgpack")
+
+v1 = APIRouter(prefix="/v1")
+operations = APIRouter()
+_bearer = HTTPBearer(auto_error=False)
+
+
+def _gateway(request: Request) -> Gateway:
+    gateway: Gateway = request.app.state.gateway
+    return gateway
+
+
+GatewayDep = Annotated[Gateway, Depends(_gateway)]
+Credentials = Annotated[HTTPAuthorizationCredentials | None, Depends(_bearer)]
+
+
+async def _vehicle(sid: str, gateway: GatewayDep, credentials: Credentials) -> Caller:
+    return await gateway.authenticate(sid, credentials.credentials if credentials else None)
+
+
+async def _ego(sid: str, gateway: GatewayDep, credentials: Credentials) -> Caller:
+    return await gateway.authenticate_ego(sid, credentials.credentials if credentials else None)
+
+
+Vehicle = Annotated[Caller, Depends(_vehicle)]
+Ego = Annotated[Caller, Depends(_ego)]
+
+_TENSOR_BODY: dict[str, Any] = {
+    "requestBody": {"required": True, "content": {MSGPACK: {"schema": {"type": "string", "format": "binary"}}}}
+}
+_FRAME_RESPONSES: dict[int | str, dict[str, Any]] = {
+    200: {"model": FrameResult, "description": "The answer to the frame, as JSON or msgpack by `Accept`."}
+}
+
+
+@v1.get("/detectors")
+async def list_detectors(gateway: GatewayDep) -> DetectorList:
+    """What each detector wants to be sent."""
+    return DetectorList(detectors=gateway.detector_list())
+
+
+@v1.post("/sessions", status_code=201)
+async def open_session(request: SessionRequest, gateway: GatewayDep) -> SessionCreated:
+    """Open a session of one ego with its teammates. The tokens are shown only in this answer."""
+    return await gateway.open_session(request)
+
+
+@v1.get("/sessions/{sid}")
+async def get_session(caller: Ego, gateway: GatewayDep) -> SessionState:
+    """The session's settings and what its defence remembers."""
+    return await gateway.describe(caller)
+
+
+@v1.delete("/sessions/{sid}", status_code=204)
+async def delete_session(caller: Ego, gateway: GatewayDep) -> None:
+    """End the session; its audit log goes with it, so fetch that first."""
+    await gateway.close_session(caller)
+
+
+@v1.get("/sessions/{sid}/audit", response_class=Response, responses={200: {"content": {"application/jsonl": {}}}})
+async def get_audit(caller: Ego, gateway: GatewayDep, after: Annotated[int, Query(ge=0)] = 0) -> Response:
+    """The audit log as JSON Lines: records with a number above `after`."""
+    records = await gateway.audit_log(caller, after)
+    lines = "".join(json.dumps(record, allow_nan=False) + "\n" for record in records)
+    return Response(lines, media_type="application/jsonl")
+
+
+@v1.post(
+    "/sessions/{sid}/messages",
+    openapi_extra=_TENSOR_BODY,
+    responses={
+        **_FRAME_RESPONSES,
+        202: {"model": Receipt, "description": "A teammate's message is kept for its frame."},
+    },
+    response_class=Response,
+)
+async def post_message(
+    request: Request, caller: Vehicle, gateway: GatewayDep, accept: Annotated[str | None, Header()] = None
+) -> Response:
+    """A vehicle's own message. The ego's starts the fusion and is answered with the frame result."""
+    body = await _read_body(request)
+    status, answer = await gateway.post_message(caller, body)
+    return _negotiated(answer, accept, status)
+
+
+@v1.post("/sessions/{sid}/frames", openapi_extra=_TENSOR_BODY, responses=_FRAME_RESPONSES, response_class=Response)
+async def post_frame(
+    request: Request, caller: Ego, gateway: GatewayDep, accept: Annotated[str | None, Header()] = None
+) -> Response:
+    """A whole frame in one request by the ego."""
+    body = await _read_body(request)
+    return _negotiated(await gateway.post_frame(caller, body), accept)
+
+
+@operations.get("/healthz")
+async def healthz() -> dict[str, str]:
+    """Whether the process lives."""
+    return {"status": "alive"}
+
+
+@operations.get("/readyz")
+async def readyz(gateway: GatewayDep) -> dict[str, str]:
+    """Whether the gateway is warm and able to serve."""
+    if not gateway.engine.ready:
+        raise Problem(503, "not-ready", "the gateway is still warming up", headers={"Retry-After": "5"})
+    return {"status": "ready"}
+
+
+@operations.get("/metrics", response_class=Response)
+async def metrics(gateway: GatewayDep) -> Response:
+    """Counters and timings for Prometheus."""
+    return Response(gateway.metrics.render(), media_type="text/plain; version=0.0.4; charset=utf-8")
+
+
+async def _read_body(request: Request) -> bytes:
+    """The body of a tensor request; its size is bounded for every route alike."""
+    media_type = request.headers.get("content-type", "").split(";")[0].strip().lower()
+    if media_type not in MSGPACK_TYPES:
+        raise Problem(415, "unsupported-media-type", f"send {MSGPACK}, not {media_type or 'an untyped body'}")
+    if "content-encoding" in request.headers:
+        raise Problem(415, "unsupported-encoding", "bodies must not be compressed", "content-encoding")
+    return await request.body()
+
+
+def _negotiated(answer: dict[str, Any], accept: str | None, status: int = 200) -> Response:
+    """msgpack where the client names it before JSON, else JSON."""
+    for media_range in (accept or "").lower().split(","):
+        media_type = media_range.split(";")[0].strip()
+        if media_type in MSGPACK_TYPES:
+            return Response(wire.pack(answer), status, media_type=MSGPACK)
+        if media_type in ("application/json", "application/*", "*/*"):
+            break
+    return Response(json.dumps(answer, allow_nan=False), status, media_type="application/json")

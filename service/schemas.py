@@ -1,0 +1,181 @@
+"""The JSON of the API, checked at the edge."""
+
+from __future__ import annotations
+
+from typing import Annotated, Any, Literal
+
+from pydantic import BaseModel, ConfigDict, Field, StringConstraints, model_validator
+
+from robosac.budget import DEFAULT_CONFIDENCE
+from robosac.consensus import DEFAULT_THRESHOLD
+from robosac.defenses import Defense, SampleConsensus
+from robosac.detectors import DetectorInfo
+
+VehicleId = Annotated[str, StringConstraints(pattern=r"^[A-Za-z0-9][A-Za-z0-9._:-]{0,63}$")]
+
+
+class _Request(BaseModel):
+    model_config = ConfigDict(extra="forbid", frozen=True, allow_inf_nan=False)
+
+
+class SampleConsensusSettings(_Request):
+    """ROBOSAC, Algorithm 1: sample subsets of teammates until one agrees with the ego."""
+
+    kind: Literal["sample_consensus"] = "sample_consensus"
+    attacker_ratio: float = Field(0.2, gt=0, lt=1, description="Assumed share of attackers among the teammates.")
+    sampling_budget: int | None = Field(None, ge=1, le=10_000, description="Most hypotheses tested in a frame.")
+    collaborators: int | None = Field(None, ge=1, description="Teammates in a hypothesis.")
+    confidence: float = Field(DEFAULT_CONFIDENCE, gt=0, lt=1)
+    consensus_threshold: float = Field(DEFAULT_THRESHOLD, gt=0, le=1, description="Jaccard index of a consensus.")
+    reference: Literal["ego"] = Field("ego", description="What a hypothesis is compared with.")
+
+    def build(self) -> Defense:
+        """The defence itself."""
+        return SampleConsensus(
+            attacker_ratio=self.attacker_ratio,
+            sampling_budget=self.sampling_budget,
+            collaborators=self.collaborators,
+            confidence=self.confidence,
+            consensus_threshold=self.consensus_threshold,
+        )
+
+
+DefenseSettings = SampleConsensusSettings
+
+
+class SessionRequest(_Request):
+    """Opens a session of one ego with its teammates."""
+
+    ego_id: VehicleId
+    teammates: list[VehicleId] = Field(max_length=1024)
+    detector: str | None = None
+    defense: DefenseSettings = SampleConsensusSettings()
+    latency_budget_ms: float | None = Field(None, gt=0, le=60_000)
+    gather_ms: float | None = Field(None, ge=0, le=60_000)
+
+    @model_validator(mode="after")
+    def _distinct_vehicles(self) -> SessionRequest:
+        if len(set(self.teammates)) != len(self.teammates):
+            raise ValueError("teammates must be distinct")
+        if self.ego_id in self.teammates:
+            raise ValueError("the ego cannot be its own teammate")
+        return self
+
+
+class TensorEntry(BaseModel):
+    """Type and shape of one tensor."""
+
+    dtype: str
+    shape: list[int]
+
+
+class DetectorEntry(BaseModel):
+    """What a detector wants to be sent."""
+
+    name: str
+    tensors: dict[Literal["ego", "teammate"], dict[str, TensorEntry]]
+    area_m: tuple[float, float, float, float] = Field(description="xmin, ymin, xmax, ymax; ego frame, metres")
+    cell_m: float
+    weights_digest: str = Field(description="SHA-256 of the weights file")
+
+    @classmethod
+    def of(cls, info: DetectorInfo) -> DetectorEntry:
+        """The entry of a detector."""
+        return cls(
+            name=info.name,
+            tensors={
+                role: {name: TensorEntry(dtype=spec.dtype, shape=list(spec.shape)) for name, spec in specs.items()}
+                for role, specs in info.tensors.items()
+            },
+            area_m=info.area_m,
+            cell_m=info.cell_m,
+            weights_digest=info.weights_digest,
+        )
+
+
+class DetectorList(BaseModel):
+    """All detectors of this gateway."""
+
+    detectors: list[DetectorEntry]
+
+
+class SessionCreated(BaseModel):
+    """A new session and the tokens of its vehicles; they are shown only here."""
+
+    session_id: str
+    ego_token: str
+    teammate_tokens: dict[str, str]
+    detector: DetectorEntry
+    defense: DefenseSettings
+    latency_budget_ms: float
+    gather_ms: float
+
+
+class SessionState(BaseModel):
+    """A session as its ego sees it."""
+
+    session_id: str
+    ego_id: str
+    teammates: list[str]
+    detector: str
+    defense: DefenseSettings
+    latency_budget_ms: float
+    gather_ms: float
+    created_at: str
+    last_frame: int | None
+    frames_answered: int
+    state: dict[str, Any] = Field(description="What the defence remembers between frames.")
+    audit_seq: int = Field(description="Number of the latest audit record.")
+
+
+class Receipt(BaseModel):
+    """A teammate's message is kept for its frame."""
+
+    frame: int
+    vehicle_id: str
+    status: Literal["accepted"] = "accepted"
+
+
+class RejectedTeammate(BaseModel):
+    """Why an enrolled teammate is not in the answer; evidence follows as further fields."""
+
+    model_config = ConfigDict(extra="allow")
+
+    vehicle_id: str
+    reason: Literal[
+        "dissensus",
+        "not_sampled",
+        "distrusted",
+        "missing",
+        "late",
+        "malformed",
+        "stale",
+        "unauthenticated",
+        "replayed",
+    ]
+
+
+class TestedHypothesis(BaseModel):
+    """One tested subset."""
+
+    teammates: list[str]
+    jaccard_index: float
+    verdict: Literal["consensus", "dissensus", "no_evidence"]
+
+
+class FrameResult(BaseModel):
+    """The answer to one frame."""
+
+    frame: int
+    boxes: list[tuple[float, float, float, float, float, float]] = Field(
+        description="x, y, length, width, yaw, score; ego frame, metres and radians, best first"
+    )
+    source: Literal["consensus", "trusted", "ego_only"]
+    accepted: list[str]
+    rejected: list[RejectedTeammate]
+    hypotheses: list[TestedHypothesis]
+    sampling_steps: int
+    attacker_ratio: float | None
+    deadline_met: bool
+    degraded_by: Literal["deadline", "fault"] | None = Field(description="What cut the defence short, if anything.")
+    timings_ms: dict[str, float]

@@ -1,0 +1,30 @@
+"""Settings of the gateway, each from an environment variable ``ROBOSAC_<NAME>``."""
+
+from __future__ import annotations
+
+from pydantic import Field
+from pydantic_settings import BaseSettings, SettingsConfigDict
+
+from robosac.detectors import DEFAULT_DETECTOR
+
+
+class Settings(BaseSettings):
+    """What an operator can set."""
+
+    model_config = SettingsConfigDict(env_prefix="ROBOSAC_", frozen=True)
+
+    detector: str = Field(DEFAULT_DETECTOR, description="Detector of sessions that name none.")
+    latency_budget_ms: float = Field(
+        200.0, gt=0, le=60_000, description="Budget of sessions that name none: from a frame's last byte to its answer."
+    )
+    gather_ms: float = Field(
+        100.0, ge=0, le=60_000, description="Longest wait for teammates' messages once the ego's is in."
+    )
+    max_body_bytes: int = Field(32 * 2**20, ge=1024, description="Largest request body.")
+    max_sessions: int = Field(10_000, ge=1, description="Open sessions at a time.")
+    max_teammates: int = Field(63, ge=1, description="Teammates of one session.")
+    max_pending_frames: int = Field(
+        4, ge=1, description="Frames ahead of the ego for which a teammate's message is kept."
+    )
+    session_idle_s: float = Field(3600.0, gt=0, description="A session unused for longer is ended.")
+    torch_threads: int = Field(1, ge=1, description="Threads of one detector pass; at this size one is fastest.")

@@ -1,0 +1,45 @@
+import json
+
+import pytest
+from typer.testing import CliRunner
+
+from robosac.cli import app
+
+runner = CliRunner()
+
+
+def test_scene_draws_a_picture(tmp_path):
+    out = tmp_path / "x.png"
+    result = runner.invoke(app, ["scene", "--seed", "8", "--frame", "0", "--out", str(out)])
+    assert result.exit_code == 0, result.output
+    assert out.read_bytes().startswith(b"\x89PNG")
+    assert "car-1 sees" in result.output
+
+
+def test_evaluate_prints_and_writes_the_table(tmp_path):
+    result = runner.invoke(app, ["evaluate", "--scenes", "1", "--frames", "1", "--out", str(tmp_path)])
+    assert result.exit_code == 0, result.output
+    assert "Algorithm 1, N = 7" in result.output
+    assert "false alarms" in result.output
+    report = json.loads((tmp_path / "bounds.json").read_text())
+    assert report["frames"] == 1
+    assert {row["name"] for row in report["rows"]} >= {"all benign", "ego only", "no defence"}
+
+
+@pytest.mark.parametrize(
+    ("arguments", "complaint"),
+    [
+        (["scene", "--out", "x.png", "--agent", "car-9"], "there are car-1"),
+        (["scene", "--out", "x.nonsense"], "nonsense"),
+        (["scene", "--out", "x.png", "--seed", "-1"], "--seed"),
+        (["evaluate", "--attack", "nonesuch"], "known: pgd"),
+        (["evaluate", "--attackers", "3", "--collaborators", "3"], "free of 3 attackers"),
+        (["evaluate", "--weights", "/nowhere"], "not a readable"),
+        (["nonesuch"], "No such command"),
+    ],
+)
+def test_bad_arguments_are_explained(arguments, complaint, tmp_path, monkeypatch):
+    monkeypatch.chdir(tmp_path)
+    result = runner.invoke(app, arguments)
+    assert result.exit_code == 2
+    assert complaint in " ".join(result.output.replace("│", "").split())

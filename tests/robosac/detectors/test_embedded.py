@@ -1,0 +1,150 @@
+import json
+
+import numpy as np
+import pytest
+import torch
+from safetensors.torch import load_file, save_file
+
+from robosac.boxes import pairwise_iou, pose_matrix
+from robosac.detectors import EmbeddedDetector, Message, WeightsError, available, load
+from robosac.detectors.embedded import SHIPPED_WEIGHTS, read_weights
+from robosac.detectors.network import MeanFusionNetwork
+from robosac.scenes.splits import TRAINING_SEEDS, VALIDATION_SEEDS
+
+
+def test_the_shipped_weights_are_small_and_say_how_they_were_made():
+    tensors, recipe = read_weights(SHIPPED_WEIGHTS)
+    assert SHIPPED_WEIGHTS.stat().st_size <= 2_000_000
+    assert all(tensor.dtype in (torch.float16, torch.int64) for tensor in tensors.values())
+    assert recipe["command"].startswith("robosac train")
+    first, last = recipe["data"]["training_seeds"]
+    assert first in TRAINING_SEEDS
+    assert last in TRAINING_SEEDS
+    assert all(seed in VALIDATION_SEEDS for seed in recipe["data"]["validation_seeds"])
+    assert {"seed", "feature_gain", "consensus_score", "tensors_sha256", "validation"} <= recipe.keys()
+
+
+def test_the_registry_loads_it(detector):
+    assert available() == ("intersection-mean",)
+    assert load().info == detector.info
+    with pytest.raises(KeyError):
+        load("nonesuch")
+
+
+def test_a_message_is_what_the_detector_declares(detector, benign, ego_message):
+    for role, message in (("ego", ego_message), ("teammate", benign["rsu"])):
+        for name, spec in detector.info.tensors[role].items():
+            assert message.tensors[name].shape == spec.shape
+            assert message.tensors[name].dtype.name == spec.dtype
+
+
+def found(boxes, truth):
+    confident = boxes[boxes[:, 5] >= 0.3]
+    return (pairwise_iou(truth, confident).max(axis=1) >= 0.5).mean()
+
+
+def test_it_sees_and_sees_more_with_teammates(detector, ego_message, benign, scene_frame):
+    truth = scene_frame.truth("car-1")
+    prepared = detector.prepare(ego_message, benign)
+    alone, together = prepared.detect(), prepared.detect(list(benign))
+    assert found(alone, truth) > 0.4
+    assert found(together, truth) > 0.85
+    assert found(together, truth) > found(alone, truth) + 0.1
+
+
+def test_boxes_are_sorted_finite_and_not_the_ego_itself(detector, ego_message, attacked):
+    boxes = detector.prepare(ego_message, attacked).detect(list(attacked))
+    assert np.isfinite(boxes).all()
+    assert (np.diff(boxes[:, 5]) <= 0).all()
+    assert len(boxes) <= 200
+
+
+def test_the_order_of_teammates_does_not_matter(detector, ego_message, benign):
+    prepared = detector.prepare(ego_message, benign)
+    team = list(benign)
+    np.testing.assert_allclose(prepared.detect(team), prepared.detect(team[::-1]), atol=1e-3)
+
+
+def test_a_subset_is_decoded_as_if_nobody_else_were_there(detector, ego_message, benign):
+    some = ["car-3", "rsu"]
+    full = detector.prepare(ego_message, benign).detect(some)
+    only = detector.prepare(ego_message, {name: benign[name] for name in some}).detect(some)
+    np.testing.assert_allclose(full, only, atol=1e-5)
+
+
+def test_an_unknown_teammate_is_an_error(detector, ego_message, benign):
+    with pytest.raises(KeyError):
+        detector.prepare(ego_message, benign).detect(["car-9"])
+
+
+def test_the_gain_changes_messages_and_nothing_else(scene_frame):
+    tensors, _ = read_weights(SHIPPED_WEIGHTS)
+    network = MeanFusionNetwork()
+    network.load_state_dict({name: tensor.float() for name, tensor in tensors.items()})
+    answers = []
+    for gain in (1.0, 0.25):
+        detector = EmbeddedDetector.from_network(network, gain, 0.1, 0.3)
+        messages = {name: detector.encode(v.points, v.pose) for name, v in scene_frame.views.items()}
+        ego = messages.pop("car-1")
+        answers.append((ego.tensors["features"], detector.prepare(ego, messages).detect(list(messages))))
+    (features, boxes), (weak, same_boxes) = answers
+    np.testing.assert_allclose(weak * 4.0, features, rtol=2e-3, atol=1e-3)
+    np.testing.assert_allclose(boxes, same_boxes, atol=1e-4)  # a power of two loses no bits
+
+
+def test_the_frame_is_anchored_to_the_ego_not_to_the_world(detector, ego_message, benign):
+    shift = pose_matrix(100.0, -50.0, 0.0, 1.2)
+
+    def moved(message):
+        return Message(shift @ message.pose, message.tensors)
+
+    team = list(benign)
+    here = detector.prepare(ego_message, benign).detect(team)
+    there = detector.prepare(moved(ego_message), {n: moved(m) for n, m in benign.items()}).detect(team)
+    np.testing.assert_allclose(here, there, atol=5e-3)
+
+
+def test_the_attack_surface_agrees_with_detection(detector, ego_message, benign):
+    surface = detector.attack_surface(ego_message, benign)
+    logits = surface.class_logits(surface.messages)
+    best = torch.sigmoid(logits).max()
+    assert float(best) == pytest.approx(detector.prepare(ego_message, benign).detect(list(benign))[0, 5], abs=1e-3)
+    variable = surface.messages["rsu"].clone().requires_grad_(True)
+    surface.class_logits({**surface.messages, "rsu": variable}).sum().backward()
+    assert variable.grad.abs().sum() > 0
+
+
+def rewritten(tmp_path, change):
+    tensors = load_file(SHIPPED_WEIGHTS)
+    _, recipe = read_weights(SHIPPED_WEIGHTS)
+    metadata = {"robosac": json.dumps(recipe)}
+    change(tensors, metadata)
+    path = tmp_path / "weights.safetensors"
+    save_file(tensors, path, metadata=metadata)
+    return path
+
+
+def flip_one_value(tensors, metadata):
+    next(iter(tensors.values())).view(-1)[0] += 1
+
+
+@pytest.mark.parametrize(
+    ("change", "message"),
+    [
+        (flip_one_value, "is damaged"),
+        (lambda tensors, metadata: metadata.clear(), "no recipe"),
+        (lambda tensors, metadata: tensors.pop("class_head.bias"), "is damaged"),
+    ],
+)
+def test_weights_that_cannot_be_trusted_are_refused(change, message, tmp_path):
+    with pytest.raises(WeightsError, match=message):
+        EmbeddedDetector(rewritten(tmp_path, change))
+
+
+def test_a_file_that_is_no_weights_file_is_refused(tmp_path):
+    path = tmp_path / "weights.safetensors"
+    with pytest.raises(WeightsError, match="not a readable safetensors file"):
+        EmbeddedDetector(path)
+    path.write_bytes(b"junk")
+    with pytest.raises(WeightsError, match="not a readable safetensors file"):
+        EmbeddedDetector(path)

@@ -1,0 +1,42 @@
+import numpy as np
+import torch
+
+from robosac.boxes import from_world, pose_matrix
+from robosac.detectors.warp import sampling_matrix, warp
+
+CELLS, HALF = 32, 32.0
+
+
+def blob(x, y):
+    """A map with a smooth bump at (x, y) metres; rows along +y, columns along +x."""
+    axis = -HALF + 2.0 * (np.arange(CELLS) + 0.5)
+    ys, xs = np.meshgrid(axis, axis, indexing="ij")
+    return torch.from_numpy(np.exp(-((xs - x) ** 2 + (ys - y) ** 2) / 18.0).astype(np.float32))[None, None]
+
+
+def centre(features):
+    axis = torch.from_numpy(-HALF + 2.0 * (np.arange(CELLS) + 0.5)).float()
+    weight = features[0, 0] / features.sum()
+    return float((weight.sum(0) * axis).sum()), float((weight.sum(1) * axis).sum())
+
+
+def test_a_thing_lands_where_the_ego_has_it():
+    ego, teammate = pose_matrix(3.0, -8.0, 1.7, 0.7), pose_matrix(-6.0, 2.0, 5.0, -2.1)
+    thing = np.array([[1.0, 4.0, 1.0, 1.0, 0.0]])
+    seen, expected = from_world(thing, teammate)[0], from_world(thing, ego)[0]
+    matrix = torch.from_numpy(sampling_matrix(ego, teammate, HALF)).float()[None]
+    x, y = centre(warp(blob(seen[0], seen[1]), matrix))
+    np.testing.assert_allclose([x, y], expected[:2], atol=0.15)
+
+
+def test_the_own_frame_is_left_as_it_is():
+    pose = pose_matrix(3.0, -8.0, 1.7, 0.7)
+    features = blob(5.0, -9.0)
+    moved = warp(features, torch.from_numpy(sampling_matrix(pose, pose, HALF)).float()[None])
+    np.testing.assert_allclose(moved, features, atol=1e-5)
+
+
+def test_outside_the_teammates_map_there_is_nothing():
+    far = pose_matrix(500.0, 0.0, 1.7, 0.0)
+    moved = warp(torch.ones(1, 1, CELLS, CELLS), torch.from_numpy(sampling_matrix(np.eye(4), far, HALF)).float()[None])
+    assert float(moved.abs().max()) == 0.0

@@ -1,0 +1,80 @@
+import numpy as np
+import pytest
+import shapely
+from hypothesis import given
+from hypothesis import strategies as st
+
+from robosac.boxes import corners, from_corners, from_world, nms, pairwise_iou, pose_matrix
+
+coordinate = st.floats(-20, 20)
+side = st.floats(0.05, 12)
+angle = st.floats(-10, 10)
+box = st.tuples(coordinate, coordinate, side, side, angle)
+
+
+def shapely_iou(a, b):
+    p, q = shapely.polygons(corners(a)), shapely.polygons(corners(b))
+    intersection = shapely.area(shapely.intersection(p[:, None], q[None, :]))
+    return intersection / (shapely.area(p)[:, None] + shapely.area(q)[None, :] - intersection)
+
+
+@given(st.lists(box, min_size=1, max_size=8), st.lists(box, min_size=1, max_size=8))
+def test_iou_agrees_with_polygon_clipping(a, b):
+    a, b = np.array(a), np.array(b)
+    np.testing.assert_allclose(pairwise_iou(a, b), shapely_iou(a, b), atol=1e-7)
+
+
+@pytest.mark.parametrize("yaw", [0.0, np.pi / 2, -np.pi, 1e-9, 0.3])
+def test_iou_of_degenerate_pairs(yaw):
+    one = np.array([[1.0, 2.0, 4.0, 2.0, yaw]])
+    beside = one + [[4.0 * np.cos(yaw), 4.0 * np.sin(yaw), 0, 0, 0]]
+    inside = one * [[1, 1, 0.5, 0.5, 1]]
+    turned = one + [[0, 0, 0, 0, np.pi]]
+    assert pairwise_iou(one, one) == pytest.approx(1.0)
+    assert pairwise_iou(one, turned) == pytest.approx(1.0)
+    assert pairwise_iou(one, beside) == pytest.approx(0.0, abs=1e-9)
+    assert pairwise_iou(one, inside) == pytest.approx(0.25)
+    assert pairwise_iou(inside, one) == pytest.approx(0.25)
+
+
+def test_iou_of_nothing_and_of_flat_boxes():
+    flat = np.array([[0.0, 0.0, 4.0, 0.0, 0.2]])
+    assert pairwise_iou(np.empty((0, 5)), flat).shape == (0, 1)
+    assert pairwise_iou(flat, flat).tolist() == [[0.0]]
+
+
+@given(box)
+def test_corners_and_back(values):
+    original = np.array([values])
+    again = from_corners(corners(original))
+    np.testing.assert_allclose(again[:, :4], original[:, :4], atol=1e-9)
+    np.testing.assert_allclose(np.exp(1j * again[:, 4]), -np.exp(1j * original[:, 4]), atol=1e-6)
+
+
+def test_corners_are_counter_clockwise():
+    points = corners(np.array([[3.0, -1.0, 4.0, 2.0, 0.7]]))[0]
+    assert shapely.Polygon(points).exterior.is_ccw
+
+
+def test_from_world_inverts_the_pose():
+    pose = pose_matrix(10.0, -3.0, 1.7, 2.5)
+    moved = from_world(np.array([[12.0, 0.0, 4.0, 2.0, 3.0, 0.9]]), pose)
+    back = pose @ np.array([moved[0, 0], moved[0, 1], -1.7, 1.0])
+    np.testing.assert_allclose(back[:2], [12.0, 0.0], atol=1e-12)
+    assert moved[0, 4] == pytest.approx(0.5)
+    assert moved[0, 5] == 0.9
+
+
+def greedy_nms(boxes, scores, threshold):
+    kept = []
+    for i in np.argsort(-scores, kind="stable"):
+        if all(shapely_iou(boxes[[i]], boxes[[k]])[0, 0] <= threshold for k in kept):
+            kept.append(int(i))
+    return kept
+
+
+@pytest.mark.parametrize("n", [0, 1, 30, 200])
+def test_nms_is_greedy(n, rng):
+    boxes = np.column_stack([rng.uniform(-15, 15, (n, 2)), rng.uniform(1, 6, (n, 2)), rng.uniform(-3, 3, n)])
+    scores = rng.choice([0.2, 0.5, 0.9], n)
+    assert nms(boxes, scores, 0.1).tolist() == greedy_nms(boxes, scores, 0.1)

@@ -1,0 +1,66 @@
+import numpy as np
+import pytest
+
+from robosac.boxes import from_corners, pairwise_iou
+from robosac.consensus import Verdict, compare, match
+from tests.conftest import GOLDEN
+
+EMPTY = np.empty((0, 5))
+ROW = np.array([[10.0 * i, 0.0, 4.0, 2.0, 0.0] for i in range(10)])
+
+
+def golden_cases():
+    data = np.load(GOLDEN / "box_matching.npz")
+    first1, first2 = np.cumsum(data["n1"]) - data["n1"], np.cumsum(data["n2"]) - data["n2"]
+    area = data["n1"].astype(int) * data["n2"]
+    first_iou = np.cumsum(area) - area
+    for i, (n1, n2) in enumerate(zip(data["n1"], data["n2"], strict=True)):
+        yield (
+            from_corners(data["boxes1"][first1[i] : first1[i] + n1].reshape(-1, 4, 2)),
+            from_corners(data["boxes2"][first2[i] : first2[i] + n2].reshape(-1, 4, 2)),
+            data["iou"][first_iou[i] : first_iou[i] + area[i]].reshape(n1, n2),
+            float(data["jaccard"][i]),
+            int(data["n_matched"][i]),
+        )
+
+
+def test_agrees_with_the_published_implementation():
+    both_empty = 0
+    for reference, candidate, iou, jaccard, matched in golden_cases():
+        comparison = compare(reference, candidate)
+        if len(reference) == len(candidate) == 0:  # there, index 0; here, agreement without evidence
+            both_empty += 1
+            assert comparison.jaccard_index == 1.0
+            continue
+        np.testing.assert_allclose(pairwise_iou(reference, candidate), iou, atol=1e-6)
+        assert comparison.jaccard_index == pytest.approx(jaccard, abs=1e-12)
+        assert comparison.matched == matched
+    assert both_empty == 1
+
+
+def test_two_empty_perceptions_are_no_evidence():
+    assert compare(EMPTY, EMPTY).verdict is Verdict.NO_EVIDENCE
+
+
+@pytest.mark.parametrize(("reference", "candidate"), [(EMPTY, ROW), (ROW, EMPTY)])
+def test_empty_against_something_is_dissensus(reference, candidate):
+    comparison = compare(reference, candidate)
+    assert (comparison.jaccard_index, comparison.verdict) == (0.0, Verdict.DISSENSUS)
+
+
+@pytest.mark.parametrize(("seen", "verdict"), [(3, Verdict.CONSENSUS), (2, Verdict.DISSENSUS)])
+def test_the_threshold_belongs_to_consensus(seen, verdict):
+    comparison = compare(ROW[:seen], ROW, threshold=0.3)
+    assert comparison.jaccard_index == seen / 10
+    assert comparison.verdict is verdict
+
+
+def test_matching_is_one_to_one():
+    rows, columns = match(ROW[[0, 0, 0]], ROW[:1])
+    assert (len(rows), columns.tolist()) == (1, [0])
+
+
+def test_a_pair_counts_from_the_threshold_on():
+    half = ROW[:1] * [[1, 1, 0.5, 1, 1]]
+    assert len(match(ROW[:1], half, 0.5)[0]) == 1
+    assert len(match(ROW[:1], half, 0.51)[0]) == 0

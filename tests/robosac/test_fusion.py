@@ -1,0 +1,146 @@
+import logging
+from collections.abc import Collection
+
+import numpy as np
+import pytest
+
+from robosac.boxes import pose_matrix
+from robosac.consensus import Verdict
+from robosac.defenses import Decision, Reason, SampleConsensus, Source
+from robosac.detectors import DetectorInfo, Message
+from robosac.fusion import SAFETY, fuse
+
+EGO = Message(pose_matrix(0, 0, 0, 0), {})
+TEAM = dict.fromkeys("abcde", EGO)
+SEEN = np.array([[10.0 * i, 5.0, 4.0, 2.0, 0.0, 0.9] for i in range(5)])
+NOISE = SEEN + [[3.0, 50.0, 0, 0, 0, 0]]
+
+
+class FakeDetector:
+    """Decodes the same boxes for every clean subset and others for one with an attacker; time passes by its clock."""
+
+    def __init__(self, attackers: Collection[str] = (), pass_s: float = 0.0, broken: str = "") -> None:
+        self.info = DetectorInfo("fake", {"ego": {}, "teammate": {}}, (-32, -32, 32, 32), 2.0, "0", 0.5)
+        self.attackers = set(attackers)
+        self.pass_s = pass_s
+        self.broken = broken
+        self.now = 0.0
+        self.decoded: list[tuple[str, ...]] = []
+
+    def clock(self) -> float:
+        return self.now
+
+    def prepare(self, ego, teammates):
+        if self.broken == "prepare" and teammates:
+            raise RuntimeError("cannot warp")
+        return self
+
+    def detect(self, teammates=()):
+        if self.broken == "detect" and teammates:
+            raise RuntimeError("cannot decode")
+        self.now += self.pass_s
+        self.decoded.append(tuple(teammates))
+        return NOISE if self.attackers & set(teammates) else SEEN
+
+
+def run(detector, defense=SampleConsensus(sampling_budget=7, collaborators=3), team=TEAM, seed=0, **options):
+    rng = np.random.default_rng(seed)
+    return fuse(detector, defense, EGO, team, rng=rng, clock=detector.clock, **options)
+
+
+@pytest.mark.parametrize("seed", range(10))
+def test_the_answer_is_the_verified_subset(seed):
+    result = run(FakeDetector(["c"]), seed=seed)
+    assert result.source is Source.CONSENSUS
+    assert "c" not in result.accepted
+    assert result.hypotheses[-1].teammates == result.accepted
+    assert [o.verdict for o in result.hypotheses] == [Verdict.DISSENSUS] * (result.sampling_steps - 1) + [
+        Verdict.CONSENSUS
+    ]
+    np.testing.assert_array_equal(result.boxes, SEEN)
+    assert set(result.rejected) == set(TEAM) - set(result.accepted)
+
+
+def test_with_attackers_everywhere_the_ego_answers_alone():
+    result = run(FakeDetector("abcde"))
+    assert (result.source, result.accepted, result.sampling_steps) == (Source.EGO_ONLY, (), 7)
+    np.testing.assert_array_equal(result.boxes, SEEN)
+
+
+def test_without_teammates_only_the_ego_is_decoded():
+    detector = FakeDetector()
+    result = run(detector, team={})
+    assert detector.decoded == [()]
+    assert result.source is Source.EGO_ONLY
+
+
+def test_weak_boxes_take_no_part_in_the_test():
+    detector = FakeDetector()
+    weak = np.vstack([SEEN, NOISE * [[1, 1, 1, 1, 1, 0.1]]])
+    detector.detect = lambda teammates=(): weak if teammates else SEEN
+    result = run(detector)
+    assert result.hypotheses[0].jaccard_index == 1.0
+    assert len(result.boxes) == 10
+
+
+@pytest.mark.parametrize("budget", [0.5, 1.0, 2.5, 3.7, 5.0, 20.0])
+def test_no_pass_is_begun_that_cannot_end_in_time(budget):
+    detector = FakeDetector("abcde", pass_s=1.0)
+    result = run(detector, deadline=budget)
+    expected = 0
+    while 1.0 + expected + SAFETY <= budget and expected < 7:
+        expected += 1
+    assert result.sampling_steps == expected
+    assert result.out_of_time == (expected < 7)
+    assert result.deadline_met == (budget >= 1.0)
+    assert result.source is Source.EGO_ONLY
+
+
+def test_a_slow_pass_makes_the_next_estimate_careful():
+    detector = FakeDetector("abcde", pass_s=1.0)
+    slow = detector.detect
+
+    def detect(teammates=()):
+        detector.now += 3.0 if teammates else 0.0
+        return slow(teammates)
+
+    detector.detect = detect
+    result = run(detector, deadline=9.0)
+    assert (result.sampling_steps, result.deadline_met) == (1, True)
+
+
+@pytest.mark.parametrize("part", ["prepare", "detect"])
+def test_a_fault_inside_is_answered_by_the_ego_alone(part, caplog):
+    with caplog.at_level(logging.CRITICAL):
+        result = run(FakeDetector(broken=part))
+    assert result.source is Source.EGO_ONLY
+    assert "RuntimeError: cannot" in result.fault
+    assert set(result.rejected) == set(TEAM)
+    assert {r.reason for r in result.rejected.values()} == {Reason.NOT_SAMPLED}
+    np.testing.assert_array_equal(result.boxes, SEEN)
+
+
+class Liar(SampleConsensus):
+    """Answers with a subset that was never in consensus."""
+
+    def converse(self, team, state, rng):
+        yield [("a",)]
+        return Decision(("a", "b"), Source.CONSENSUS, {}, None, state)
+
+
+def test_nothing_unverified_reaches_the_answer(caplog):
+    with caplog.at_level(logging.CRITICAL):
+        result = run(FakeDetector(), Liar())
+    assert (result.source, result.accepted) == (Source.EGO_ONLY, ())
+    assert "UnverifiedAnswer" in result.fault
+
+
+def test_the_embedded_detector_end_to_end(detector, ego_message, attacked):
+    results = [
+        fuse(detector, SampleConsensus(collaborators=3), ego_message, attacked, rng=np.random.default_rng(seed))
+        for seed in range(8)
+    ]
+    assert all(result.source is Source.CONSENSUS for result in results)
+    assert all("car-2" not in result.accepted for result in results)
+    assert any(result.sampling_steps > 1 for result in results)
+    assert all(len(result.boxes) for result in results)

@@ -1,0 +1,88 @@
+import json
+from dataclasses import replace
+
+import numpy as np
+import pytest
+import torch
+from safetensors import safe_open
+
+from robosac.detectors import EmbeddedDetector
+from robosac.detectors.decoding import cell_centres
+from robosac.training.export import export_weights
+from robosac.training.loop import TrainingConfig, train_network
+from robosac.training.loss import detection_loss, stack, targets
+from robosac.training.validation import OperatingPoint
+
+TINY = TrainingConfig(scenes=2, frames_per_scene=2, steps=40, frames_per_step=2, egos_per_frame=2)
+
+
+def silent(stage, done, total, remark):
+    assert 1 <= done <= total
+
+
+class Stop(Exception):
+    pass
+
+
+def test_training_learns_and_resumes_where_it_stopped(tmp_path, monkeypatch):
+    losses = []
+
+    def note(stage, done, total, remark):
+        if stage == "train":
+            losses.append(float(remark.split()[-1]))
+
+    whole = train_network(TINY, tmp_path / "whole.pt", note)
+    assert np.mean(losses[-5:]) < 0.9 * np.mean(losses[:5])
+
+    def interrupt(stage, done, total, remark):
+        if stage == "train" and done == 29:
+            raise Stop
+
+    monkeypatch.setattr("robosac.training.loop.CHECKPOINT_EVERY", 8)
+    with pytest.raises(Stop):
+        train_network(TINY, tmp_path / "parts.pt", interrupt)
+    resumed = train_network(TINY, tmp_path / "parts.pt", silent)
+    for name, tensor in whole.state_dict().items():
+        torch.testing.assert_close(resumed.state_dict()[name], tensor)
+
+
+def test_a_checkpoint_of_another_run_is_refused(tmp_path):
+    train_network(TINY, tmp_path / "c.pt", silent)
+    with pytest.raises(ValueError, match="another configuration"):
+        train_network(replace(TINY, seed=2), tmp_path / "c.pt", silent)
+
+
+def test_exported_weights_load_with_their_recipe(tmp_path):
+    network = train_network(TINY, tmp_path / "c.pt", silent)
+    point = OperatingPoint(0.5, 0.1, 0.3, {"ego_only_ap50": 0.1})
+    path = tmp_path / "weights.safetensors"
+    recipe = export_weights(network, TINY, point, "robosac train --out DIR", path)
+    detector = EmbeddedDetector(path)
+    assert detector.recipe == recipe
+    assert detector.info.consensus_score == 0.3
+    with safe_open(path, framework="pt") as file:
+        assert json.loads(file.metadata()["robosac"])["feature_gain"] == 0.5
+
+
+def test_targets_know_what_was_seen_what_is_doubtful_and_what_nobody_can_know():
+    near = np.array(
+        [[10.5, 0.5, 4.5, 1.9, 0.3], [20.5, 0.5, 4.5, 1.9, 0.0], [-10.5, 0.5, 4.5, 1.9, 0.0], [0.5, 0.5, 4.5, 2, 0]]
+    )
+    heat, weight, codes, code_weight = targets(near, np.array([9, 2, 0, 50]))
+    seen, doubtful, unseen, own = (32, 42), (32, 52), (32, 21), (32, 32)
+    assert (heat[seen], weight[seen], code_weight[seen]) == (1.0, 1.0, 1.0)
+    assert (round(heat[doubtful], 6), weight[doubtful], code_weight[doubtful]) == (0.0, 0.0, 0.0)
+    assert (round(heat[unseen], 6), weight[unseen]) == (0.0, 1.0)
+    assert (weight[own], code_weight[own]) == (0.0, 0.0)
+    xs, ys = cell_centres()
+    np.testing.assert_allclose(codes[:2, *seen], near[0, :2] - [xs[seen], ys[seen]], atol=1e-6)
+    np.testing.assert_allclose(codes[2:, *seen], [np.log(4.5), np.log(1.9), np.cos(0.6), np.sin(0.6)], atol=1e-6)
+
+
+def test_the_loss_is_least_at_the_truth():
+    goal = stack([targets(np.array([[10.5, 0.5, 4.5, 1.9, 0.3]]), np.array([9]))])
+    heat, _, codes, _ = goal
+    right = torch.where(heat == 1.0, 8.0, -8.0)
+    assert float(detection_loss(right, codes, goal)) < 0.05
+    assert float(detection_loss(-right, codes, goal)) > 1.0
+    assert float(detection_loss(right, codes + 1.0, goal)) > 1.0
