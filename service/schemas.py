@@ -4,7 +4,7 @@ from __future__ import annotations
 
 from typing import Annotated, Any, Literal
 
-from pydantic import BaseModel, ConfigDict, Field, StringConstraints, model_validator
+from pydantic import BaseModel, ConfigDict, Field, StringConstraints, ValidationInfo, field_validator
 
 from robosac.budget import DEFAULT_CONFIDENCE
 from robosac.consensus import DEFAULT_THRESHOLD
@@ -53,13 +53,14 @@ class SessionRequest(_Request):
     latency_budget_ms: float | None = Field(None, gt=0, le=60_000)
     gather_ms: float | None = Field(None, ge=0, le=60_000)
 
-    @model_validator(mode="after")
-    def _distinct_vehicles(self) -> SessionRequest:
-        if len(set(self.teammates)) != len(self.teammates):
+    @field_validator("teammates")
+    @classmethod
+    def _distinct_vehicles(cls, teammates: list[str], others: ValidationInfo) -> list[str]:
+        if len(set(teammates)) != len(teammates):
             raise ValueError("teammates must be distinct")
-        if self.ego_id in self.teammates:
+        if others.data.get("ego_id") in teammates:
             raise ValueError("the ego cannot be its own teammate")
-        return self
+        return teammates
 
 
 class TensorEntry(BaseModel):

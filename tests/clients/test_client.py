@@ -1,0 +1,105 @@
+import httpx
+import numpy as np
+import pytest
+
+from clients.client import FrameAnswer, GatewayClient
+from clients.errors import (
+    AccessDenied,
+    FrameConflict,
+    GatewayError,
+    GatewayUnavailable,
+    GatewayUnreachable,
+    InvalidRequest,
+    ProtocolError,
+    SessionNotFound,
+)
+from robosac import wire
+
+PROBLEM = {"type": "urn:robosac:problem:wrong-shape", "detail": "must be [1]", "field": "tensors.x.shape"}
+
+
+def gateway(handler) -> GatewayClient:
+    return GatewayClient("http://gateway", transport=httpx.MockTransport(handler))
+
+
+@pytest.mark.parametrize(
+    ("status", "kind"),
+    [
+        (400, InvalidRequest),
+        (401, AccessDenied),
+        (403, AccessDenied),
+        (404, SessionNotFound),
+        (409, FrameConflict),
+        (413, InvalidRequest),
+        (422, InvalidRequest),
+        (500, GatewayUnavailable),
+        (503, GatewayUnavailable),
+    ],
+)
+async def test_problems_become_exceptions(status, kind):
+    async with gateway(lambda _: httpx.Response(status, json=PROBLEM, headers={"Retry-After": "7"})) as client:
+        with pytest.raises(kind) as caught:
+            await client.detectors()
+    error = caught.value
+    assert (error.status, error.type, error.field) == (status, PROBLEM["type"], PROBLEM["field"])
+    assert error.retry_after_s == 7.0
+    assert "wrong-shape: tensors.x.shape: must be [1]" in str(error)
+
+
+async def test_a_refusal_without_a_problem_is_still_one():
+    async with gateway(lambda _: httpx.Response(502, text="<html>")) as client:
+        with pytest.raises(GatewayUnavailable, match="502"):
+            await client.detectors()
+
+
+@pytest.mark.parametrize("error", [httpx.ConnectError("refused"), httpx.ReadTimeout("slow")])
+async def test_a_gateway_that_does_not_answer_is_unreachable(error):
+    def fail(_):
+        raise error
+
+    async with gateway(fail) as client:
+        assert not await client.ready()
+        with pytest.raises(GatewayUnreachable):
+            await client.detectors()
+
+
+@pytest.mark.parametrize("content", [b"", b"junk", b"\x80", wire.pack({"frame": 1, "boxes": 3})])
+async def test_an_answer_that_is_no_frame_result_is_a_protocol_error(content, ego_message):
+    async with gateway(lambda _: httpx.Response(200, content=content)) as client:
+        with pytest.raises(ProtocolError):
+            await client.vehicle("s", "e", "t").ask(0, ego_message)
+        with pytest.raises(ProtocolError):
+            await client.open_session("e", ["a"])
+
+
+async def test_a_vehicle_sends_its_token_and_asks_for_msgpack(ego_message):
+    seen = []
+
+    def answer(request):
+        seen.append(request)
+        return httpx.Response(202, json={})
+
+    async with gateway(answer) as client:
+        await client.vehicle("s1", "car-2", "token").send(3, ego_message)
+    (request,) = seen
+    assert request.url.path == "/v1/sessions/s1/messages"
+    assert request.headers["authorization"] == "Bearer token"
+    assert request.headers["content-type"] == request.headers["accept"] == "application/vnd.msgpack"
+    envelope = wire.read_message(request.content)
+    assert (envelope.frame, envelope.vehicle_id) == (3, "car-2")
+
+
+def test_a_frame_without_boxes_has_an_empty_array():
+    fields = {
+        "frame": 0, "boxes": [], "source": "ego_only", "accepted": [], "rejected": [], "hypotheses": [],
+        "sampling_steps": 0, "deadline_met": True, "timings_ms": {},
+    }  # fmt: skip
+    assert FrameAnswer.parse(fields).boxes.shape == (0, 6)
+    np.testing.assert_array_equal(
+        FrameAnswer.parse({**fields, "boxes": [[1, 2, 3, 4, 5, 6]]}).boxes, [[1, 2, 3, 4, 5, 6]]
+    )
+
+
+def test_every_exception_has_one_root():
+    for kind in (GatewayUnreachable, ProtocolError, AccessDenied, FrameConflict, InvalidRequest):
+        assert issubclass(kind, GatewayError)

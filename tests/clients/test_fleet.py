@@ -1,0 +1,109 @@
+import io
+import json
+
+import numpy as np
+import pytest
+from matplotlib.image import imread
+from rich.console import Console
+from typer.testing import CliRunner
+
+from clients.demo import main as demo_main
+from clients.errors import GatewayUnreachable
+from clients.fleet import FleetOptions, close_run, main, run_fleet
+from clients.local_gateway import local_gateway
+from clients.simulation import Fleet
+from robosac.attacks import PGD
+from robosac.scenes import IntersectionScene
+
+
+def options(url, **changes):
+    values = {
+        "url": url, "scenes": 1, "frames": 3, "first_scene": 3, "egos": 1, "attackers": 1, "attack": "pgd", "seed": 0,
+        "defense": {"kind": "sample_consensus", "collaborators": 3}, "real_time": False, "report": None,
+    }  # fmt: skip
+    return FleetOptions(**{**values, **changes})
+
+
+async def test_a_fleet_of_independent_clients_end_to_end(tmp_path):
+    console = Console(file=io.StringIO(), width=100)
+    async with local_gateway(tmp_path / "gateway.log") as url:
+        chosen = options(url, scenes=2, frames=3, egos=2, report=tmp_path / "report")
+        summary = await run_fleet(chosen, console)
+    close_run(chosen, summary, console)
+    assert summary.frames == 2 * 3 * 2
+    assert summary.clean_share >= 0.9
+    report = json.loads((tmp_path / "report" / "summary.json").read_text())
+    ap = {name: values["ap50"] for name, values in report["average_precision"].items()}
+    assert ap["all benign"] >= ap["gateway"] > ap["ego only"] > ap["no defence"]
+    assert report["settings"]["attackers"] == 1
+    tally = report["participation"]
+    assert sum(tally["attackers"].values()) == 12
+    assert sum(tally["honest"].values()) == 12 * 4
+    assert report["sampling_steps"]["mean"] >= 1
+    assert report["latency_ms"]["p50"] <= report["latency_ms"]["p99"]
+    assert imread(tmp_path / "report" / "example.png").std() > 0.01
+    text = console.file.getvalue()
+    for expected in ("what the gateway answered", "No attacker accepted in", "dissensus", "Latency over HTTP"):
+        assert expected in text
+
+
+def test_attackers_are_never_the_ego_and_send_each_ego_its_own(detector):
+    for seed in range(5):
+        fleet = Fleet(IntersectionScene(3), detector, 2, 2, PGD(steps=2), seed)
+        assert not fleet.attackers & set(fleet.egos)
+        first, second = fleet.sense(0)
+        for attacker in fleet.attackers:
+            sent = first.sent[attacker].tensors["features"]
+            assert not np.array_equal(sent, first.benign[attacker].tensors["features"])
+            assert not np.array_equal(sent, second.sent[attacker].tensors["features"])
+        for honest in set(first.sent) - fleet.attackers:
+            assert first.sent[honest] is first.benign[honest]
+        assert second.ego_id in first.sent
+
+
+@pytest.mark.parametrize(("egos", "attackers"), [(0, 1), (6, 0), (1, 6), (1, -1)])
+def test_impossible_fleets_are_refused(detector, egos, attackers):
+    with pytest.raises(ValueError, match="must be between"):
+        Fleet(IntersectionScene(3), detector, egos, attackers, PGD(), 0)
+
+
+def command(function):
+    import typer
+
+    app = typer.Typer()
+    app.command()(function)
+    return app
+
+
+def test_a_fleet_without_a_gateway_says_so():
+    result = CliRunner().invoke(command(main), ["--url", "http://127.0.0.1:9", "--frames", "1", "--scenes", "1"])
+    assert result.exit_code == 1
+    assert "The fleet stopped" in result.output
+
+
+def test_an_unknown_attack_is_explained():
+    result = CliRunner().invoke(command(main), ["--attack", "nonesuch"])
+    assert result.exit_code == 2
+    assert "known: pgd" in result.output
+
+
+def test_the_demo_shows_a_summary(tmp_path):
+    result = CliRunner().invoke(command(demo_main), ["--report", str(tmp_path), "--scenes", "1", "--frames", "2"])
+    assert result.exit_code == 0, result.output
+    assert "No attacker accepted in" in result.output
+    assert (tmp_path / "example.png").exists()
+
+
+def test_the_demo_fails_loudly_when_the_gateway_does(tmp_path, monkeypatch):
+    monkeypatch.setenv("ROBOSAC_GATHER_MS", "nonsense")
+    result = CliRunner().invoke(command(demo_main), ["--report", str(tmp_path)])
+    assert result.exit_code == 1
+    assert "The demo failed" in result.output
+    assert "gather_ms" in result.output
+
+
+async def test_a_gateway_that_does_not_start_shows_its_log(tmp_path, monkeypatch):
+    monkeypatch.setenv("ROBOSAC_TORCH_THREADS", "0")
+    with pytest.raises(GatewayUnreachable, match="torch_threads"):
+        async with local_gateway(tmp_path / "gateway.log"):
+            pytest.fail("it started")

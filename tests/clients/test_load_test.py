@@ -1,0 +1,47 @@
+import json
+
+import pytest
+import typer
+from typer.testing import CliRunner
+
+from clients.load_test import Figures, Load, _Bodies, main
+from robosac import wire
+
+
+def test_a_short_run_measures_every_load(tmp_path):
+    app = typer.Typer()
+    app.command()(main)
+    arguments = ["--seconds", "0.6", "--egos", "1", "--egos", "3", "--rate", "5", "--out", str(tmp_path)]
+    result = CliRunner().invoke(app, arguments)
+    assert result.exit_code == 0, result.output
+    report = json.loads((tmp_path / "load_test.json").read_text())
+    loads = report["loads"]
+    assert {(load["loop"], load["egos"], load["attacked"]) for load in loads} == {
+        (loop, egos, attacked) for loop in ("closed", "open") for egos in (1, 3) for attacked in (False, True)
+    }
+    assert report["bytes_a_frame"] > 6 * 64 * 32 * 32 * 2
+    for load in loads:
+        assert load["errors"] == {}
+        assert load["fps"] > 0
+        assert load["latency_ms"]["p50"] <= load["latency_ms"]["p95"] <= load["latency_ms"]["p99"]
+        assert load["sampling_steps_mean"] >= 1
+        assert {"receive", "queue", "prepare", "hypotheses", "total"} <= set(load["stages_ms"])
+        if load["loop"] == "open":
+            assert load["frames"] == load["egos"] * 3
+
+
+def test_refused_frames_count_as_not_answered_in_time():
+    figures = Figures(Load("closed", 1, attacked=False), seconds=2.0)
+    answer = type("Answer", (), {"sampling_steps": 1, "deadline_met": True, "timings_ms": {"total": 3.0}})()
+    figures.add(answer, 10.0, budget_ms=200.0)
+    figures.add(answer, 300.0, budget_ms=200.0)
+    figures.errors["GatewayUnavailable"] += 2
+    values = figures.as_dict()
+    assert values["fps"] == 1.0
+    assert values["within_budget_share"] == 0.25
+
+
+@pytest.mark.parametrize("index", [0, 3, 200, 70_000])
+def test_prepared_bodies_are_renumbered(ego_message, benign, index):
+    bodies = _Bodies([wire.pack_frame(0, ego_message, benign)])
+    assert bodies.numbered(index) == wire.pack_frame(index, ego_message, benign)

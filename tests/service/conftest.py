@@ -1,0 +1,79 @@
+from collections.abc import AsyncIterator, Callable
+from contextlib import asynccontextmanager
+from dataclasses import dataclass
+from typing import Any
+
+import httpx
+import pytest
+
+from clients.client import GatewayClient, OpenedSession, VehicleClient
+from robosac import wire
+from service.app import create_app
+from service.gateway import Gateway
+from service.settings import Settings
+
+EGO = "car-1"
+TEAM = ("car-2", "car-3", "car-4", "car-5", "rsu")
+MSGPACK = {"Content-Type": "application/vnd.msgpack"}
+
+
+@dataclass
+class Served:
+    """A gateway in this process, its typed client, and raw HTTP for what the client would never send."""
+
+    gateway: Gateway
+    client: GatewayClient
+    http: httpx.AsyncClient
+
+    async def open(self, **options: Any) -> OpenedSession:
+        options.setdefault("gather_ms", 2000)
+        options.setdefault("latency_budget_ms", 20_000)
+        return await self.client.open_session(EGO, TEAM, **options)
+
+    def ego(self, session: OpenedSession) -> VehicleClient:
+        return self.client.vehicle(session.session_id, EGO, session.ego_token)
+
+    def teammate(self, session: OpenedSession, name: str) -> VehicleClient:
+        return self.client.vehicle(session.session_id, name, session.teammate_tokens[name])
+
+    async def post(self, session: OpenedSession, what: str, body: bytes, token: str | None = None, **headers: str):
+        bearer = {"Authorization": f"Bearer {token or session.ego_token}"}
+        return await self.http.post(
+            f"/v1/sessions/{session.session_id}/{what}", content=body, headers={**MSGPACK, **bearer, **headers}
+        )
+
+
+@asynccontextmanager
+async def serve(new_seed: Callable[[], int] | None = None, **settings: Any) -> AsyncIterator[Served]:
+    app = create_app(Settings(**settings), new_seed)
+    transport = httpx.ASGITransport(app, raise_app_exceptions=False)
+    async with (
+        app.router.lifespan_context(app),
+        GatewayClient("http://gateway", transport=transport) as client,
+        httpx.AsyncClient(base_url="http://gateway", transport=transport) as http,
+    ):
+        yield Served(app.state.gateway, client, http)
+
+
+@pytest.fixture
+async def served() -> AsyncIterator[Served]:
+    async with serve() as served:
+        yield served
+
+
+@pytest.fixture
+def good_frame(ego_message, benign) -> Callable[[int], bytes]:
+    """The body of a good frame with a given number."""
+    return lambda index: wire.pack_frame(index, ego_message, benign)
+
+
+def problem(response: httpx.Response, status: int, slug: str) -> dict[str, Any]:
+    """Check that a response is this problem, and give its fields."""
+    assert response.status_code == status, response.text
+    assert response.headers["content-type"] == "application/problem+json"
+    fields = response.json()
+    assert fields["type"] == f"urn:robosac:problem:{slug}"
+    assert fields["status"] == status
+    assert fields["title"]
+    assert fields["detail"]
+    return fields

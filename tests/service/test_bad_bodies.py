@@ -1,0 +1,190 @@
+import msgpack
+import numpy as np
+import pytest
+
+from robosac import wire
+from robosac.detectors import Message
+from tests.service.conftest import problem, serve
+
+
+def altered(body, path, value):
+    fields = msgpack.unpackb(body)
+    *parents, last = path.split(".")
+    target = fields
+    for name in parents:
+        target = target[name]
+    target[last] = value
+    return msgpack.packb(fields)
+
+
+NAN = np.full((64, 32, 32), np.nan, dtype=np.float16).tobytes()
+HUGE_CLAIM = b"\x83\xa5frame\x01\xa3ego\xc6\xff\xff\xff\xff"
+
+# what is done to a message, and the status, type and field that must answer it
+DAMAGE = {
+    "truncated": (lambda body: body[:-100], 400, "malformed-msgpack", ""),
+    "trailing": (lambda body: body + b"\x00", 400, "malformed-msgpack", ""),
+    "empty": (lambda body: b"", 400, "malformed-msgpack", ""),
+    "a claim of 4 GiB": (lambda body: HUGE_CLAIM, 400, "malformed-msgpack", ""),
+    "no map": (lambda body: b"\x01", 422, "wrong-type", ""),
+    "wrong type": (
+        lambda body: altered(body, "tensors.features.data", "text"),
+        422,
+        "wrong-type",
+        "tensors.features.data",
+    ),
+    "wrong dtype": (
+        lambda body: altered(body, "tensors.features.dtype", "float32"),
+        422,
+        "wrong-dtype",
+        "tensors.features.dtype",
+    ),
+    "wrong shape": (
+        lambda body: altered(body, "tensors.features.shape", [64, 32, 33]),
+        422,
+        "wrong-shape",
+        "tensors.features.shape",
+    ),
+    "a shape of 4 GiB": (
+        lambda body: altered(body, "tensors.features.shape", [65536, 65536]),
+        422,
+        "wrong-shape",
+        "tensors.features.shape",
+    ),
+    "wrong length": (
+        lambda body: altered(body, "tensors.features.data", b"1234"),
+        422,
+        "wrong-length",
+        "tensors.features.data",
+    ),
+    "NaN": (lambda body: altered(body, "tensors.features.data", NAN), 422, "non-finite", "tensors.features.data"),
+    "bad pose": (lambda body: altered(body, "pose", [0.0] * 16), 422, "bad-pose", "pose"),
+    "no frame": (lambda body: altered(body, "frame", None), 422, "wrong-type", "frame"),
+}
+damage = pytest.mark.parametrize(("spoil", "status", "slug", "field"), list(DAMAGE.values()), ids=list(DAMAGE))
+
+
+@damage
+async def test_a_bad_message_is_refused_recorded_and_costs_its_sender_only(
+    served, messages, spoil, status, slug, field
+):
+    session = await served.open(gather_ms=20)
+    ego = served.ego(session)
+    body = spoil(wire.pack_message(0, "car-2", messages["car-2"]))
+    token = session.teammate_tokens["car-2"]
+    fields = problem(await served.post(session, "messages", body, token), status, slug)
+    assert fields["field"] == field
+    for name in ("car-3", "car-4", "car-5", "rsu"):
+        await served.teammate(session, name).send(0, messages[name])
+    answer = await ego.ask(0, messages["car-1"])
+    assert answer.source == "consensus"
+    assert answer.rejected["car-2"]["reason"] == "malformed"
+    (refusal,) = [record for record in await ego.audit() if record["event"] == "message_refused"]
+    assert (refusal["vehicle_id"], refusal["reason"], refusal["field"]) == ("car-2", "malformed", field)
+    await served.teammate(session, "car-2").send(1, messages["car-2"])
+    answer = await ego.ask(1, messages["car-1"])
+    assert answer.accepted == ("car-2",)
+
+
+@damage
+async def test_a_bad_message_of_the_ego_is_refused_and_its_next_frame_is_answered(
+    served, messages, good_frame, spoil, status, slug, field
+):
+    session = await served.open(gather_ms=0)
+    body = spoil(wire.pack_message(0, "car-1", messages["car-1"]))
+    problem(await served.post(session, "messages", body), status, slug)
+    assert (await served.post(session, "frames", good_frame(0))).status_code == 200
+
+
+@damage
+async def test_a_malformed_ego_part_refuses_the_whole_frame(served, good_frame, spoil, status, slug, field):
+    session = await served.open()
+    if field in ("", "frame"):
+        body = spoil(good_frame(0))
+        expected = field
+    else:
+        frame = msgpack.unpackb(good_frame(0))
+        frame["ego"] = msgpack.unpackb(spoil(msgpack.packb(frame["ego"])))
+        body, expected = msgpack.packb(frame), f"ego.{field}"
+    fields = problem(await served.post(session, "frames", body), status, slug)
+    assert fields["field"] == expected
+    assert (await served.post(session, "frames", good_frame(0))).json()["source"] == "consensus"
+
+
+@pytest.mark.parametrize(
+    ("spoil", "status", "slug", "field"), [values for values in DAMAGE.values() if values[3] not in ("", "frame")]
+)
+async def test_a_malformed_teammate_in_a_whole_frame_is_rejected_and_the_frame_is_answered(
+    served, good_frame, spoil, status, slug, field
+):
+    session = await served.open()
+    frame = msgpack.unpackb(good_frame(0))
+    frame["teammates"]["car-3"] = msgpack.unpackb(spoil(msgpack.packb(frame["teammates"]["car-3"])))
+    result = (await served.post(session, "frames", msgpack.packb(frame))).json()
+    assert result["source"] == "consensus"
+    (entry,) = [entry for entry in result["rejected"] if entry["vehicle_id"] == "car-3"]
+    assert entry["reason"] == "malformed"
+    assert entry["field"] == f"teammates.car-3.{field}"
+    assert entry["detail"]
+
+
+async def test_a_teammate_of_the_wrong_kind_is_malformed_too(served, good_frame):
+    session = await served.open()
+    body = altered(good_frame(0), "teammates.rsu", None)
+    result = (await served.post(session, "frames", body)).json()
+    assert {e["vehicle_id"]: e["reason"] for e in result["rejected"]}["rsu"] == "malformed"
+
+
+async def test_strangers_in_a_whole_frame_are_named_and_not_fused(served, good_frame, benign, ego_message):
+    session = await served.open()
+    body = wire.pack_frame(0, ego_message, {**benign, "stranger": benign["rsu"]})
+    result = (await served.post(session, "frames", body)).json()
+    assert {e["vehicle_id"]: e["reason"] for e in result["rejected"]}["stranger"] == "unauthenticated"
+    assert all("stranger" not in h["teammates"] for h in result["hypotheses"])
+
+
+async def test_a_vehicle_cannot_speak_for_another(served, messages):
+    session = await served.open(gather_ms=20)
+    ego = served.ego(session)
+    thief = session.teammate_tokens["car-2"]
+    for victim in ("car-3", "car-1", "nobody"):
+        body = wire.pack_message(0, victim, messages["car-2"])
+        fields = problem(await served.post(session, "messages", body, thief), 403, "wrong-vehicle")
+        assert fields["field"] == "vehicle_id"
+    body = wire.pack_message(0, "car-3", messages["car-3"])
+    problem(await served.post(session, "messages", body, session.ego_token), 403, "wrong-vehicle")
+    problem(await served.post(session, "frames", body, thief), 403, "ego-only")
+    answer = await ego.ask(0, messages["car-1"])
+    assert answer.rejected["car-2"]["reason"] == "unauthenticated"
+    assert answer.rejected["car-3"]["reason"] == "missing"
+    refused = [r for r in await ego.audit() if r["event"] == "message_refused"]
+    assert [r["vehicle_id"] for r in refused] == ["car-2"] * 3 + ["car-1"]
+    assert {r["reason"] for r in refused} == {"unauthenticated"}
+
+
+async def test_bodies_are_bounded_before_they_are_read(good_frame):
+    async with serve(max_body_bytes=1_000_000) as served:
+        session = await served.open()
+        assert (await served.post(session, "frames", good_frame(0))).status_code == 200
+        problem(await served.post(session, "frames", bytes(1_000_001)), 413, "too-large")
+
+        async def endless():
+            for _ in range(100):
+                yield bytes(100_000)
+
+        headers = {"Authorization": f"Bearer {session.ego_token}", "Content-Type": "application/vnd.msgpack"}
+        path = f"/v1/sessions/{session.session_id}/frames"
+        problem(await served.http.post(path, content=endless(), headers=headers), 413, "too-large")
+        headers["Content-Length"] = str(4 * 2**30)
+        problem(await served.http.post(path, content=b"x", headers=headers), 413, "too-large")
+        problem(await served.http.post("/v1/sessions", content=bytes(1_000_001)), 413, "too-large")
+        assert (await served.post(session, "frames", good_frame(1))).status_code == 200
+
+
+async def test_messages_of_absurd_size_break_nothing(served, ego_message, benign):
+    loud = Message(benign["car-2"].pose, {"features": np.full((64, 32, 32), 65504, dtype=np.float16)})
+    session = await served.open(defense={"sampling_budget": 7, "collaborators": 3})
+    answer = await served.ego(session).post_frame(0, ego_message, {**benign, "car-2": loud})
+    assert answer.source == "consensus"
+    assert "car-2" not in answer.accepted
+    assert np.isfinite(answer.boxes).all()

@@ -1,0 +1,246 @@
+import asyncio
+import json
+
+import msgpack
+import numpy as np
+import pytest
+
+from robosac import wire
+from robosac.boxes import pose_matrix
+from robosac.defenses import SampleConsensus
+from robosac.detectors import Message
+from robosac.fusion import fuse
+from tests.service.conftest import EGO, TEAM, problem, serve
+
+ACCEPT_JSON = {"Accept": "application/json"}
+
+
+async def test_over_http_and_through_the_library_the_answer_is_the_same(detector, ego_message, attacked):
+    defense = {"kind": "sample_consensus", "attacker_ratio": 0.2, "sampling_budget": 7, "collaborators": 3}
+    seeds = iter(range(100))
+    async with serve(new_seed=lambda: next(seeds)) as served:
+        session = await served.open(defense=defense)
+        steps = []
+        for frame in range(6):
+            answer = await served.ego(session).post_frame(frame, ego_message, attacked)
+            expected = fuse(
+                detector,
+                SampleConsensus(0.2, 7, 3),
+                ego_message,
+                {name: attacked[name] for name in TEAM},
+                rng=np.random.default_rng(frame),
+            )
+            np.testing.assert_array_equal(answer.boxes, expected.boxes)
+            assert answer.accepted == expected.accepted
+            assert [tuple(h["teammates"]) for h in answer.hypotheses] == [o.teammates for o in expected.hypotheses]
+            assert [h["verdict"] for h in answer.hypotheses] == [o.verdict.value for o in expected.hypotheses]
+            assert [h["jaccard_index"] for h in answer.hypotheses] == [o.jaccard_index for o in expected.hypotheses]
+            assert "car-2" not in answer.accepted
+            steps.append(answer.sampling_steps)
+        assert max(steps) > 1
+
+
+async def test_the_audit_log_replays_a_decision(detector, served, ego_message, attacked):
+    session = await served.open(defense={"collaborators": 3})
+    answer = await served.ego(session).post_frame(0, ego_message, attacked)
+    record = (await served.ego(session).audit())[-1]
+    again = fuse(
+        detector,
+        SampleConsensus(collaborators=3),
+        ego_message,
+        {name: attacked[name] for name in TEAM},
+        rng=np.random.default_rng(int(record["seed"])),
+    )
+    assert again.accepted == answer.accepted
+    np.testing.assert_array_equal(again.boxes, answer.boxes)
+
+
+async def test_a_frame_result_has_the_fields_of_the_contract(served, good_frame):
+    session = await served.open()
+    response = await served.post(session, "frames", good_frame(7), **ACCEPT_JSON)
+    assert response.headers["content-type"] == "application/json"
+    result = response.json()
+    assert result["frame"] == 7
+    assert result["source"] == "consensus"
+    assert all(len(box) == 6 for box in result["boxes"])
+    assert set(result["accepted"]) | {entry["vehicle_id"] for entry in result["rejected"]} == set(TEAM)
+    assert result["sampling_steps"] == len(result["hypotheses"]) >= 1
+    assert set(result["hypotheses"][0]) == {"teammates", "jaccard_index", "verdict"}
+    assert result["attacker_ratio"] == 0.2
+    assert result["deadline_met"] is True
+    assert result["degraded_by"] is None
+    assert {"receive", "queue", "prepare", "ego_only", "hypotheses", "consensus", "total"} <= set(result["timings_ms"])
+
+
+@pytest.mark.parametrize(
+    ("accept", "media_type"),
+    [
+        ("application/vnd.msgpack", "application/vnd.msgpack"),
+        ("application/msgpack", "application/vnd.msgpack"),
+        ("text/html, application/msgpack;q=0.5", "application/vnd.msgpack"),
+        ("application/json, application/msgpack", "application/json"),
+        ("*/*", "application/json"),
+        ("", "application/json"),
+    ],
+)
+async def test_results_come_as_the_client_asks(served, good_frame, accept, media_type):
+    session = await served.open()
+    response = await served.post(session, "frames", good_frame(0), Accept=accept)
+    assert response.headers["content-type"] == media_type
+    result = response.json() if media_type.endswith("json") else msgpack.unpackb(response.content)
+    assert result["frame"] == 0
+
+
+async def test_both_msgpack_types_are_taken_and_others_are_not(served, good_frame):
+    session = await served.open()
+    response = await served.post(session, "frames", good_frame(0), **{"Content-Type": "application/msgpack"})
+    assert response.status_code == 200
+    for media_type in ("application/json", "application/octet-stream", ""):
+        response = await served.post(session, "frames", good_frame(1), **{"Content-Type": media_type})
+        problem(response, 415, "unsupported-media-type")
+    response = await served.post(session, "frames", good_frame(1), **{"Content-Encoding": "gzip"})
+    problem(response, 415, "unsupported-encoding")
+
+
+async def test_vehicles_send_their_own_messages(served, messages):
+    session = await served.open()
+    sends = [served.teammate(session, name).send(0, messages[name]) for name in TEAM]
+    answer, *_ = await asyncio.gather(served.ego(session).ask(0, messages[EGO]), *sends)
+    assert answer.source == "consensus"
+    assert {entry["reason"] for entry in answer.rejected.values()} <= {"not_sampled", "dissensus"}
+    assert answer.timings_ms["gather"] >= 0
+
+
+async def test_the_ego_does_not_wait_longer_than_for_all(served, messages):
+    session = await served.open(gather_ms=10_000)
+    for name in TEAM:
+        await served.teammate(session, name).send(0, messages[name])
+    answer = await served.ego(session).ask(0, messages[EGO])
+    assert answer.timings_ms["gather"] < 1000
+
+
+async def test_missing_teammates_are_waited_for_and_then_left_out(served, messages):
+    session = await served.open(gather_ms=60)
+    for name in ("car-2", "car-3"):
+        await served.teammate(session, name).send(0, messages[name])
+    answer = await served.ego(session).ask(0, messages[EGO])
+    assert answer.timings_ms["gather"] >= 50
+    assert [answer.rejected[name]["reason"] for name in ("car-4", "car-5", "rsu")] == ["missing"] * 3
+    assert set(answer.accepted) <= {"car-2", "car-3"}
+
+
+async def test_with_nobody_there_the_ego_answers_alone(served, messages):
+    session = await served.open(gather_ms=0)
+    answer = await served.ego(session).ask(0, messages[EGO])
+    assert (answer.source, answer.accepted, answer.sampling_steps) == ("ego_only", (), 0)
+    assert len(answer.boxes)
+    assert set(answer.rejected) == set(TEAM)
+
+
+async def test_messages_may_come_some_frames_ahead_but_only_so_many(messages):
+    async with serve(max_pending_frames=2) as served:
+        session = await served.open(gather_ms=20)
+        teammate = served.teammate(session, "car-2")
+        for frame in (0, 1, 10**12):
+            await teammate.send(frame, messages["car-2"])
+        first = await served.ego(session).ask(0, messages[EGO])
+        assert first.rejected["car-2"]["reason"] == "missing"  # its oldest made way for its newest
+        second = await served.ego(session).ask(1, messages[EGO])
+        assert "car-2" in second.accepted
+
+
+async def test_late_stale_and_second_messages_are_refused_and_named(served, messages):
+    session = await served.open(gather_ms=20)
+    ego, teammate = served.ego(session), served.teammate(session, "car-2")
+
+    def body(frame):
+        return wire.pack_message(frame, "car-2", messages["car-2"])
+
+    async def post(frame):
+        return await served.post(session, "messages", body(frame), session.teammate_tokens["car-2"])
+
+    await teammate.send(5, messages["car-2"])
+    problem(await post(5), 409, "duplicate-message")
+    assert (await ego.ask(5, messages[EGO])).accepted == ("car-2",)
+    problem(await post(5), 409, "stale-frame")
+    assert (await ego.ask(6, messages[EGO])).rejected["car-2"]["reason"] == "late"
+    problem(await post(3), 409, "stale-frame")
+    assert (await ego.ask(7, messages[EGO])).rejected["car-2"]["reason"] == "stale"
+    assert (await ego.ask(8, messages[EGO])).rejected["car-2"]["reason"] == "missing"
+    refused = [r["reason"] for r in await ego.audit() if r["event"] == "message_refused"]
+    assert refused == ["replayed", "late", "stale"]
+
+
+async def test_frames_of_the_ego_must_increase(served, good_frame):
+    session = await served.open()
+    assert (await served.post(session, "frames", good_frame(3))).status_code == 200
+    for stale in (3, 2):
+        assert problem(await served.post(session, "frames", good_frame(stale)), 409, "stale-frame")["field"] == "frame"
+    assert (await served.post(session, "frames", good_frame(4))).status_code == 200
+
+
+async def test_the_same_frame_sent_twice_at_once_is_answered_once(served, good_frame):
+    session = await served.open()
+    responses = await asyncio.gather(*(served.post(session, "frames", good_frame(0)) for _ in range(5)))
+    assert sorted(response.status_code for response in responses) == [200, 409, 409, 409, 409]
+
+
+async def test_a_session_that_ends_under_a_waiting_ego_says_so(served, messages):
+    session = await served.open(gather_ms=300)
+    ego = served.ego(session)
+    asking = asyncio.create_task(ego.ask(0, messages[EGO]))
+    await asyncio.sleep(0.05)
+    await ego.close()
+    assert (await asking).source == "ego_only"
+
+
+async def test_when_time_is_short_the_ego_answers_alone_and_says_why(served, good_frame):
+    session = await served.open(latency_budget_ms=0.01)
+    result = (await served.post(session, "frames", good_frame(0))).json()
+    assert (result["source"], result["degraded_by"], result["deadline_met"]) == ("ego_only", "deadline", False)
+    assert {entry["reason"] for entry in result["rejected"]} == {"not_sampled"}
+    assert len(result["boxes"])
+
+
+async def test_a_fault_inside_still_gives_the_ego_its_own_boxes(served, good_frame, monkeypatch, caplog):
+    caplog.set_level("CRITICAL")
+
+    def broken(*_):
+        raise RuntimeError("boom")
+
+    monkeypatch.setattr("robosac.fusion.compare", broken)
+    session = await served.open()
+    result = (await served.post(session, "frames", good_frame(0))).json()
+    assert (result["source"], result["degraded_by"]) == ("ego_only", "fault")
+    assert "boom" in (await served.ego(session).audit())[-1]["fault"]
+    monkeypatch.undo()
+    assert (await served.post(session, "frames", good_frame(1))).json()["source"] == "consensus"
+
+
+async def test_an_empty_street_is_no_evidence_and_earns_nobody_trust(served, ego_message):
+    blank = {"features": np.zeros((64, 32, 32), dtype=np.float16)}
+    nothing = Message(pose_matrix(0, 0, 1.7, 0), blank)
+    session = await served.open(defense={"sampling_budget": 3, "collaborators": 3})
+    answer = await served.ego(session).post_frame(0, nothing, dict.fromkeys(TEAM, nothing))
+    if len(answer.boxes) == 0:
+        assert answer.source == "ego_only"
+        assert {h["verdict"] for h in answer.hypotheses} == {"no_evidence"}
+
+
+async def test_the_audit_log_is_json_lines_from_any_point(served, ego_message, attacked):
+    session = await served.open(defense={"collaborators": 3})
+    ego = served.ego(session)
+    for frame in range(3):
+        await ego.post_frame(frame, ego_message, attacked)
+    response = await served.http.get(
+        f"/v1/sessions/{session.session_id}/audit", headers={"Authorization": f"Bearer {session.ego_token}"}
+    )
+    assert response.headers["content-type"] == "application/jsonl"
+    records = [json.loads(line) for line in response.text.splitlines()]
+    assert [record["seq"] for record in records] == [1, 2, 3, 4]
+    assert [record["event"] for record in records] == ["session_opened"] + ["frame_answered"] * 3
+    assert records[0]["weights_digest"] == session.detector["weights_digest"]
+    for record in records[1:]:
+        assert {"accepted", "rejected", "hypotheses", "seed", "timings_ms", "deadline_met"} <= set(record)
+    assert await ego.audit(after=2) == records[2:]
+    assert await ego.audit(after=99) == []

@@ -1,0 +1,76 @@
+import httpx
+import pytest
+
+from robosac import wire
+from service.app import create_app
+from service.settings import Settings
+from tests.service.conftest import problem
+
+
+async def test_alive_at_once_and_ready_after_the_warm_up():
+    app = create_app(Settings())
+    transport = httpx.ASGITransport(app)
+    async with httpx.AsyncClient(base_url="http://gateway", transport=transport) as http:
+        assert (await http.get("/healthz")).status_code == 200
+        problem(await http.get("/readyz"), 503, "not-ready")
+        problem(await http.post("/v1/sessions", json={"ego_id": "a", "teammates": ["b"]}), 503, "not-ready")
+        async with app.router.lifespan_context(app):
+            assert (await http.get("/readyz")).json() == {"status": "ready"}
+        problem(await http.get("/readyz"), 503, "not-ready")
+
+
+async def test_metrics_count_what_happened(served, ego_message, attacked, messages):
+    session = await served.open(defense={"collaborators": 3})
+    for frame in range(4):
+        await served.ego(session).post_frame(frame, ego_message, attacked)
+    bad = wire.pack_message(0, "car-3", messages["car-3"])
+    await served.post(session, "messages", bad, session.teammate_tokens["car-2"])
+    text = (await served.http.get("/metrics")).text
+    values = {line.rsplit(" ", 1)[0]: float(line.rsplit(" ", 1)[1]) for line in text.splitlines() if line[0] != "#"}
+    assert values["robosac_sessions"] == 1
+    assert values['robosac_frames_total{source="consensus"}'] == 4
+    assert values['robosac_hypotheses_total{verdict="consensus"}'] == 4
+    assert values['robosac_refused_messages_total{reason="unauthenticated"}'] == 1
+    assert values['robosac_stage_seconds_count{stage="total"}'] == 4
+    rejected = sum(v for k, v in values.items() if k.startswith("robosac_rejected_teammates_total"))
+    assert rejected == 4 * 2
+
+
+async def test_the_api_describes_itself(served):
+    description = (await served.http.get("/openapi.json")).json()
+    paths = set(description["paths"])
+    assert {
+        "/v1/detectors",
+        "/v1/sessions",
+        "/v1/sessions/{sid}",
+        "/v1/sessions/{sid}/messages",
+        "/v1/sessions/{sid}/frames",
+        "/v1/sessions/{sid}/audit",
+        "/healthz",
+        "/readyz",
+        "/metrics",
+    } <= paths
+    body = description["paths"]["/v1/sessions/{sid}/frames"]["post"]
+    assert "application/vnd.msgpack" in body["requestBody"]["content"]
+    assert "FrameResult" in str(body["responses"]["200"])
+    assert (await served.http.get("/docs")).status_code == 200
+
+
+async def test_an_error_nobody_foresaw_is_a_problem_without_its_inside(served, monkeypatch, caplog):
+    caplog.set_level("CRITICAL")
+
+    def broken(*_):
+        raise RuntimeError("secret")
+
+    monkeypatch.setattr(served.gateway, "detector_list", broken)
+    response = await served.http.get("/v1/detectors")
+    problem(response, 500, "internal-error")
+    assert "secret" not in response.text
+
+
+def test_settings_come_from_the_environment(monkeypatch):
+    monkeypatch.setenv("ROBOSAC_LATENCY_BUDGET_MS", "75")
+    assert Settings().latency_budget_ms == 75
+    monkeypatch.setenv("ROBOSAC_GATHER_MS", "-1")
+    with pytest.raises(ValueError, match="gather_ms"):
+        Settings()

@@ -1,0 +1,130 @@
+import pytest
+
+from clients.errors import AccessDenied, SessionNotFound
+from tests.service.conftest import EGO, TEAM, problem, serve
+
+
+async def test_the_detectors_say_what_to_send(served, detector):
+    (entry,) = await served.client.detectors()
+    assert entry["name"] == "intersection-mean"
+    assert entry["tensors"]["ego"] == entry["tensors"]["teammate"]
+    assert entry["tensors"]["ego"]["features"] == {"dtype": "float16", "shape": [64, 32, 32]}
+    assert entry["area_m"] == [-32, -32, 32, 32]
+    assert entry["weights_digest"] == detector.info.weights_digest
+
+
+async def test_a_session_answers_with_everything_its_vehicles_need(served):
+    session = await served.open(defense={"kind": "sample_consensus", "collaborators": 3})
+    assert set(session.teammate_tokens) == set(TEAM)
+    assert len({session.ego_token, *session.teammate_tokens.values()}) == 6
+    assert session.detector["name"] == "intersection-mean"
+    assert session.defense["collaborators"] == 3
+    assert session.defense["consensus_threshold"] == 0.3
+
+
+async def test_state_and_end(served, good_frame):
+    session = await served.open()
+    ego = served.ego(session)
+    before = await ego.state()
+    assert (before["ego_id"], before["teammates"], before["last_frame"]) == (EGO, list(TEAM), None)
+    await served.post(session, "frames", good_frame(4))
+    after = await ego.state()
+    assert (after["last_frame"], after["frames_answered"]) == (4, 1)
+    assert after["audit_seq"] == 2
+    await ego.close()
+    with pytest.raises(SessionNotFound):
+        await ego.state()
+
+
+@pytest.mark.parametrize(
+    ("request_", "field", "hint"),
+    [
+        ({}, "ego_id", "required"),
+        ({"ego_id": "a"}, "teammates", "required"),
+        ({"ego_id": "a b", "teammates": []}, "ego_id", "pattern"),
+        ({"ego_id": "../etc", "teammates": []}, "ego_id", "pattern"),
+        ({"ego_id": "a\n", "teammates": []}, "ego_id", "pattern"),
+        ({"ego_id": "a", "teammates": ["b", "b"]}, "teammates", "distinct"),
+        ({"ego_id": "a", "teammates": ["b", "a"]}, "teammates", "own teammate"),
+        ({"ego_id": "a", "teammates": ["b"], "surprise": 1}, "surprise", "not permitted"),
+        ({"ego_id": "a", "teammates": ["b"], "latency_budget_ms": 0}, "latency_budget_ms", "greater than 0"),
+        ({"ego_id": "a", "teammates": ["b"], "detector": "nonesuch"}, "detector", "intersection-mean"),
+        ({"ego_id": "a", "teammates": ["b"], "defense": {"kind": "magic"}}, "defense.kind", "sample_consensus"),
+        (
+            {"ego_id": "a", "teammates": ["b"], "defense": {"attacker_ratio": 1.0}},
+            "defense.attacker_ratio",
+            "less than 1",
+        ),
+        ({"ego_id": "a", "teammates": ["b"], "defense": {"attacker_ratio": 0}}, "defense.attacker_ratio", "greater"),
+        ({"ego_id": "a", "teammates": ["b"], "defense": {"sampling_budget": 0}}, "defense.sampling_budget", "greater"),
+        ({"ego_id": "a", "teammates": ["b", "c"], "defense": {"collaborators": 3}}, "defense", "between 1 and"),
+        ({"ego_id": "a", "teammates": list("bcdef"), "defense": {"collaborators": 5}}, "defense", "at most 4"),
+        ({"ego_id": "a", "teammates": [f"v{i}" for i in range(64)]}, "teammates", "at most 63"),
+    ],
+)
+async def test_a_bad_request_is_told_what_is_wrong_with_which_field(served, request_, field, hint):
+    response = await served.http.post("/v1/sessions", json=request_)
+    assert response.status_code == 422
+    fields = problem(response, 422, response.json()["type"].rsplit(":", 1)[-1])
+    assert fields["field"] == field
+    assert hint in fields["detail"]
+
+
+async def test_bodies_that_are_no_json_are_refused(served):
+    response = await served.http.post("/v1/sessions", content=b"{", headers={"Content-Type": "application/json"})
+    problem(response, 400, "malformed-json")
+
+
+async def test_only_the_ego_may_look_inside_and_end_the_session(served):
+    session = await served.open()
+    spy = served.teammate(session, "car-2")
+    for call in (spy.state, spy.audit, spy.close):
+        with pytest.raises(AccessDenied) as caught:
+            await call()
+        assert caught.value.status == 403
+    assert (await served.ego(session).state())["session_id"] == session.session_id
+
+
+@pytest.mark.parametrize("authorization", [None, "Bearer", "Bearer wrong", "Basic abc", "Bearer \xff"])
+async def test_without_a_token_of_the_session_nothing_is_told(served, authorization):
+    session = await served.open()
+    headers = {} if authorization is None else {"Authorization": authorization.encode("latin-1")}
+    response = await served.http.get(f"/v1/sessions/{session.session_id}", headers=headers)
+    problem(response, 401, "unauthenticated")
+    assert response.headers["www-authenticate"] == "Bearer"
+
+
+async def test_tokens_of_one_session_are_worth_nothing_in_another(served):
+    one, other = await served.open(), await served.open()
+    with pytest.raises(AccessDenied):
+        await served.client.vehicle(one.session_id, EGO, other.ego_token).state()
+
+
+async def test_unknown_sessions_and_paths_are_problems_too(served):
+    problem(await served.http.get("/v1/sessions/nope", headers={"Authorization": "Bearer x"}), 404, "unknown-session")
+    problem(await served.http.get("/v1/nope"), 404, "not-found")
+    problem(await served.http.put("/v1/sessions"), 405, "method-not-allowed")
+
+
+async def test_the_number_of_sessions_is_bounded():
+    async with serve(max_sessions=2) as served:
+        first = await served.open()
+        await served.open()
+        response = await served.http.post("/v1/sessions", json={"ego_id": "a", "teammates": ["b"]})
+        problem(response, 503, "too-many-sessions")
+        assert response.headers["retry-after"]
+        await served.ego(first).close()
+        await served.open()
+
+
+async def test_idle_sessions_expire(monkeypatch):
+    monkeypatch.setattr("service.gateway.SWEEP_EVERY_S", 0.02)
+    async with serve(session_idle_s=0.3) as served:
+        idle, busy = await served.open(), await served.open()
+        import asyncio
+
+        for _ in range(12):
+            await asyncio.sleep(0.05)
+            await served.ego(busy).state()
+        with pytest.raises(SessionNotFound):
+            await served.ego(idle).state()
