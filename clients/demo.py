@@ -7,6 +7,7 @@ import sys
 from pathlib import Path
 from typing import Annotated
 
+import torch
 import typer
 from rich.console import Console
 
@@ -27,6 +28,7 @@ def main(
 
     Exits with 1 if anything failed, or if the attacker got into more than 5 % of the answers.
     """
+    torch.set_num_threads(1)
     console = Console()
     try:
         options, summary = asyncio.run(_run(report, scenes, frames, console))

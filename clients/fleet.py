@@ -10,6 +10,7 @@ from dataclasses import dataclass
 from pathlib import Path
 from typing import Annotated, Any
 
+import torch
 import typer
 from rich.console import Console, Group
 from rich.live import Live
@@ -198,6 +199,7 @@ def main(
     report: Annotated[Path | None, typer.Option(help="Folder for summary.json and example.png.")] = None,
 ) -> None:
     """Drive a simulated fleet, some of it hostile, through a running gateway."""
+    torch.set_num_threads(1)
     console = Console()
     if attack not in ATTACKS:
         raise typer.BadParameter(f"unknown attack {attack!r}; known: {', '.join(ATTACKS)}", param_hint="--attack")

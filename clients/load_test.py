@@ -22,7 +22,9 @@ from pathlib import Path
 from typing import Annotated, Any
 
 import numpy as np
+import torch
 import typer
+from rich.box import SIMPLE_HEAD
 from rich.console import Console
 from rich.progress import track
 from rich.table import Table
@@ -190,36 +192,33 @@ async def _post(ego: VehicleClient, body: bytes, figures: Figures, due: float, b
 
 def show(console: Console, results: Sequence[Figures], bytes_a_frame: int, budget_ms: float) -> None:
     """Print the figures and the gateway's own timings by stage."""
-    table = Table(
-        title=f"Six vehicles, {bytes_a_frame / 1e3:.0f} kB a frame; latency budget {budget_ms:.0f} ms",
-        title_justify="left",
-    )
-    for heading in ("load", "FPS", "p50 ms", "p95 ms", "p99 ms", "in budget", "steps", "errors"):
-        table.add_column(heading, justify="left" if heading == "load" else "right", no_wrap=heading == "load")
-    stages = Table(title="The gateway's own median timings, ms", title_justify="left")
+    size = f"{bytes_a_frame / 1e3:.0f} kB a frame"
+    figures_of_load = ("FPS", "p50", "p95", "p99", "in time", "steps", "errors")
+    table = _table(f"Six vehicles, {size}; latencies in ms, budget {budget_ms:.0f} ms", figures_of_load)
     names = list(dict.fromkeys(stage for figures in results for stage in figures.stages))
-    for heading in ("load", *names):
-        stages.add_column(
-            heading.replace("_", " "), justify="left" if heading == "load" else "right", no_wrap=heading == "load"
-        )
+    stages = _table("The gateway's own median timings, ms", [name.replace("_", " ") for name in names])
     for figures in results:
-        values = figures.as_dict()
-        work = figures.load
-        rate = "" if work.rate_hz is None else f" at {work.rate_hz:g} Hz"
-        label = (
-            f"{work.loop}, {work.egos} ego{'s' * (work.egos > 1)}{rate}, {'attacked' if work.attacked else 'benign'}"
-        )
+        values, work = figures.as_dict(), figures.load
+        loop = work.loop if work.rate_hz is None else f"{work.loop} {work.rate_hz:g} Hz"
+        label = (loop, str(work.egos), "PGD" if work.attacked else "none")
         table.add_row(
-            label,
+            *label,
             f"{values['fps']:.1f}",
-            *(f"{values['latency_ms'][p]:.1f}" for p in ("p50", "p95", "p99")),
+            *(f"{values['latency_ms'][p]:.0f}" for p in ("p50", "p95", "p99")),
             f"{values['within_budget_share']:.1%}",
             f"{values['sampling_steps_mean']:.2f}",
             str(sum(figures.errors.values())),
         )
-        stages.add_row(label, *(f"{values['stages_ms'].get(name, float('nan')):.1f}" for name in names))
+        stages.add_row(*label, *(f"{values['stages_ms'].get(name, float('nan')):.1f}" for name in names))
     console.print(table)
     console.print(stages)
+
+
+def _table(title: str, columns: Sequence[str]) -> Table:
+    table = Table(title=title, title_justify="left", box=SIMPLE_HEAD, padding=(0, 0, 0, 1))
+    for heading in ("loop", "egos", "attack", *columns):
+        table.add_column(heading, justify="left" if heading == "loop" else "right", no_wrap=heading == "loop")
+    return table
 
 
 def main(
@@ -232,6 +231,7 @@ def main(
     out: Annotated[Path | None, typer.Option(help="Folder for load_test.json.")] = None,
 ) -> None:
     """Measure a gateway's capacity and latency, with and without attackers, for one ego and for several."""
+    torch.set_num_threads(1)
     console = Console()
     bodies = {attacked: prepare(attacked, scene, console) for attacked in (False, True)}
     loads = [

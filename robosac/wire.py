@@ -24,6 +24,8 @@ MAX_FRAME = 2**53 - 1
 MAX_KEYS = 1024
 MAX_STRING = 256
 RIGID_TOLERANCE = 1e-3
+MAX_TRANSLATION_M = 1e8
+"""Farther than any earth-fixed frame needs; beyond it single precision would lose the warp."""
 
 
 class WireError(ValueError):
@@ -152,7 +154,7 @@ def check_message(payload: Any, info: DetectorInfo, role: Role, path: str = "") 
     where = _join(path, "tensors")
     tensors = _mapping(_get(fields, "tensors", path), where)
     specs = info.tensors[role]
-    unknown = [str(name) for name in tensors if name not in specs]
+    unknown = [name for name in tensors if name not in specs][:4]
     if unknown:
         raise WireError(
             "unknown-tensor", where, f"unexpected {_quoted(unknown)}; detector {info.name} wants {_quoted(specs)}"
@@ -221,6 +223,8 @@ def _pose(value: Any, path: str) -> FloatArray:
     )
     if not rigid or np.linalg.det(rotation) < 0 or not np.allclose(pose[3], (0, 0, 0, 1), atol=1e-9):
         raise WireError("bad-pose", path, "must be a rigid transform: a rotation, a translation, last row 0 0 0 1")
+    if np.abs(pose[:3, 3]).max() > MAX_TRANSLATION_M:
+        raise WireError("bad-pose", path, f"must lie within {MAX_TRANSLATION_M:g} m of the world's origin")
     return pose
 
 

@@ -100,6 +100,12 @@ class Gateway:
             defense.check_team(len(request.teammates))
         except DomainError as error:
             raise Problem(422, "impossible-defense", str(error), "defense") from error
+        budget_ms = request.latency_budget_ms or self.settings.latency_budget_ms
+        gather_ms = min(self.settings.gather_ms, budget_ms / 2) if request.gather_ms is None else request.gather_ms
+        if gather_ms > budget_ms:
+            raise Problem(
+                422, "invalid-request", f"must not exceed the latency budget of {budget_ms:g} ms", "gather_ms"
+            )
         if await self._store.count() >= self.settings.max_sessions:
             raise Problem(
                 503, "too-many-sessions", "the gateway holds as many sessions as it may", headers={"Retry-After": "30"}
@@ -111,8 +117,8 @@ class Gateway:
             teammates=tuple(request.teammates),
             detector=detector.info.name,
             defense=request.defense.model_dump(),
-            latency_budget_ms=request.latency_budget_ms or self.settings.latency_budget_ms,
-            gather_ms=self.settings.gather_ms if request.gather_ms is None else request.gather_ms,
+            latency_budget_ms=budget_ms,
+            gather_ms=gather_ms,
             token_digests={_digest(token): vehicle for vehicle, token in tokens.items()},
             created_at=audit.now(),
             state=defense.initial_state(),
@@ -186,7 +192,7 @@ class Gateway:
         async with caller.live.lock:
             await self._check_order(caller, envelope.frame)
             gathering = time.perf_counter()
-            until = min(gathering + caller.record.gather_ms / 1e3, received + caller.record.latency_budget_ms / 1e3)
+            until = received + caller.record.gather_ms / 1e3
             messages, absent = await caller.live.gathering.collect(envelope.frame, until)
             timings["gather"] = (time.perf_counter() - gathering) * 1e3
             return 200, await self._answer(caller, envelope.frame, message, messages, absent, received, timings)

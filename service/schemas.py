@@ -51,7 +51,7 @@ class SessionRequest(_Request):
     detector: str | None = None
     defense: DefenseSettings = SampleConsensusSettings()
     latency_budget_ms: float | None = Field(None, gt=0, le=60_000)
-    gather_ms: float | None = Field(None, ge=0, le=60_000)
+    gather_ms: float | None = Field(None, ge=0, le=60_000, description="At most the latency budget.")
 
     @field_validator("teammates")
     @classmethod

@@ -18,7 +18,10 @@ class Settings(BaseSettings):
         200.0, gt=0, le=60_000, description="Budget of sessions that name none: from a frame's last byte to its answer."
     )
     gather_ms: float = Field(
-        100.0, ge=0, le=60_000, description="Longest wait for teammates' messages once the ego's is in."
+        100.0,
+        ge=0,
+        le=60_000,
+        description="Longest wait for teammates once the ego's message is in; by default at most half the budget.",
     )
     max_body_bytes: int = Field(32 * 2**20, ge=1024, description="Largest request body.")
     max_sessions: int = Field(10_000, ge=1, description="Open sessions at a time.")

@@ -70,6 +70,8 @@ def with_value(value):
 SHEAR = [1, 1, 0, 0, 0, 1, 0, 0, 0, 0, 1, 0, 0, 0, 0, 1]
 MIRROR = [1, 0, 0, 0, 0, -1, 0, 0, 0, 0, 1, 0, 0, 0, 0, 1]
 
+AFAR = [1, 0, 0, 1e300, 0, 1, 0, 0, 0, 0, 1, 0, 0, 0, 0, 1]
+
 
 @pytest.mark.parametrize(
     ("path", "value", "code"),
@@ -92,6 +94,7 @@ MIRROR = [1, 0, 0, 0, 0, -1, 0, 0, 0, 0, 1, 0, 0, 0, 0, 1]
         ("pose", [1e300] * 16, "bad-pose"),
         ("pose", SHEAR, "bad-pose"),
         ("pose", MIRROR, "bad-pose"),
+        ("pose", AFAR, "bad-pose"),
         ("tensors", KeyError, "missing-field"),
         ("tensors", [], "wrong-type"),
         ("tensors.features", KeyError, "missing-field"),

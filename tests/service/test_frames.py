@@ -195,7 +195,7 @@ async def test_a_session_that_ends_under_a_waiting_ego_says_so(served, messages)
 
 
 async def test_when_time_is_short_the_ego_answers_alone_and_says_why(served, good_frame):
-    session = await served.open(latency_budget_ms=0.01)
+    session = await served.open(latency_budget_ms=0.01, gather_ms=0)
     result = (await served.post(session, "frames", good_frame(0))).json()
     assert (result["source"], result["degraded_by"], result["deadline_met"]) == ("ego_only", "deadline", False)
     assert {entry["reason"] for entry in result["rejected"]} == {"not_sampled"}

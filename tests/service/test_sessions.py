@@ -48,6 +48,7 @@ async def test_state_and_end(served, good_frame):
         ({"ego_id": "a", "teammates": ["b", "a"]}, "teammates", "own teammate"),
         ({"ego_id": "a", "teammates": ["b"], "surprise": 1}, "surprise", "not permitted"),
         ({"ego_id": "a", "teammates": ["b"], "latency_budget_ms": 0}, "latency_budget_ms", "greater than 0"),
+        ({"ego_id": "a", "teammates": ["b"], "latency_budget_ms": 50, "gather_ms": 51}, "gather_ms", "50 ms"),
         ({"ego_id": "a", "teammates": ["b"], "detector": "nonesuch"}, "detector", "intersection-mean"),
         ({"ego_id": "a", "teammates": ["b"], "defense": {"kind": "magic"}}, "defense.kind", "sample_consensus"),
         (
