@@ -7,7 +7,7 @@ from dataclasses import dataclass
 
 import numpy as np
 
-from robosac.attacks import IterativeAttack
+from robosac.attacks import Attack
 from robosac.boxes import FloatArray
 from robosac.detectors import Detector, Message
 from robosac.scenes import IntersectionScene, SceneFrame
@@ -56,7 +56,7 @@ class Fleet:
         The first cars are egos.
     attackers : int
         Chosen at random among the vehicles that are not egos.
-    attack : IterativeAttack
+    attack : Attack
     seed : int
 
     Raises
@@ -71,7 +71,7 @@ class Fleet:
         detector: Detector,
         egos: int,
         attackers: int,
-        attack: IterativeAttack,
+        attack: Attack,
         seed: int,
     ) -> None:
         others = scene.agents[egos:]

@@ -1,9 +1,23 @@
 """Attacks on the messages of teammates."""
 
-from robosac.attacks.base import IterativeAttack, inverted_pseudo_truth
-from robosac.attacks.pgd import PGD
+from robosac.attacks.adaptive import Erase
+from robosac.attacks.base import Attack, IterativeAttack, Knowledge, inverted_pseudo_truth
+from robosac.attacks.carlini_wagner import CarliniWagner
+from robosac.attacks.gradient import BIM, PGD
+from robosac.attacks.noise import GaussianNoise
 
-ATTACKS: dict[str, type[IterativeAttack]] = {attack.name: attack for attack in (PGD,)}
+ATTACKS: dict[str, type[Attack]] = {attack.name: attack for attack in (PGD, BIM, CarliniWagner, GaussianNoise, Erase)}
 """All attacks by name."""
 
-__all__ = ["ATTACKS", "PGD", "IterativeAttack", "inverted_pseudo_truth"]
+__all__ = [
+    "ATTACKS",
+    "BIM",
+    "PGD",
+    "Attack",
+    "CarliniWagner",
+    "Erase",
+    "GaussianNoise",
+    "IterativeAttack",
+    "Knowledge",
+    "inverted_pseudo_truth",
+]

@@ -17,7 +17,23 @@ from torch.nn import functional
 
 from robosac.detectors.base import AttackSurface
 
-Perturbation = dict[str, torch.Tensor]
+Tensors = Mapping[str, torch.Tensor]
+
+
+@dataclass(frozen=True)
+class Knowledge:
+    """What the adversary sees before it begins.
+
+    Attributes
+    ----------
+    ego_logits : tensor
+        Class logits of the ego alone: the paper's pseudo ground truth.
+    benign_logits : tensor
+        Class logits of the fusion in which everybody is honest.
+    """
+
+    ego_logits: torch.Tensor
+    benign_logits: torch.Tensor
 
 
 def inverted_pseudo_truth(ego_logits: torch.Tensor, logits: torch.Tensor) -> torch.Tensor:
@@ -40,18 +56,11 @@ def inverted_pseudo_truth(ego_logits: torch.Tensor, logits: torch.Tensor) -> tor
 
 
 @dataclass(frozen=True)
-class IterativeAttack(ABC):
-    """Descend an objective for a number of steps, staying within the bound.
-
-    1. ``delta = start()``.
-    2. Repeat ``steps`` times: ``delta = project(delta - step_size * normalise(gradient of objective))``.
+class Attack(ABC):
+    """An adversary in control of some teammates.
 
     Parameters
     ----------
-    steps : int
-        At least 1.
-    step_size : float
-        In units of the message.
     epsilon : float
         L-infinity bound on the perturbation, in units of the message.
 
@@ -63,19 +72,18 @@ class IterativeAttack(ABC):
 
     name: ClassVar[str]
 
-    steps: int = 15
-    step_size: float = 0.1
     epsilon: float = 0.5
 
     def __post_init__(self) -> None:
-        for parameter in ("steps", "step_size", "epsilon"):
-            if not getattr(self, parameter) > 0:
-                raise ValueError(f"{parameter} must be positive, got {getattr(self, parameter)}")
+        for parameter, value in vars(self).items():
+            if not value > 0:
+                raise ValueError(f"{parameter} must be positive, got {value}")
 
+    @abstractmethod
     def run(
         self, surface: AttackSurface, attackers: Collection[str], rng: np.random.Generator
     ) -> dict[str, torch.Tensor]:
-        """Optimise the attackers' messages jointly.
+        """Make the attackers' messages.
 
         Parameters
         ----------
@@ -95,38 +103,83 @@ class IterativeAttack(ABC):
         KeyError
             If an attacker has no message in the frame.
         """
+
+
+@dataclass(frozen=True)
+class IterativeAttack(Attack):
+    """Descend an objective for a number of steps, staying within the bound.
+
+    1. ``variables = start()``.
+    2. Repeat ``steps`` times: the optimiser moves the variables along ``normalise(gradient of objective)``; then
+       ``variables = project(variables)``.
+    3. The perturbation is ``perturbation(variables)``.
+
+    Parameters
+    ----------
+    epsilon : float
+        L-infinity bound on the perturbation, in units of the message.
+    steps : int
+        At least 1.
+    step_size : float
+        The optimiser's; for signed steps, in units of the message.
+    """
+
+    steps: int = 15
+    step_size: float = 0.1
+
+    def run(
+        self, surface: AttackSurface, attackers: Collection[str], rng: np.random.Generator
+    ) -> dict[str, torch.Tensor]:
+        """Optimise the attackers' messages jointly."""
         clean = {name: surface.messages[name] for name in sorted(attackers)}
         if not clean:
             return {}
-        delta = self.project(self.start(clean, rng))
         with torch.no_grad():
-            ego_logits = surface.class_logits({})
+            known = Knowledge(surface.class_logits({}), surface.class_logits(surface.messages))
+        variables = {name: v.requires_grad_(True) for name, v in self.start(clean, rng).items()}
+        optimiser = self.optimiser(list(variables.values()))
         for _ in range(self.steps):
-            variables = {name: d.detach().requires_grad_(True) for name, d in delta.items()}
-            attacked = {name: clean[name] + d for name, d in variables.items()}
-            loss = self.objective(ego_logits, surface.class_logits({**surface.messages, **attacked}))
+            delta = {name: self.perturbation(v) for name, v in variables.items()}
+            attacked = {name: clean[name] + d for name, d in delta.items()}
+            loss = self.objective(known, surface.class_logits({**surface.messages, **attacked}), delta)
             gradients = torch.autograd.grad(loss, list(variables.values()))
             with torch.no_grad():
-                delta = self.project(
-                    {
-                        name: d - self.step_size * self.normalise(g)
-                        for (name, d), g in zip(variables.items(), gradients, strict=True)
-                    }
-                )
-        return {name: (clean[name] + delta[name]).detach() for name in clean}
+                for variable, gradient in zip(variables.values(), gradients, strict=True):
+                    variable.grad = self.normalise(gradient)
+                optimiser.step()
+                for variable in variables.values():
+                    variable.copy_(self.project(variable))
+        return {name: (clean[name] + self.perturbation(variables[name])).detach() for name in clean}
 
     @abstractmethod
-    def start(self, clean: Mapping[str, torch.Tensor], rng: np.random.Generator) -> Perturbation:
-        """The first perturbation; it is projected before use."""
+    def start(self, clean: Tensors, rng: np.random.Generator) -> dict[str, torch.Tensor]:
+        """The first variables, within the bound."""
 
-    def objective(self, ego_logits: torch.Tensor, logits: torch.Tensor) -> torch.Tensor:
-        """What the adversary minimises; by default `inverted_pseudo_truth`."""
-        return inverted_pseudo_truth(ego_logits, logits)
+    def objective(self, known: Knowledge, logits: torch.Tensor, delta: Tensors) -> torch.Tensor:  # noqa: ARG002
+        """What the adversary minimises; by default `inverted_pseudo_truth`.
+
+        Parameters
+        ----------
+        known : Knowledge
+        logits : tensor
+            The ego's class logits under the present perturbation.
+        delta : mapping of attacker to tensor
+            The present perturbation.
+        """
+        return inverted_pseudo_truth(known.ego_logits, logits)
+
+    def perturbation(self, variable: torch.Tensor) -> torch.Tensor:
+        """The perturbation that a variable stands for; by default itself."""
+        return variable
+
+    def optimiser(self, variables: list[torch.Tensor]) -> torch.optim.Optimizer:
+        """What moves the variables; by default plain descent."""
+        return torch.optim.SGD(variables, lr=self.step_size)
 
     def normalise(self, gradient: torch.Tensor) -> torch.Tensor:
         """The direction of a step; by default the sign, the steepest descent under an L-infinity bound."""
         return gradient.sign()
 
-    def project(self, delta: Perturbation) -> Perturbation:
-        """The nearest perturbation within the bound."""
-        return {name: d.clamp(-self.epsilon, self.epsilon) for name, d in delta.items()}
+    def project(self, variable: torch.Tensor) -> torch.Tensor:
+        """The nearest variable within the bound."""
+        return variable.clamp(-self.epsilon, self.epsilon)

@@ -8,7 +8,7 @@ from itertools import combinations
 
 import numpy as np
 
-from robosac.attacks import IterativeAttack
+from robosac.attacks import Attack
 from robosac.boxes import FloatArray
 from robosac.consensus import Verdict, compare
 from robosac.defenses import SampleConsensus
@@ -96,7 +96,7 @@ def evaluation_frames(
     detector: Detector,
     seeds: Sequence[int],
     frames_per_scene: int,
-    attack: IterativeAttack,
+    attack: Attack,
     attackers: int,
     rng: np.random.Generator,
 ) -> Iterator[EvaluationFrame]:
@@ -121,7 +121,7 @@ def evaluation_frames(
 
 def evaluate_bounds(
     detector: Detector,
-    attack: IterativeAttack,
+    attack: Attack,
     *,
     seeds: Sequence[int],
     frames_per_scene: int = 5,

@@ -2,7 +2,7 @@ import numpy as np
 import pytest
 import torch
 
-from robosac.attacks import ATTACKS, PGD, inverted_pseudo_truth
+from robosac.attacks import ATTACKS, BIM, PGD, CarliniWagner, Erase, GaussianNoise, IterativeAttack, Knowledge
 
 
 class Linear:
@@ -42,12 +42,30 @@ def test_the_bound_holds_and_only_attackers_change(attack, attackers, surface, r
         torch.testing.assert_close(message, clean[name])
 
 
-@attacks
+iterative = [attack for attack in ATTACKS.values() if issubclass(attack, IterativeAttack)]
+
+
+@pytest.mark.parametrize("attack", iterative, ids=lambda attack: attack.name)
 def test_the_objective_falls(attack, surface, rng):
-    sent = attack().run(surface, ["a", "b"], rng)
-    before = inverted_pseudo_truth(surface.ego, surface.class_logits(surface.messages))
-    after = inverted_pseudo_truth(surface.ego, surface.class_logits({**surface.messages, **sent}))
-    assert after < before
+    known = Knowledge(surface.ego, surface.class_logits(surface.messages))
+
+    def objective(sent):
+        delta = {name: message - surface.messages[name] for name, message in sent.items()}
+        return float(attack().objective(known, surface.class_logits({**surface.messages, **sent}), delta))
+
+    untouched = {name: surface.messages[name] for name in ("a", "b")}
+    assert objective(attack().run(surface, ["a", "b"], rng)) < objective(untouched)
+
+
+@pytest.mark.parametrize("attack", iterative, ids=lambda attack: attack.name)
+def test_more_steps_get_further(attack, surface):
+    known = Knowledge(surface.ego, surface.class_logits(surface.messages))
+    reached = []
+    for steps in (1, 30):
+        sent = attack(steps=steps, step_size=0.02).run(surface, ["a"], np.random.default_rng(0))
+        delta = {"a": sent["a"] - surface.messages["a"]}
+        reached.append(float(attack().objective(known, surface.class_logits({**surface.messages, **sent}), delta)))
+    assert reached[1] < reached[0]
 
 
 @attacks
@@ -69,11 +87,11 @@ def test_an_attacker_that_is_not_there_is_an_error(attack, surface, rng):
 
 
 @attacks
-@pytest.mark.parametrize("parameter", ["steps", "step_size", "epsilon"])
-@pytest.mark.parametrize("value", [0, -1])
-def test_parameters_must_be_positive(attack, parameter, value):
-    with pytest.raises(ValueError, match=parameter):
-        attack(**{parameter: value})
+@pytest.mark.parametrize("value", [0, -1, float("nan")])
+def test_parameters_must_be_positive(attack, value):
+    for parameter in vars(attack()):
+        with pytest.raises(ValueError, match=parameter):
+            attack(**{parameter: value})
 
 
 def test_pgd_reaches_the_corner_of_the_ball_on_a_linear_ego(surface, rng):
@@ -88,6 +106,60 @@ def test_pgd_starts_at_random_within_the_ball(surface, rng):
     values = torch.cat([d.flatten() for d in start.values()])
     assert float(values.abs().max()) <= 0.2
     assert float(values.std()) > 0.05
+
+
+def test_bim_starts_from_the_benign_message(surface, rng):
+    assert all(not d.any() for d in BIM().start(surface.messages, rng).values())
+
+
+def test_noise_fills_the_ball_and_follows_no_gradient(surface, rng):
+    sent = GaussianNoise(epsilon=0.2).run(surface, ["a", "b"], rng)
+    noise = torch.cat([(sent[name] - surface.messages[name]).flatten() for name in ("a", "b")])
+    assert 0.08 < float(noise.abs().mean()) <= 0.2
+    assert abs(float(noise.mean())) < 0.1
+
+
+def test_carlini_wagner_flips_what_it_can_and_spends_no_more_than_it_needs(rng):
+    surface = Linear()
+    surface.ego = surface.ego.clamp(-0.4, 0.4)
+    sent = CarliniWagner(epsilon=1.0, steps=200, confidence=0.1, trade_off=100.0).run(surface, ["a"], rng)
+    logits = surface.class_logits({**surface.messages, **sent})
+    sure = surface.ego.abs() > 0.05
+    margin = torch.where(surface.ego >= 0, logits, -logits)[sure]
+    assert float(margin.max()) < 0.0
+    assert float((sent["a"] - surface.messages["a"]).abs().mean()) < 0.8
+
+
+def test_an_eraser_leaves_what_the_ego_sees_and_erases_the_rest():
+    surface = Linear()
+    surface.ego = torch.full((3, 4), -4.0)
+    surface.ego[0] = 4.0  # the ego sees the first row, its teammates the second
+    surface.messages["b"] = torch.zeros(3, 4)
+    surface.messages["b"][1] = 6.0
+    sent = Erase(epsilon=5.0, steps=80).run(surface, ["a"], np.random.default_rng(0))
+    logits = surface.class_logits({**surface.messages, **sent})
+    assert float(logits[0].min()) > 3.0
+    assert float(logits[1].max()) < -2.0
+
+
+def test_an_eraser_passes_the_consensus_test(detector, ego_message, benign, scene_frame):
+    from robosac.consensus import compare
+    from tests.robosac.detectors.test_embedded import found
+
+    surface = detector.attack_surface(ego_message, benign)
+    erased = Erase().run(surface, ["car-2"], np.random.default_rng(0))
+    received = {**benign, "car-2": detector.perturbed(benign["car-2"], erased["car-2"])}
+    score, team = detector.info.consensus_score, list(benign)
+
+    def confident(boxes):
+        return boxes[boxes[:, 5] >= score]
+
+    ego_only = confident(detector.prepare(ego_message, {}).detect())
+    honest = confident(detector.prepare(ego_message, benign).detect(team))
+    attacked = confident(detector.prepare(ego_message, received).detect(team))
+    assert compare(ego_only, attacked).jaccard_index > compare(ego_only, honest).jaccard_index
+    truth = scene_frame.truth("car-1")
+    assert found(attacked, truth) < found(honest, truth) - 0.1
 
 
 def test_pgd_overruns_an_undefended_ego(detector, ego_message, benign, attacked, scene_frame):

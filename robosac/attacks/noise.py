@@ -1,0 +1,29 @@
+"""A control: noise that nobody optimised."""
+
+from __future__ import annotations
+
+from collections.abc import Collection
+from typing import ClassVar
+
+import numpy as np
+import torch
+
+from robosac.attacks.base import Attack
+from robosac.detectors.base import AttackSurface
+
+
+class GaussianNoise(Attack):
+    """Independent Gaussian noise with standard deviation epsilon, cut off at the bound."""
+
+    name: ClassVar[str] = "noise"
+
+    def run(
+        self, surface: AttackSurface, attackers: Collection[str], rng: np.random.Generator
+    ) -> dict[str, torch.Tensor]:
+        """Add the noise."""
+        sent = {}
+        for name in sorted(attackers):
+            clean = surface.messages[name]
+            noise = torch.from_numpy(rng.normal(0.0, self.epsilon, tuple(clean.shape)).astype(np.float32))
+            sent[name] = clean + noise.clamp(-self.epsilon, self.epsilon)
+        return sent
