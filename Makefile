@@ -18,7 +18,7 @@ demo: $(VENV)/.installed
 	$(BIN)/python -m clients.demo --report $(OUT)/demo
 
 serve: $(VENV)/.installed
-	$(BIN)/uvicorn service.app:app --host $(HOST) --port $(PORT)
+	$(BIN)/uvicorn service.app:app --host $(HOST) --port $(PORT) --timeout-graceful-shutdown 5
 
 test: $(VENV)/.installed-dev
 	$(BIN)/pytest

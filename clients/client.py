@@ -11,7 +11,7 @@ from typing import Any
 import httpx
 import numpy as np
 
-from clients.errors import GatewayUnreachable, ProtocolError, refusal
+from clients.errors import GatewayError, GatewayUnreachable, ProtocolError, refusal
 from robosac import wire
 from robosac.boxes import FloatArray
 from robosac.detectors import Message
@@ -83,7 +83,7 @@ class FrameAnswer:
                 deadline_met=bool(fields["deadline_met"]),
                 timings_ms=dict(fields["timings_ms"]),
             )
-        except (KeyError, TypeError, ValueError) as error:
+        except (KeyError, TypeError, ValueError, OverflowError) as error:
             raise ProtocolError(f"not a frame result: {error!r}") from error
 
 
@@ -131,13 +131,17 @@ class GatewayClient:
     async def ready(self) -> bool:
         """Whether the gateway is up and warm."""
         try:
-            return (await self._http.get("/readyz")).status_code == 200
-        except httpx.HTTPError:
+            await self._request("GET", "/readyz")
+        except GatewayError:
             return False
+        return True
 
     async def detectors(self) -> list[Mapping[str, Any]]:
         """The gateway's detectors and their message layouts."""
-        return list(_json(await self._request("GET", "/v1/detectors"))["detectors"])
+        entries = _json(await self._request("GET", "/v1/detectors")).get("detectors")
+        if not isinstance(entries, list):
+            raise ProtocolError("not a list of detectors")
+        return entries
 
     async def open_session(
         self,
@@ -177,13 +181,15 @@ class GatewayClient:
     async def _request(self, method: str, path: str, **options: Any) -> httpx.Response:
         try:
             response = await self._http.request(method, path, **options)
-        except httpx.HTTPError as error:
+        except (httpx.HTTPError, httpx.InvalidURL) as error:
             raise GatewayUnreachable(f"{method} {path}: {type(error).__name__} {error}") from error
         if response.is_success:
             return response
         try:
             problem = response.json()
         except ValueError:
+            problem = None
+        if not isinstance(problem, dict):
             problem = {}
         retry = response.headers.get("retry-after", "")
         raise refusal(response.status_code)(
@@ -237,7 +243,23 @@ class VehicleClient:
     async def audit(self, after: int = 0) -> list[Mapping[str, Any]]:
         """As the ego: audit records with a number above ``after``."""
         response = await self._request("GET", f"{self._path}/audit", params={"after": after}, headers=self._bearer)
-        return [json.loads(line) for line in response.text.splitlines()]
+        try:
+            return [json.loads(line) for line in response.text.splitlines()]
+        except ValueError as error:
+            raise ProtocolError(f"not JSON Lines: {error}") from error
+
+    async def enrol(self, teammates: Sequence[str]) -> Mapping[str, str]:
+        """As the ego: let teammates join; their tokens."""
+        body = {"teammates": list(teammates)}
+        fields = _json(await self._request("POST", f"{self._path}/teammates", json=body, headers=self._bearer))
+        try:
+            return dict(fields["teammate_tokens"])
+        except (KeyError, TypeError, ValueError) as error:
+            raise ProtocolError(f"not a change of the team: {error!r}") from error
+
+    async def dismiss(self, teammate: str) -> None:
+        """As the ego: let a teammate leave."""
+        await self._request("DELETE", f"{self._path}/teammates/{teammate}", headers=self._bearer)
 
     async def close(self) -> None:
         """As the ego: end the session."""
@@ -246,7 +268,7 @@ class VehicleClient:
 
 def _answer(response: httpx.Response) -> FrameAnswer:
     try:
-        fields = wire.unpack(response.content, max_items=2**20, max_string=2**20)
+        fields = wire.unpack(response.content, trusted=True)
     except wire.WireError as error:
         raise ProtocolError(str(error)) from error
     return FrameAnswer.parse(fields)

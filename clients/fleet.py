@@ -122,6 +122,10 @@ class _Vehicle:
         token = session.ego_token if ego_id == self.vehicle_id else session.teammate_tokens[self.vehicle_id]
         self._tokens[ego_id] = (session.session_id, token)
 
+    async def leave(self) -> None:
+        session_id, token = self._tokens[self.vehicle_id]
+        await self.gateway.vehicle(session_id, self.vehicle_id, token).close()
+
     async def send(self, frame: EgoFrame, index: int) -> None:
         session_id, token = self._tokens[frame.ego_id]
         await self.gateway.vehicle(session_id, self.vehicle_id, token).send(index, frame.sent[self.vehicle_id])
@@ -171,6 +175,8 @@ async def _run_scene(options: FleetOptions, fleet: Fleet, summary: FleetSummary,
             for frame, (answer, latency_ms) in zip(frames, answers, strict=True):
                 await asyncio.to_thread(summary.add, frame, answer, latency_ms)
                 screen.add(fleet.scene.seed, frame, answer, latency_ms)
+        for ego_id in fleet.egos:
+            await vehicles[ego_id].leave()
     finally:
         await asyncio.gather(*(vehicle.gateway.aclose() for vehicle in vehicles.values()))
 

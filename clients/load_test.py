@@ -90,16 +90,16 @@ class Figures:
         """Plain values for JSON; shares are of the frames sent, so a refused frame counts as not answered in time."""
         answered = len(self.latencies_ms)
         sent = answered + sum(self.errors.values())
-        p50, p95, p99 = np.percentile(self.latencies_ms, [50, 95, 99]) if answered else [float("nan")] * 3
+        p50, p95, p99 = np.percentile(self.latencies_ms, [50, 95, 99]) if answered else [None] * 3
         return {
             **asdict(self.load),
             "seconds": self.seconds,
             "frames": answered,
             "fps": answered / self.seconds,
-            "latency_ms": {"p50": float(p50), "p95": float(p95), "p99": float(p99)},
+            "latency_ms": {"p50": p50, "p95": p95, "p99": p99},
             "within_budget_share": self.within_budget / max(sent, 1),
             "deadline_met_share": self.deadline_met / max(sent, 1),
-            "sampling_steps_mean": float(np.mean(self.steps)) if answered else float("nan"),
+            "sampling_steps_mean": float(np.mean(self.steps)) if answered else None,
             "errors": dict(self.errors),
             "stages_ms": {stage: float(np.median(values)) for stage, values in self.stages.items()},
         }
@@ -173,7 +173,7 @@ async def _open(
     rate = figures.load.rate_hz or 1 / FRAME_PERIOD_S
     offset = number / figures.load.egos / rate  # egos are not in step
     posts = []
-    for k in range(int(seconds * rate)):
+    for k in range(max(1, int(seconds * rate))):
         due = started + offset + k / rate
         await asyncio.sleep(max(0.0, due - time.perf_counter()))
         body = bodies.numbered(WARM_UP_FRAMES + k)
@@ -204,14 +204,18 @@ def show(console: Console, results: Sequence[Figures], bytes_a_frame: int, budge
         table.add_row(
             *label,
             f"{values['fps']:.1f}",
-            *(f"{values['latency_ms'][p]:.0f}" for p in ("p50", "p95", "p99")),
+            *(_shown(values["latency_ms"][p], 0) for p in ("p50", "p95", "p99")),
             f"{values['within_budget_share']:.1%}",
-            f"{values['sampling_steps_mean']:.2f}",
+            _shown(values["sampling_steps_mean"], 2),
             str(sum(figures.errors.values())),
         )
-        stages.add_row(*label, *(f"{values['stages_ms'].get(name, float('nan')):.1f}" for name in names))
+        stages.add_row(*label, *(_shown(values["stages_ms"].get(name), 1) for name in names))
     console.print(table)
     console.print(stages)
+
+
+def _shown(value: float | None, digits: int) -> str:
+    return "-" if value is None else f"{value:.{digits}f}"
 
 
 def _table(title: str, columns: Sequence[str]) -> Table:

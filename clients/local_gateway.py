@@ -41,7 +41,10 @@ async def local_gateway(log: Path) -> AsyncIterator[str]:
     log.parent.mkdir(parents=True, exist_ok=True)
     with log.open("wb") as output:
         process = subprocess.Popen(
-            [*command, "--log-level", "warning"], stdout=output, stderr=subprocess.STDOUT, env=dict(os.environ)
+            [*command, "--log-level", "warning", "--timeout-graceful-shutdown", "5"],
+            stdout=output,
+            stderr=subprocess.STDOUT,
+            env=dict(os.environ),
         )
         try:
             await _until_ready(url, process, log)

@@ -48,6 +48,11 @@ def from_world(boxes: FloatArray, pose: FloatArray) -> FloatArray:
     return moved
 
 
+def to_world(boxes: FloatArray, pose: FloatArray) -> FloatArray:
+    """Boxes (n, 5+) of a sensor's frame in the world frame; the inverse of `from_world`."""
+    return from_world(boxes, np.linalg.inv(pose))
+
+
 def corners(boxes: FloatArray) -> FloatArray:
     """Corners (n, 4, 2) of boxes (n, 5+), counter-clockwise from front left."""
     boxes = np.asarray(boxes, dtype=np.float64)

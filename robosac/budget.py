@@ -12,6 +12,8 @@ from __future__ import annotations
 import math
 
 DEFAULT_CONFIDENCE = 0.99
+_ENUMERABLE = 100_000
+"""Up to so many hypotheses the law of distinct draws is summed up exactly."""
 _ROUNDING = 1e-9
 """Slack under which a quotient counts as the whole number it misses by floating point."""
 
@@ -111,8 +113,8 @@ def clean_probability(team_size: int, attackers: int, collaborators: int) -> flo
     DomainError
         If an argument is outside its range.
     """
-    _check_team(team_size, attackers, collaborators)
-    return math.comb(team_size - attackers, collaborators) / math.comb(team_size, collaborators)
+    total, clean = _hypotheses(team_size, attackers, collaborators)
+    return clean / total
 
 
 def exact_budget(
@@ -139,7 +141,8 @@ def exact_budget(
     Returns
     -------
     int
-        N >= 1.
+        N >= 1; the least that suffices, except for distinct hypotheses when there are more than 100,000 of them: then
+        it is the smaller of two bounds that always suffice, the independent one and ``T (1 - (1-p)^(1/(T-D)))``.
 
     Raises
     ------
@@ -147,19 +150,20 @@ def exact_budget(
         If an argument is outside its range, or no attacker-free hypothesis exists.
     """
     _check_open_unit("confidence", confidence)
-    clean = clean_probability(team_size, attackers, collaborators)
-    if clean == 0.0:
+    total, clean = _hypotheses(team_size, attackers, collaborators)
+    if clean == 0:
         raise DomainError(
             f"no {collaborators} of {team_size} teammates can be free of {attackers} attackers; "
             f"ask for at most {team_size - attackers} collaborators"
         )
     if not distinct:
-        return _trials(clean, confidence)
-    total = math.comb(team_size, collaborators)
-    attacked = total - math.comb(team_size - attackers, collaborators)
+        return _trials(clean / total, confidence)
+    if total > _ENUMERABLE:
+        bound = math.ceil(-total * math.expm1(math.log1p(-confidence) / clean))
+        return max(1, min(bound, _trials(clean / total, confidence)))
     failure, tries = 1.0, 0
     while failure > 1.0 - confidence + 1e-12:
-        failure *= (attacked - tries) / (total - tries)
+        failure *= (total - clean - tries) / (total - tries)
         tries += 1
     return max(1, tries)
 
@@ -182,9 +186,20 @@ def exact_collaborators(
     _check_budget(sampling_budget)
     _check_team(team_size, attackers, 1)
     for s in range(team_size - attackers, 0, -1):
+        total, clean = _hypotheses(team_size, attackers, s)
+        if distinct and total - clean < sampling_budget:
+            return s
+        if sampling_budget * clean < confidence * total:
+            continue  # the chances of all tries together do not add up to the confidence
         if exact_budget(team_size, attackers, s, confidence, distinct=distinct) <= sampling_budget:
             return s
     return 0
+
+
+def _hypotheses(team_size: int, attackers: int, collaborators: int) -> tuple[int, int]:
+    """How many subsets there are, and how many of them hold no attacker."""
+    _check_team(team_size, attackers, collaborators)
+    return math.comb(team_size, collaborators), math.comb(team_size - attackers, collaborators)
 
 
 def _trials(success: float, confidence: float) -> int:

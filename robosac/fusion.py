@@ -14,9 +14,9 @@ from dataclasses import dataclass, field
 
 import numpy as np
 
-from robosac.boxes import FloatArray
+from robosac.boxes import FloatArray, from_world, to_world
 from robosac.consensus import Verdict, compare
-from robosac.defenses import Decision, Defense, Hypothesis, Outcome, Reason, Rejection, Source, State
+from robosac.defenses import Decision, Defense, Hypothesis, Outcome, Reason, Reference, Rejection, Source, State
 from robosac.detectors import Detector, Message, PreparedFrame
 
 logger = logging.getLogger(__name__)
@@ -26,7 +26,31 @@ SAFETY = 1.2
 
 
 class UnverifiedAnswer(Exception):
-    """A defence tried to answer with a subset that was not in consensus in this frame."""
+    """A defence tried to answer with, or to trust, teammates that were not in consensus."""
+
+
+@dataclass(frozen=True)
+class PreviousAnswer:
+    """A collaborative answer, kept as the reference of the next frame (temporal consistency).
+
+    Attributes
+    ----------
+    frame : int
+    pose : (4, 4) ndarray
+        world_from_sensor of the ego then.
+    boxes : (n, 6) ndarray
+        In the ego's frame then.
+    """
+
+    frame: int
+    pose: FloatArray
+    boxes: FloatArray
+
+    def seen_from(self, pose: FloatArray) -> FloatArray:
+        """The boxes in the frame of the ego at ``pose``: moved by the ego's own motion, other vehicles taken to
+        stand.
+        """
+        return from_world(to_world(self.boxes, self.pose), pose)
 
 
 @dataclass(frozen=True)
@@ -56,6 +80,8 @@ class FusionResult:
         ``prepare``, ``ego_only``, ``hypotheses`` (decoding), ``consensus`` (matching).
     state : mapping
         The defence's state for the next frame.
+    previous : PreviousAnswer or None
+        What the next frame may be compared with; None after an ego-only answer.
     """
 
     boxes: FloatArray
@@ -69,6 +95,7 @@ class FusionResult:
     fault: str | None
     timings_ms: Mapping[str, float]
     state: State
+    previous: PreviousAnswer | None
 
     @property
     def sampling_steps(self) -> int:
@@ -84,6 +111,8 @@ def fuse(
     *,
     rng: np.random.Generator,
     state: State | None = None,
+    frame: int = 0,
+    previous: PreviousAnswer | None = None,
     deadline: float = math.inf,
     clock: Callable[[], float] = time.perf_counter,
 ) -> FusionResult:
@@ -101,10 +130,15 @@ def fuse(
     rng : numpy.random.Generator
         All randomness of the defence.
     state : mapping, optional
-        What the defence remembers; its initial state by default.
+        What the defence remembers; by default its initial state for the teammates present.
+    frame : int
+        The frame's number; needed only with ``previous``.
+    previous : PreviousAnswer, optional
+        The latest answer's. A defence with the reference ``previous`` compares with it if it is of the frame before
+        this one, else with the ego's own perception.
     deadline : float
-        In the clock's time. No hypothesis is begun that is not expected to end before it. The ego's own perception is
-        computed in any case.
+        In the clock's time. No hypothesis is begun that is not expected to end before it. Where nothing is verified or
+        trusted, the ego's own perception is computed in any case.
     clock : callable
         Monotonic, seconds.
 
@@ -112,7 +146,7 @@ def fuse(
     -------
     FusionResult
     """
-    return _FrameRun(detector, defense, clock, deadline).answer(ego, teammates, rng, state)
+    return _FrameRun(detector, defense, ego, frame, previous, clock, deadline).answer(teammates, rng, state)
 
 
 @dataclass
@@ -121,6 +155,9 @@ class _FrameRun:
 
     detector: Detector
     defense: Defense
+    ego: Message
+    frame: int
+    previous: PreviousAnswer | None
     clock: Callable[[], float]
     deadline: float
     timings: dict[str, float] = field(
@@ -132,24 +169,22 @@ class _FrameRun:
     out_of_time: bool = False
     fault: str | None = None
 
-    def answer(
-        self, ego: Message, teammates: Mapping[str, Message], rng: np.random.Generator, state: State | None
-    ) -> FusionResult:
+    def answer(self, teammates: Mapping[str, Message], rng: np.random.Generator, state: State | None) -> FusionResult:
+        team = sorted(teammates)  # the draws must not depend on the order of arrival
         if state is None:
-            state = self.defense.initial_state()
-        prepared, team = self._prepare(ego, teammates)
-        started = self.clock()
-        ego_only = prepared.detect()
-        self._spend("ego_only", started)
-        self.dearest_pass = self.clock() - started
+            state = self.defense.initial_state(team)
         try:
-            decision = self._converse(prepared, self._confident(ego_only), team, state, rng)
+            prepared = self._prepare(teammates)
+            decision = self._converse(prepared, team, state, rng)
+            boxes = self._decode(prepared, decision.accepted)
         except Exception as error:
-            decision = self._give_up(teammates, state, error)
-        if not team and teammates:
-            decision = self._give_up(teammates, state, None)
+            logger.exception("fusion failed; answering with the ego's own perception")
+            self.fault = f"{type(error).__name__}: {error}"
+            rejected = {name: Rejection(Reason.NOT_SAMPLED, {"fault": self.fault}) for name in team}
+            decision = Decision((), Source.EGO_ONLY, rejected, None, state)
+            boxes = self._decode(self._prepare({}), ())
         return FusionResult(
-            boxes=self.boxes[decision.accepted] if decision.accepted else ego_only,
+            boxes=boxes,
             source=decision.source,
             accepted=decision.accepted,
             rejected=decision.rejected,
@@ -160,63 +195,74 @@ class _FrameRun:
             fault=self.fault,
             timings_ms=self.timings,
             state=decision.state,
+            previous=PreviousAnswer(self.frame, self.ego.pose, boxes) if decision.accepted else None,
         )
 
-    def _prepare(self, ego: Message, teammates: Mapping[str, Message]) -> tuple[PreparedFrame, list[str]]:
+    def _prepare(self, teammates: Mapping[str, Message]) -> PreparedFrame:
         started = self.clock()
-        try:
-            return self.detector.prepare(ego, teammates), list(teammates)
-        except Exception as error:
-            self._note_fault(error)
-            return self.detector.prepare(ego, {}), []
-        finally:
-            self._spend("prepare", started)
+        prepared = self.detector.prepare(self.ego, teammates)
+        self._spend("prepare", started)
+        return prepared
 
-    def _converse(
-        self, prepared: PreparedFrame, reference: FloatArray, team: list[str], state: State, rng: np.random.Generator
-    ) -> Decision:
+    def _converse(self, prepared: PreparedFrame, team: list[str], state: State, rng: np.random.Generator) -> Decision:
         conversation = self.defense.converse(team, state, rng)
         try:
             batch = next(conversation)
             while True:
-                batch = conversation.send(self._test(prepared, reference, batch))
+                batch = conversation.send(self._test(prepared, batch))
         except StopIteration as stop:
             decision: Decision = stop.value
-        verified = {o.teammates for o in self.outcomes if o.verdict is Verdict.CONSENSUS}
-        if decision.accepted and decision.accepted not in verified:
-            raise UnverifiedAnswer(f"{self.defense.kind} answered with {decision.accepted}")
+        self._check(decision, state)
         return decision
 
-    def _test(self, prepared: PreparedFrame, reference: FloatArray, batch: Sequence[Hypothesis]) -> list[Outcome]:
+    def _check(self, decision: Decision, state: State) -> None:
+        """Nothing reaches the answer that was not verified in this frame or trusted before; nor does trust come from
+        less.
+        """
+        verified = {o.teammates for o in self.outcomes if o.verdict is Verdict.CONSENSUS}
+        trusted = set(state.get("trusted", ()))
+        allowed = {
+            Source.CONSENSUS: decision.accepted in verified,
+            Source.TRUSTED: bool(decision.accepted) and trusted.issuperset(decision.accepted),
+            Source.EGO_ONLY: not decision.accepted,
+        }
+        if not allowed[decision.source]:
+            raise UnverifiedAnswer(f"{self.defense.kind} answered {decision.source} with {decision.accepted}")
+        if not trusted.union(*verified).issuperset(decision.state.get("trusted", ())):
+            raise UnverifiedAnswer(f"{self.defense.kind} trusts {decision.state['trusted']} without a consensus")
+
+    def _test(self, prepared: PreparedFrame, batch: Sequence[Hypothesis]) -> list[Outcome]:
         tested: list[Outcome] = []
         for subset in batch:
-            started = self.clock()
-            if started + SAFETY * self.dearest_pass > self.deadline:
+            reference = self._reference(prepared)
+            if self.clock() + SAFETY * self.dearest_pass > self.deadline:
                 self.out_of_time = True
                 break
-            boxes = prepared.detect(subset)
-            self._spend("hypotheses", started)
-            comparing = self.clock()
+            boxes = self._decode(prepared, subset)
+            started = self.clock()
             comparison = compare(reference, self._confident(boxes), self.defense.consensus_threshold)
-            self._spend("consensus", comparing)
-            self.dearest_pass = max(self.dearest_pass, self.clock() - started)
-            self.boxes[subset] = boxes
+            self._spend("consensus", started)
             tested.append(Outcome(subset, comparison.jaccard_index, comparison.verdict))
             self.outcomes.append(tested[-1])
         return tested
 
+    def _reference(self, prepared: PreparedFrame) -> FloatArray:
+        before = self.previous
+        if self.defense.reference is Reference.PREVIOUS and before is not None and before.frame == self.frame - 1:
+            return self._confident(before.seen_from(self.ego.pose))
+        return self._confident(self._decode(prepared, ()))
+
+    def _decode(self, prepared: PreparedFrame, subset: Hypothesis) -> FloatArray:
+        """Boxes of a subset; each is decoded once a frame."""
+        if subset not in self.boxes:
+            started = self.clock()
+            self.boxes[subset] = prepared.detect(subset)
+            self._spend("hypotheses" if subset else "ego_only", started)
+            self.dearest_pass = max(self.dearest_pass, self.clock() - started)
+        return self.boxes[subset]
+
     def _confident(self, boxes: FloatArray) -> FloatArray:
         return boxes[boxes[:, 5] >= self.detector.info.consensus_score]
-
-    def _give_up(self, teammates: Mapping[str, Message], state: State, error: Exception | None) -> Decision:
-        if error is not None:
-            self._note_fault(error)
-        rejected = {name: Rejection(Reason.NOT_SAMPLED, {"fault": self.fault}) for name in teammates}
-        return Decision((), Source.EGO_ONLY, rejected, None, state)
-
-    def _note_fault(self, error: Exception) -> None:
-        logger.exception("fusion failed; answering with the ego's own perception", exc_info=error)
-        self.fault = f"{type(error).__name__}: {error}"
 
     def _spend(self, stage: str, started: float) -> None:
         self.timings[stage] += (self.clock() - started) * 1e3

@@ -21,9 +21,18 @@ from robosac.detectors.base import DetectorInfo, Message, Role, TensorSpec
 
 MAX_FRAME = 2**53 - 1
 """Largest frame number: what every JSON reader can hold exactly."""
-MAX_KEYS = 1024
-MAX_STRING = 256
+MAX_ARRAY = 64
+MAX_MAP = 1024
+MAX_STRING = 2**16
+MAX_ENTRIES = 2**16
+"""Entries of all arrays and maps of a body together: small containers by the million would cost far more than their
+bytes.
+"""
+SHOWN = 40
+"""Characters of a sender's own words that an error repeats."""
 RIGID_TOLERANCE = 1e-3
+MIN_UPRIGHT = 0.5
+"""Cosine of the largest tilt of a sensor; views from above mean nothing beyond it."""
 MAX_TRANSLATION_M = 1e8
 """Farther than any earth-fixed frame needs; beyond it single precision would lose the warp."""
 
@@ -64,7 +73,7 @@ class FrameEnvelope:
 
     frame: int
     ego: Any
-    teammates: Mapping[str, Any]
+    teammates: Mapping[Any, Any]
 
 
 def pack_message(frame: int, vehicle_id: str, message: Message) -> bytes:
@@ -83,16 +92,14 @@ def pack(value: Any) -> bytes:
     return _pack(value)
 
 
-def unpack(body: bytes, max_items: int = MAX_KEYS, max_string: int = MAX_STRING) -> Any:
+def unpack(body: bytes, *, trusted: bool = False) -> Any:
     """A body of plain types, within limits.
 
     Parameters
     ----------
     body : bytes
-    max_items : int
-        Entries of one array or map.
-    max_string : int
-        Bytes of one string.
+    trusted : bool
+        Whether it comes from the gateway itself, whose results may be long; then only its length bounds it.
 
     Raises
     ------
@@ -101,16 +108,27 @@ def unpack(body: bytes, max_items: int = MAX_KEYS, max_string: int = MAX_STRING)
         the limits do not allow.
     """
     limit = len(body)
+    entries = 0
+
+    def count(container: Any) -> Any:
+        nonlocal entries
+        entries += 1 + len(container)
+        if entries > MAX_ENTRIES and not trusted:
+            raise ValueError(f"more than {MAX_ENTRIES} entries in all")
+        return container
+
     try:
         return msgpack.unpackb(
             body,
             raw=False,
-            strict_map_key=True,
+            strict_map_key=False,
             max_bin_len=limit,
-            max_str_len=min(limit, max_string),
-            max_array_len=min(limit, max_items),
-            max_map_len=min(limit, max_items),
-            max_ext_len=0,
+            max_str_len=limit if trusted else min(limit, MAX_STRING),
+            max_array_len=limit if trusted else min(limit, MAX_ARRAY),
+            max_map_len=limit if trusted else min(limit, MAX_MAP),
+            max_ext_len=limit,
+            list_hook=count,
+            object_hook=count,
         )
     except Exception as error:  # msgpack raises many unrelated types, ValueError and its own among them
         reason = str(error) or type(error).__name__
@@ -127,8 +145,6 @@ def read_frame(body: bytes) -> FrameEnvelope:
     """The parts of a whole frame; each is left to `check_message`."""
     fields = _mapping(unpack(body), "")
     teammates = _mapping(_get(fields, "teammates", ""), "teammates")
-    for name in teammates:
-        _string(name, "teammates")
     return FrameEnvelope(_frame(fields), _get(fields, "ego", ""), teammates)
 
 
@@ -180,12 +196,12 @@ def _tensor(value: Any, spec: TensorSpec, path: str) -> np.ndarray[Any, np.dtype
     fields = _mapping(value, path)
     name = _string(_get(fields, "dtype", path), _join(path, "dtype"))
     if name != spec.dtype:
-        raise WireError("wrong-dtype", _join(path, "dtype"), f"must be {spec.dtype!r}, got {name!r}")
+        raise WireError("wrong-dtype", _join(path, "dtype"), f"must be {spec.dtype!r}, got {_shown(name)}")
     shape = _get(fields, "shape", path)
     if not isinstance(shape, list) or not all(type(n) is int for n in shape):
         raise WireError("wrong-type", _join(path, "shape"), "must be an array of integers")
     if tuple(shape) != spec.shape:
-        raise WireError("wrong-shape", _join(path, "shape"), f"must be {list(spec.shape)}, got {shape[:8]}")
+        raise WireError("wrong-shape", _join(path, "shape"), f"must be {list(spec.shape)}, got {_shown(shape)[1:-1]}")
     data = _get(fields, "data", path)
     if not isinstance(data, bytes):
         raise WireError("wrong-type", _join(path, "data"), f"must be binary, got {_type(data)}")
@@ -223,6 +239,8 @@ def _pose(value: Any, path: str) -> FloatArray:
     )
     if not rigid or np.linalg.det(rotation) < 0 or not np.allclose(pose[3], (0, 0, 0, 1), atol=1e-9):
         raise WireError("bad-pose", path, "must be a rigid transform: a rotation, a translation, last row 0 0 0 1")
+    if rotation[2, 2] < MIN_UPRIGHT:
+        raise WireError("bad-pose", path, "must be upright: the sensor's z axis within 60 degrees of the world's")
     if np.abs(pose[:3, 3]).max() > MAX_TRANSLATION_M:
         raise WireError("bad-pose", path, f"must lie within {MAX_TRANSLATION_M:g} m of the world's origin")
     return pose
@@ -260,7 +278,12 @@ def _join(path: str, name: str) -> str:
 
 
 def _quoted(names: Any) -> str:
-    return ", ".join(repr(str(name)) for name in names)
+    return ", ".join(_shown(name) for name in names)
+
+
+def _shown(name: Any) -> str:
+    text = repr(str(name))
+    return text if len(text) <= SHOWN else text[:SHOWN] + "..."
 
 
 def _type(value: Any) -> str:

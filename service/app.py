@@ -15,10 +15,12 @@ from fastapi import FastAPI  # noqa: E402
 
 from service import problems  # noqa: E402
 from service.engine import Engine  # noqa: E402
+from service.frames import Frames  # noqa: E402
 from service.gateway import Gateway  # noqa: E402
 from service.limits import BodyLimit  # noqa: E402
 from service.metrics import Metrics  # noqa: E402
 from service.routes import operations, v1  # noqa: E402
+from service.sessions import Sessions  # noqa: E402
 from service.settings import Settings  # noqa: E402
 from service.store import MemoryStore  # noqa: E402
 
@@ -36,13 +38,19 @@ def create_app(settings: Settings | None = None, new_seed: Callable[[], int] | N
     """
     settings = settings or Settings()
     engine = Engine(settings.torch_threads)
+    metrics = Metrics()
+    sessions = Sessions(settings, MemoryStore(), engine, metrics)
     seeding = {} if new_seed is None else {"new_seed": new_seed}
-    gateway = Gateway(settings, MemoryStore(), engine, Metrics(), **seeding)
+    gateway = Gateway(engine, metrics, sessions, Frames(sessions, engine, metrics, **seeding))
 
     @contextlib.asynccontextmanager
     async def lifespan(_: FastAPI) -> AsyncIterator[None]:
         await engine.start()
-        sweeper = asyncio.create_task(gateway.expire_idle_sessions())
+        if settings.detector not in engine.detectors:
+            raise ValueError(
+                f"ROBOSAC_DETECTOR: unknown detector {settings.detector!r}; known: {list(engine.detectors)}"
+            )
+        sweeper = asyncio.create_task(sessions.expire_idle())
         try:
             yield
         finally:
@@ -54,6 +62,7 @@ def create_app(settings: Settings | None = None, new_seed: Callable[[], int] | N
         summary="Fuses teammates' feature maps that the ego's own perception does not contradict.",
         version=version("robosac"),
         lifespan=lifespan,
+        redirect_slashes=False,
     )
     app.state.gateway = gateway
     problems.install(app)

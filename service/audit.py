@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Mapping
+from collections.abc import Mapping, Sequence
 from datetime import UTC, datetime
 from typing import Any
 
@@ -33,10 +33,24 @@ def session_opened(record: SessionRecord, info: DetectorInfo) -> AuditRecord:
     }
 
 
-def frame_answered(answer: Mapping[str, Any], result: FusionResult, seed: int) -> AuditRecord:
+def team_changed(before: Sequence[str], after: Sequence[str]) -> AuditRecord:
+    """Teammates joined or left."""
+    return {
+        "event": "team_changed",
+        "time": now(),
+        "joined": [name for name in after if name not in before],
+        "left": [name for name in before if name not in after],
+        "teammates": list(after),
+    }
+
+
+def frame_answered(
+    answer: Mapping[str, Any], result: FusionResult, seed: int, unlogged: Mapping[str, int]
+) -> AuditRecord:
     """A frame is decided: everything of the answer but the boxes themselves, and the seed that replays it.
 
-    The seed is written as a string, since it exceeds what JSON readers hold exactly.
+    The seed is written as a string, since it exceeds what JSON readers hold exactly. ``unlogged`` counts the refused
+    messages of each vehicle since the last frame that were too many to be recorded one by one.
     """
     kept = {name: value for name, value in answer.items() if name != "boxes"}
     return {
@@ -46,6 +60,7 @@ def frame_answered(answer: Mapping[str, Any], result: FusionResult, seed: int) -
         "boxes": len(result.boxes),
         "seed": str(seed),
         "fault": result.fault,
+        "unlogged_refusals": dict(unlogged),
     }
 
 

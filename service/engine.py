@@ -15,7 +15,7 @@ import torch
 from robosac.boxes import pose_matrix
 from robosac.defenses import Defense, State
 from robosac.detectors import Detector, Message, available, load
-from robosac.fusion import FusionResult, fuse
+from robosac.fusion import FusionResult, PreviousAnswer, fuse
 
 T = TypeVar("T")
 
@@ -55,6 +55,8 @@ class Engine:
         *,
         seed: int,
         state: State,
+        frame: int,
+        previous: PreviousAnswer | None,
         deadline: float,
     ) -> tuple[FusionResult, float]:
         """`robosac.fusion.fuse` on the engine's thread; also the milliseconds that the frame waited for it."""
@@ -62,8 +64,18 @@ class Engine:
 
         def work() -> tuple[FusionResult, float]:
             waited_ms = (time.perf_counter() - submitted) * 1e3
-            rng = np.random.default_rng(seed)
-            return fuse(detector, defense, ego, teammates, rng=rng, state=state, deadline=deadline), waited_ms
+            result = fuse(
+                detector,
+                defense,
+                ego,
+                teammates,
+                rng=np.random.default_rng(seed),
+                state=state,
+                frame=frame,
+                previous=previous,
+                deadline=deadline,
+            )
+            return result, waited_ms
 
         return await self._submit(work)
 

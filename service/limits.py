@@ -1,16 +1,50 @@
-"""A bound on request bodies, kept while they are read."""
+"""Bounds on request bodies, kept while they are read."""
 
 from __future__ import annotations
 
+from fastapi import Request
 from starlette.datastructures import Headers
 from starlette.exceptions import HTTPException
+from starlette.requests import ClientDisconnect
 from starlette.types import ASGIApp, Message, Receive, Scope, Send
+
+from service.problems import Problem
+
+
+def too_large(limit: int) -> Problem:
+    """The refusal of a body of more than ``limit`` bytes."""
+    return Problem(413, "too-large", f"a body may have at most {limit} bytes here")
+
+
+def announced_bytes(headers: Headers) -> int:
+    """The length that a request announces; 0 if it announces none."""
+    announced = headers.get("content-length", "")
+    return int(announced) if announced.isdecimal() and len(announced) < 20 else 0
+
+
+async def read_bounded(request: Request, limit: int) -> bytes:
+    """The body, never more than ``limit`` bytes of it; what is announced as more is not read at all.
+
+    Raises
+    ------
+    Problem
+        413 for a larger body, 400 if the client goes away before its end.
+    """
+    if announced_bytes(request.headers) > limit:
+        raise too_large(limit)
+    body = bytearray()
+    try:
+        async for chunk in request.stream():
+            body += chunk
+            if len(body) > limit:
+                raise too_large(limit)
+    except ClientDisconnect as error:
+        raise Problem(400, "incomplete-body", "the body ended before its announced length") from error
+    return bytes(body)
 
 
 class BodyLimit:
-    """Refuses a body of more than ``limit`` bytes with 413: by its announced length before any of it is read, else
-    when it outgrows the limit.
-    """
+    """Bounds every body, whatever route reads it: 413 by its announced length, else when it outgrows the limit."""
 
     def __init__(self, app: ASGIApp, limit: int) -> None:
         self._app = app
@@ -20,18 +54,17 @@ class BodyLimit:
         if scope["type"] != "http":
             await self._app(scope, receive, send)
             return
-        announced = Headers(scope=scope).get("content-length", "")
-        too_large = announced.isdecimal() and int(announced[:32]) > self._limit
+        if announced_bytes(Headers(scope=scope)) > self._limit:
+            await too_large(self._limit).response()(scope, receive, send)
+            return
         taken = 0
 
         async def bounded() -> Message:
             nonlocal taken
-            if too_large:
-                raise HTTPException(413, f"a body may have at most {self._limit} bytes")
             message = await receive()
             taken += len(message.get("body", b""))
             if taken > self._limit:
-                raise HTTPException(413, f"a body may have at most {self._limit} bytes")
+                raise HTTPException(413, too_large(self._limit).detail)  # FastAPI lets no other pass here
             return message
 
         await self._app(scope, bounded, send)

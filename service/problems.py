@@ -17,6 +17,7 @@ from fastapi.responses import JSONResponse
 from starlette.exceptions import HTTPException
 
 from robosac.wire import WireError
+from service.schemas import DEFENSE_KINDS
 
 logger = logging.getLogger(__name__)
 
@@ -87,13 +88,14 @@ def install(app: FastAPI) -> None:
             return Problem(
                 400, "malformed-json", f"not JSON: {first.get('ctx', {}).get('error', first['msg'])}"
             ).response()
-        where = [str(part) for part in first["loc"] if part not in ("body", "query", "path")]
+        where = [str(part) for part in first["loc"] if part not in ("body", "query", "path", *DEFENSE_KINDS)]
         return Problem(422, "invalid-request", str(first["msg"]), ".".join(where)).response()
 
     @app.exception_handler(HTTPException)
     async def _http(_: Request, error: HTTPException) -> JSONResponse:
         phrase = HTTPStatus(error.status_code).phrase.lower().replace(" ", "-")
-        slug = "too-large" if error.status_code == 413 else phrase  # Python 3.13 renamed the phrase
+        # 400 comes only from bodies that FastAPI cannot parse; Python 3.13 renamed the phrase of 413
+        slug = {400: "malformed-json", 413: "too-large"}.get(error.status_code, phrase)
         return Problem(error.status_code, slug, str(error.detail), headers=error.headers).response()
 
     @app.exception_handler(Exception)

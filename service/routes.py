@@ -3,15 +3,28 @@
 from __future__ import annotations
 
 import json
+import re
 from typing import Annotated, Any
 
 from fastapi import APIRouter, Depends, Header, Query, Request, Response
 from fastapi.security import HTTPAuthorizationCredentials, HTTPBearer
 
 from robosac import wire
-from service.gateway import Caller, Gateway
+from service.gateway import Gateway
+from service.limits import read_bounded
 from service.problems import Problem
-from service.schemas import DetectorList, FrameResult, Receipt, SessionCreated, SessionRequest, SessionState
+from service.schemas import (
+    DetectorEntry,
+    DetectorList,
+    EnrolmentRequest,
+    FrameResult,
+    Receipt,
+    SessionCreated,
+    SessionRequest,
+    SessionState,
+    TeamChanged,
+)
+from service.sessions import Caller
 
 MSGPACK = "application/vnd.msgpack"
 MSGPACK_TYPES = (MSGPACK, "application/msgpack", "application/x-msgpack")
@@ -31,11 +44,11 @@ Credentials = Annotated[HTTPAuthorizationCredentials | None, Depends(_bearer)]
 
 
 async def _vehicle(sid: str, gateway: GatewayDep, credentials: Credentials) -> Caller:
-    return await gateway.authenticate(sid, credentials.credentials if credentials else None)
+    return await gateway.sessions.authenticate(sid, credentials.credentials if credentials else None)
 
 
 async def _ego(sid: str, gateway: GatewayDep, credentials: Credentials) -> Caller:
-    return await gateway.authenticate_ego(sid, credentials.credentials if credentials else None)
+    return await gateway.sessions.authenticate_ego(sid, credentials.credentials if credentials else None)
 
 
 Vehicle = Annotated[Caller, Depends(_vehicle)]
@@ -52,31 +65,43 @@ _FRAME_RESPONSES: dict[int | str, dict[str, Any]] = {
 @v1.get("/detectors")
 async def list_detectors(gateway: GatewayDep) -> DetectorList:
     """What each detector wants to be sent."""
-    return DetectorList(detectors=gateway.detector_list())
+    return DetectorList(detectors=[DetectorEntry.of(detector.info) for detector in gateway.engine.detectors.values()])
 
 
 @v1.post("/sessions", status_code=201)
 async def open_session(request: SessionRequest, gateway: GatewayDep) -> SessionCreated:
     """Open a session of one ego with its teammates. The tokens are shown only in this answer."""
-    return await gateway.open_session(request)
+    return await gateway.sessions.open(request)
 
 
 @v1.get("/sessions/{sid}")
 async def get_session(caller: Ego, gateway: GatewayDep) -> SessionState:
     """The session's settings and what its defence remembers."""
-    return await gateway.describe(caller)
+    return await gateway.sessions.describe(caller)
 
 
 @v1.delete("/sessions/{sid}", status_code=204)
 async def delete_session(caller: Ego, gateway: GatewayDep) -> None:
     """End the session; its audit log goes with it, so fetch that first."""
-    await gateway.close_session(caller)
+    await gateway.sessions.close(caller)
+
+
+@v1.post("/sessions/{sid}/teammates", status_code=201)
+async def enrol_teammates(request: EnrolmentRequest, caller: Ego, gateway: GatewayDep) -> TeamChanged:
+    """Let teammates join from the next frame on. Their tokens are shown only in this answer."""
+    return await gateway.sessions.enrol(caller, request.teammates)
+
+
+@v1.delete("/sessions/{sid}/teammates/{vehicle_id}", status_code=204)
+async def dismiss_teammate(vehicle_id: str, caller: Ego, gateway: GatewayDep) -> None:
+    """Let a teammate leave from the next frame on; its token is worth nothing any more."""
+    await gateway.sessions.dismiss(caller, vehicle_id)
 
 
 @v1.get("/sessions/{sid}/audit", response_class=Response, responses={200: {"content": {"application/jsonl": {}}}})
 async def get_audit(caller: Ego, gateway: GatewayDep, after: Annotated[int, Query(ge=0)] = 0) -> Response:
     """The audit log as JSON Lines: records with a number above `after`."""
-    records = await gateway.audit_log(caller, after)
+    records = await gateway.sessions.audit_log(caller, after)
     lines = "".join(json.dumps(record, allow_nan=False) + "\n" for record in records)
     return Response(lines, media_type="application/jsonl")
 
@@ -94,8 +119,8 @@ async def post_message(
     request: Request, caller: Vehicle, gateway: GatewayDep, accept: Annotated[str | None, Header()] = None
 ) -> Response:
     """A vehicle's own message. The ego's starts the fusion and is answered with the frame result."""
-    body = await _read_body(request)
-    status, answer = await gateway.post_message(caller, body)
+    body = await _read_body(request, caller, gateway, whole_frame=False)
+    status, answer = await gateway.frames.post_message(caller, body)
     return _negotiated(answer, accept, status)
 
 
@@ -104,8 +129,8 @@ async def post_frame(
     request: Request, caller: Ego, gateway: GatewayDep, accept: Annotated[str | None, Header()] = None
 ) -> Response:
     """A whole frame in one request by the ego."""
-    body = await _read_body(request)
-    return _negotiated(await gateway.post_frame(caller, body), accept)
+    body = await _read_body(request, caller, gateway, whole_frame=True)
+    return _negotiated(await gateway.frames.post_frame(caller, body), accept)
 
 
 @operations.get("/healthz")
@@ -128,20 +153,26 @@ async def metrics(gateway: GatewayDep) -> Response:
     return Response(gateway.metrics.render(), media_type="text/plain; version=0.0.4; charset=utf-8")
 
 
-async def _read_body(request: Request) -> bytes:
-    """The body of a tensor request; its size is bounded for every route alike."""
-    media_type = request.headers.get("content-type", "").split(";")[0].strip().lower()
-    if media_type not in MSGPACK_TYPES:
-        raise Problem(415, "unsupported-media-type", f"send {MSGPACK}, not {media_type or 'an untyped body'}")
-    if "content-encoding" in request.headers:
-        raise Problem(415, "unsupported-encoding", "bodies must not be compressed", "content-encoding")
-    return await request.body()
+async def _read_body(request: Request, caller: Caller, gateway: Gateway, *, whole_frame: bool) -> bytes:
+    """The body of a tensor request, read only as far as the detector's layout allows; a refusal goes on record."""
+    try:
+        media_type = request.headers.get("content-type", "").split(";")[0].strip().lower()
+        if media_type not in MSGPACK_TYPES:
+            raise Problem(415, "unsupported-media-type", f"send {MSGPACK}, not {media_type[:64] or 'an untyped body'}")
+        if "content-encoding" in request.headers:
+            raise Problem(415, "unsupported-encoding", "bodies must not be compressed", "content-encoding")
+        return await read_bounded(request, gateway.frames.body_limit(caller, whole_frame=whole_frame))
+    except Problem as problem:
+        await gateway.frames.note_unread(caller, problem)
+        raise
 
 
 def _negotiated(answer: dict[str, Any], accept: str | None, status: int = 200) -> Response:
     """msgpack where the client names it before JSON, else JSON."""
     for media_range in (accept or "").lower().split(","):
-        media_type = media_range.split(";")[0].strip()
+        media_type, *parameters = (part.strip() for part in media_range.split(";"))
+        if any(re.fullmatch(r"q=0(\.0*)?", parameter) for parameter in parameters):
+            continue
         if media_type in MSGPACK_TYPES:
             return Response(wire.pack(answer), status, media_type=MSGPACK)
         if media_type in ("application/json", "application/*", "*/*"):

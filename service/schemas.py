@@ -4,11 +4,22 @@ from __future__ import annotations
 
 from typing import Annotated, Any, Literal
 
-from pydantic import BaseModel, ConfigDict, Field, StringConstraints, ValidationInfo, field_validator
+from pydantic import (
+    AfterValidator,
+    BaseModel,
+    ConfigDict,
+    Field,
+    StringConstraints,
+    TypeAdapter,
+    ValidationInfo,
+    field_validator,
+)
 
 from robosac.budget import DEFAULT_CONFIDENCE
 from robosac.consensus import DEFAULT_THRESHOLD
-from robosac.defenses import Defense, SampleConsensus
+from robosac.defenses import A2CP, Defense, Reference, SampleConsensus, StaticTeam, Undefended
+from robosac.defenses.a2cp import DEFAULT_BUDGET as DEFAULT_A2CP_BUDGET
+from robosac.defenses.static_team import DEFAULT_RECHECK
 from robosac.detectors import DetectorInfo
 
 VehicleId = Annotated[str, StringConstraints(pattern=r"^[A-Za-z0-9][A-Za-z0-9._:-]{0,63}$")]
@@ -18,29 +29,83 @@ class _Request(BaseModel):
     model_config = ConfigDict(extra="forbid", frozen=True, allow_inf_nan=False)
 
 
-class SampleConsensusSettings(_Request):
-    """ROBOSAC, Algorithm 1: sample subsets of teammates until one agrees with the ego."""
-
-    kind: Literal["sample_consensus"] = "sample_consensus"
+class _SamplingSettings(_Request):
     attacker_ratio: float = Field(0.2, gt=0, lt=1, description="Assumed share of attackers among the teammates.")
     sampling_budget: int | None = Field(None, ge=1, le=10_000, description="Most hypotheses tested in a frame.")
-    collaborators: int | None = Field(None, ge=1, description="Teammates in a hypothesis.")
+    collaborators: int | None = Field(None, ge=1, le=1024, description="Teammates in a hypothesis.")
     confidence: float = Field(DEFAULT_CONFIDENCE, gt=0, lt=1)
     consensus_threshold: float = Field(DEFAULT_THRESHOLD, gt=0, le=1, description="Jaccard index of a consensus.")
-    reference: Literal["ego"] = Field("ego", description="What a hypothesis is compared with.")
+    reference: Reference = Field(Reference.EGO, description="What a hypothesis is compared with.")
+
+
+class SampleConsensusSettings(_SamplingSettings):
+    """ROBOSAC, Algorithm 1: sample subsets of teammates until one agrees with the reference."""
+
+    kind: Literal["sample_consensus"] = "sample_consensus"
 
     def build(self) -> Defense:
         """The defence itself."""
-        return SampleConsensus(
-            attacker_ratio=self.attacker_ratio,
-            sampling_budget=self.sampling_budget,
-            collaborators=self.collaborators,
-            confidence=self.confidence,
-            consensus_threshold=self.consensus_threshold,
-        )
+        return SampleConsensus(**self.model_dump(exclude={"kind"}))
 
 
-DefenseSettings = SampleConsensusSettings
+class StaticTeamSettings(_SamplingSettings):
+    """Find trustworthy teammates once, rely on them, and look again now and then."""
+
+    kind: Literal["static_team"]
+    recheck_every: int | None = Field(
+        DEFAULT_RECHECK, ge=1, description="Frames between two re-checks of the trusted; null never looks again."
+    )
+
+    def build(self) -> Defense:
+        """The defence itself."""
+        return StaticTeam(**self.model_dump(exclude={"kind"}))
+
+
+class A2CPSettings(_Request):
+    """Aggressive-to-conservative probing: estimate the attacker ratio while answering."""
+
+    kind: Literal["a2cp"]
+    ratios: tuple[float, ...] | None = Field(
+        None, min_length=1, max_length=64, description="Ascending in [0, 1); by default all that the team size allows."
+    )
+    sampling_budget: int = Field(DEFAULT_A2CP_BUDGET, ge=1, le=10_000, description="Most hypotheses tested in a frame.")
+    confidence: float = Field(DEFAULT_CONFIDENCE, gt=0, lt=1)
+    consensus_threshold: float = Field(DEFAULT_THRESHOLD, gt=0, le=1, description="Jaccard index of a consensus.")
+    reference: Reference = Field(Reference.EGO, description="What a hypothesis is compared with.")
+
+    def build(self) -> Defense:
+        """The defence itself."""
+        return A2CP(**self.model_dump(exclude={"kind"}))
+
+
+class UndefendedSettings(_Request):
+    """No defence: everybody is fused and nothing is tested. A baseline."""
+
+    kind: Literal["none"]
+
+    def build(self) -> Defense:
+        """The defence itself."""
+        return Undefended()
+
+
+DefenseSettings = Annotated[
+    SampleConsensusSettings | StaticTeamSettings | A2CPSettings | UndefendedSettings, Field(discriminator="kind")
+]
+DEFENSE_KINDS = ("sample_consensus", "static_team", "a2cp", "none")
+read_defense = TypeAdapter[DefenseSettings](DefenseSettings).validate_python
+"""Settings of a defence from what a session keeps of them."""
+
+
+def _check_distinct(teammates: list[str]) -> list[str]:
+    if len(set(teammates)) != len(teammates):
+        raise ValueError("teammates must be distinct")
+    return teammates
+
+
+class EnrolmentRequest(_Request):
+    """Teammates that join a session."""
+
+    teammates: Annotated[list[VehicleId], AfterValidator(_check_distinct)] = Field(min_length=1, max_length=1024)
 
 
 class SessionRequest(_Request):
@@ -56,8 +121,7 @@ class SessionRequest(_Request):
     @field_validator("teammates")
     @classmethod
     def _distinct_vehicles(cls, teammates: list[str], others: ValidationInfo) -> list[str]:
-        if len(set(teammates)) != len(teammates):
-            raise ValueError("teammates must be distinct")
+        _check_distinct(teammates)
         if others.data.get("ego_id") in teammates:
             raise ValueError("the ego cannot be its own teammate")
         return teammates
@@ -110,6 +174,13 @@ class SessionCreated(BaseModel):
     defense: DefenseSettings
     latency_budget_ms: float
     gather_ms: float
+
+
+class TeamChanged(BaseModel):
+    """The team after some joined, and the tokens of those; they are shown only here."""
+
+    teammates: list[str]
+    teammate_tokens: dict[str, str]
 
 
 class SessionState(BaseModel):

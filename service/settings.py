@@ -25,9 +25,9 @@ class Settings(BaseSettings):
     )
     max_body_bytes: int = Field(32 * 2**20, ge=1024, description="Largest request body.")
     max_sessions: int = Field(10_000, ge=1, description="Open sessions at a time.")
-    max_teammates: int = Field(63, ge=1, description="Teammates of one session.")
+    max_teammates: int = Field(63, ge=1, le=1024, description="Teammates of one session.")
     max_pending_frames: int = Field(
-        4, ge=1, description="Frames ahead of the ego for which a teammate's message is kept."
+        4, ge=1, description="Frames after the next for which a teammate's message is kept."
     )
     session_idle_s: float = Field(3600.0, gt=0, description="A session unused for longer is ended.")
     torch_threads: int = Field(1, ge=1, description="Threads of one detector pass; at this size one is fastest.")

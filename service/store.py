@@ -63,6 +63,17 @@ class Store(Protocol):
         """Keep a decision: the frame is answered, the defence's state is the new one, and the log says so."""
         ...
 
+    async def change_team(
+        self,
+        session_id: str,
+        teammates: tuple[str, ...],
+        token_digests: Mapping[str, str],
+        state: Mapping[str, Any],
+        event: AuditRecord,
+    ) -> None:
+        """Keep a new team with its tokens, the defence's state for it, and the log's record of it."""
+        ...
+
     async def log(self, session_id: str, event: AuditRecord) -> None:
         """Append to a session's log."""
         ...
@@ -104,6 +115,20 @@ class MemoryStore:
             self._sessions[session_id] = replace(
                 record, last_frame=frame, frames_answered=record.frames_answered + 1, state=state
             )
+            self._append(session_id, event)
+
+    async def change_team(
+        self,
+        session_id: str,
+        teammates: tuple[str, ...],
+        token_digests: Mapping[str, str],
+        state: Mapping[str, Any],
+        event: AuditRecord,
+    ) -> None:
+        """Keep a new team; nothing happens if the session was ended meanwhile."""
+        record = self._sessions.get(session_id)
+        if record is not None:
+            self._sessions[session_id] = replace(record, teammates=teammates, token_digests=token_digests, state=state)
             self._append(session_id, event)
 
     async def log(self, session_id: str, event: AuditRecord) -> None:

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from robosac.defenses.a2cp import A2CP
 from robosac.defenses.protocol import (
     Conversation,
     Decision,
@@ -9,21 +10,28 @@ from robosac.defenses.protocol import (
     Hypothesis,
     Outcome,
     Reason,
+    Reference,
     Rejection,
     Source,
     State,
 )
 from robosac.defenses.sample_consensus import SampleConsensus
+from robosac.defenses.static_team import StaticTeam
+from robosac.defenses.undefended import Undefended
 
 __all__ = [
+    "A2CP",
     "Conversation",
     "Decision",
     "Defense",
     "Hypothesis",
     "Outcome",
     "Reason",
+    "Reference",
     "Rejection",
     "SampleConsensus",
     "Source",
     "State",
+    "StaticTeam",
+    "Undefended",
 ]

@@ -5,6 +5,8 @@ for each that was tested, and returns a `Decision`. It knows nothing of detector
 outcomes than it proposed hypotheses, the time is up: it must return its decision from what it knows.
 
 What a defence remembers between frames is its *state*, a plain dict of JSON values that the caller keeps per session.
+Under ``trusted`` it may hold a list of teammates whose messages may be used without a test in the frame; a teammate
+gets onto that list only by having been in consensus, or because the defence's settings say so from the start.
 """
 
 from __future__ import annotations
@@ -20,6 +22,15 @@ from robosac.consensus import Verdict
 
 Hypothesis = tuple[str, ...]
 State = Mapping[str, Any]
+
+
+class Reference(StrEnum):
+    """What the fusion of a hypothesis is compared with."""
+
+    EGO = "ego"
+    """The ego's own perception of the frame."""
+    PREVIOUS = "previous"
+    """The previous frame's answer, moved with the ego; saves the pass of the ego's own perception."""
 
 
 class Source(StrEnum):
@@ -88,7 +99,8 @@ class Decision:
     Attributes
     ----------
     accepted : tuple of str
-        The subset whose fusion is the answer; empty for ``ego_only``. It must be one that was tested in this frame.
+        The subset whose fusion is the answer; empty for ``ego_only``. For ``consensus`` it must be one that was in
+        consensus in this frame, for ``trusted`` all of it must be on the trust list that the frame began with.
     source : Source
     rejected : mapping of teammate id to Rejection
         Every teammate of the frame that is not accepted.
@@ -118,8 +130,17 @@ class Defense(Protocol):
         """Jaccard index from which on a hypothesis is in consensus."""
         ...
 
-    def initial_state(self) -> State:
-        """State of a session before its first frame."""
+    @property
+    def reference(self) -> Reference:
+        """What hypotheses are compared with."""
+        ...
+
+    def initial_state(self, team: Sequence[str]) -> State:
+        """State of a session with this team before its first frame."""
+        ...
+
+    def change_team(self, state: State, team: Sequence[str]) -> State:
+        """State after teammates joined or left; ``team`` is the new one."""
         ...
 
     def check_team(self, team_size: int) -> None:
@@ -132,9 +153,15 @@ class Defense(Protocol):
 
 
 def explain_rejections(
-    team: Sequence[str], accepted: Collection[str], outcomes: Sequence[Outcome]
+    team: Sequence[str],
+    accepted: Collection[str],
+    outcomes: Sequence[Outcome],
+    otherwise: Reason = Reason.NOT_SAMPLED,
 ) -> dict[str, Rejection]:
-    """A reason for every teammate that is not accepted, from the outcomes of the frame."""
+    """A reason for every teammate that is not accepted, from the outcomes of the frame.
+
+    Those that no outcome speaks against get the reason ``otherwise``.
+    """
     rejected = {}
     for teammate in team:
         if teammate in accepted:
@@ -144,5 +171,5 @@ def explain_rejections(
             lowest = min(outcomes[i].jaccard_index for i in against)
             rejected[teammate] = Rejection(Reason.DISSENSUS, {"hypotheses": against, "lowest_jaccard_index": lowest})
         else:
-            rejected[teammate] = Rejection(Reason.NOT_SAMPLED)
+            rejected[teammate] = Rejection(otherwise)
     return rejected

@@ -26,6 +26,11 @@ class TensorSpec:
     dtype: str
     shape: tuple[int, ...]
 
+    @property
+    def nbytes(self) -> int:
+        """Bytes of the tensor's data."""
+        return int(np.prod(self.shape)) * np.dtype(self.dtype).itemsize
+
 
 @dataclass(frozen=True)
 class DetectorInfo:

@@ -40,5 +40,6 @@ def simulate_sampling(
     """Hypotheses tested in each of many independent frames, (runs,), for a given number of attackers in the team."""
     team = [f"v{i}" for i in range(team_size)]
     bad = set(team[:attackers])
-    steps = [len(converse_with_oracle(defense, team, bad, defense.initial_state(), rng)[1]) for _ in range(runs)]
+    state = defense.initial_state(team)
+    steps = [len(converse_with_oracle(defense, team, bad, state, rng)[1]) for _ in range(runs)]
     return np.array(steps, dtype=np.int64)

@@ -4,11 +4,11 @@ from collections.abc import Collection
 import numpy as np
 import pytest
 
-from robosac.boxes import pose_matrix
+from robosac.boxes import from_world, pose_matrix
 from robosac.consensus import Verdict
-from robosac.defenses import Decision, Reason, SampleConsensus, Source
+from robosac.defenses import Decision, Reason, Reference, SampleConsensus, Source, StaticTeam, Undefended
 from robosac.detectors import DetectorInfo, Message
-from robosac.fusion import SAFETY, fuse
+from robosac.fusion import SAFETY, PreviousAnswer, fuse
 
 EGO = Message(pose_matrix(0, 0, 0, 0), {})
 TEAM = dict.fromkeys("abcde", EGO)
@@ -133,6 +133,81 @@ def test_nothing_unverified_reaches_the_answer(caplog):
         result = run(FakeDetector(), Liar())
     assert (result.source, result.accepted) == (Source.EGO_ONLY, ())
     assert "UnverifiedAnswer" in result.fault
+
+
+class Usurper(StaticTeam):
+    """Trusts whom it likes."""
+
+    def converse(self, team, state, rng):
+        yield [("a",)]
+        return Decision(("a",), Source.CONSENSUS, {}, None, {"trusted": ["a", "b"], "frames_since_check": 0})
+
+
+class Flatterer(StaticTeam):
+    """Answers with teammates that are not on its list."""
+
+    def converse(self, team, state, rng):
+        yield from ()
+        return Decision(("a", "b"), Source.TRUSTED, {}, None, state)
+
+
+@pytest.mark.parametrize("defense", [Usurper(), Flatterer()])
+def test_trust_comes_from_consensus_and_from_nothing_else(defense, caplog):
+    with caplog.at_level(logging.CRITICAL):
+        result = run(FakeDetector(), defense, state={"trusted": ["a"] if isinstance(defense, Flatterer) else []})
+    assert (result.source, result.accepted) == (Source.EGO_ONLY, ())
+    assert "UnverifiedAnswer" in result.fault
+
+
+def test_a_trusted_frame_costs_one_pass_and_none_of_the_ego_alone():
+    detector = FakeDetector()
+    state = {"trusted": ["a", "c"], "frames_since_check": 0}
+    result = run(detector, StaticTeam(), state=state)
+    assert detector.decoded == [("a", "c")]
+    assert (result.source, result.accepted, result.sampling_steps) == (Source.TRUSTED, ("a", "c"), 0)
+    assert result.timings_ms["ego_only"] == 0.0
+    assert set(result.rejected) == {"b", "d", "e"}
+
+
+def test_undefended_fusion_decodes_everybody_once():
+    detector = FakeDetector(["c"])
+    result = run(detector, Undefended())
+    assert detector.decoded == [tuple(TEAM)]
+    np.testing.assert_array_equal(result.boxes, NOISE)
+
+
+TEMPORAL = SampleConsensus(sampling_budget=7, collaborators=3, reference=Reference.PREVIOUS)
+
+
+def test_the_previous_answer_saves_the_pass_of_the_ego_alone():
+    detector = FakeDetector()
+    first = run(detector, TEMPORAL, frame=4)
+    assert detector.decoded[0] == ()
+    detector.decoded.clear()
+    second = run(detector, TEMPORAL, frame=5, previous=first.previous)
+    assert second.source is Source.CONSENSUS
+    assert () not in detector.decoded
+    assert second.previous.frame == 5
+
+
+def test_the_previous_answer_moves_with_the_ego():
+    detector = FakeDetector()
+    pose = pose_matrix(3.0, -1.0, 0.0, 0.4)
+    before = PreviousAnswer(0, pose, from_world(SEEN, pose))
+    assert run(detector, TEMPORAL, frame=1, previous=before).hypotheses[0].jaccard_index == 1.0
+    unmoved = PreviousAnswer(0, EGO.pose, from_world(SEEN, pose))
+    assert run(detector, TEMPORAL, frame=1, previous=unmoved).hypotheses[0].jaccard_index < 0.3
+
+
+def test_after_a_gap_or_without_a_previous_answer_the_ego_is_the_reference():
+    answered = PreviousAnswer(0, EGO.pose, NOISE)
+    for frame, previous in ((2, answered), (0, answered), (1, None)):
+        detector = FakeDetector()
+        assert run(detector, TEMPORAL, frame=frame, previous=previous).source is Source.CONSENSUS
+        assert detector.decoded[0] == ()
+    misled = run(FakeDetector(), TEMPORAL, frame=1, previous=answered)
+    assert misled.source is Source.EGO_ONLY
+    assert misled.previous is None
 
 
 def test_the_embedded_detector_end_to_end(detector, ego_message, attacked):

@@ -70,6 +70,7 @@ def with_value(value):
 SHEAR = [1, 1, 0, 0, 0, 1, 0, 0, 0, 0, 1, 0, 0, 0, 0, 1]
 MIRROR = [1, 0, 0, 0, 0, -1, 0, 0, 0, 0, 1, 0, 0, 0, 0, 1]
 
+UPSIDE_DOWN = [1, 0, 0, 0, 0, -1, 0, 0, 0, 0, -1, 0, 0, 0, 0, 1]
 AFAR = [1, 0, 0, 1e300, 0, 1, 0, 0, 0, 0, 1, 0, 0, 0, 0, 1]
 
 
@@ -95,6 +96,7 @@ AFAR = [1, 0, 0, 1e300, 0, 1, 0, 0, 0, 0, 1, 0, 0, 0, 0, 1]
         ("pose", SHEAR, "bad-pose"),
         ("pose", MIRROR, "bad-pose"),
         ("pose", AFAR, "bad-pose"),
+        ("pose", UPSIDE_DOWN, "bad-pose"),
         ("tensors", KeyError, "missing-field"),
         ("tensors", [], "wrong-type"),
         ("tensors.features", KeyError, "missing-field"),
@@ -141,9 +143,9 @@ GOOD = wire.pack_message(0, "car-2", TEAMMATE)
         b"\xdd\xff\xff\xff\xff",  # an array of 4 Gi entries
         b"\xdf\xff\xff\xff\xff",  # a map of 4 Gi entries
         b"\x91" * 5000,  # nesting
-        b"\xc7\x04\x01abcd",  # an extension
-        b"\xd6\xff\x00\x00\x00\x00",  # a timestamp
-        b"\x81\x01\x02",  # a key that is no string
+        b"\x81\x90\x02",  # a key that is an array
+        b"\x92" + (b"\xdc\x00\x40" + b"\x80" * 64) * 2000,  # too many small containers
+        b"\xdc\x00\x41" + b"\x00" * 65,  # a long array
         b"\xa2\xff\xfe",  # a string that is not UTF-8
         b"\xc1",
     ],
@@ -154,7 +156,7 @@ def test_a_body_that_is_no_msgpack_within_limits_is_refused(body):
     assert (caught.value.code, caught.value.field) == ("malformed-msgpack", "")
 
 
-@pytest.mark.parametrize("value", [None, 3, [], "x"])
+@pytest.mark.parametrize("value", [None, 3, [], "x", msgpack.ExtType(1, b"abcd"), msgpack.Timestamp(0)])
 def test_a_body_that_is_no_map_is_refused(value):
     for read in (wire.read_message, wire.read_frame):
         with pytest.raises(wire.WireError, match="must be a map"):

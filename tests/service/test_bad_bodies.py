@@ -183,8 +183,104 @@ async def test_bodies_are_bounded_before_they_are_read(good_frame):
 
 async def test_messages_of_absurd_size_break_nothing(served, ego_message, benign):
     loud = Message(benign["car-2"].pose, {"features": np.full((64, 32, 32), 65504, dtype=np.float16)})
-    session = await served.open(defense={"sampling_budget": 7, "collaborators": 3})
+    session = await served.open(defense={"kind": "sample_consensus", "sampling_budget": 7, "collaborators": 3})
     answer = await served.ego(session).post_frame(0, ego_message, {**benign, "car-2": loud})
     assert answer.source == "consensus"
     assert "car-2" not in answer.accepted
     assert np.isfinite(answer.boxes).all()
+
+
+async def test_a_teammate_cannot_break_the_frame_that_carries_its_part(served, good_frame):
+    session = await served.open()
+    spoilers = [
+        msgpack.ExtType(5, b"1234"),
+        msgpack.Timestamp(3),
+        {1: 2},
+        {"pose": list(range(60)), "tensors": {"x" * 300: 1}},
+        {"pose": "y" * 10_000},
+    ]
+    for index, spoiler in enumerate(spoilers):
+        frame = msgpack.unpackb(good_frame(index))
+        frame["teammates"]["car-3"] = spoiler
+        frame["teammates"][7] = None
+        response = await served.post(session, "frames", msgpack.packb(frame))
+        assert response.status_code == 200, response.text
+        reasons = {e["vehicle_id"]: e["reason"] for e in response.json()["rejected"]}
+        assert (reasons["car-3"], reasons["7"]) == ("malformed", "unauthenticated")
+
+
+async def test_a_message_may_be_no_larger_than_its_detector_needs(served, messages):
+    session = await served.open(gather_ms=20)
+    token = session.teammate_tokens["car-2"]
+    problem(await served.post(session, "messages", bytes(300_000), token), 413, "too-large")
+    problem(
+        await served.post(session, "messages", b"x", token, **{"Content-Type": "text/plain"}),
+        415,
+        "unsupported-media-type",
+    )
+    answer = await served.ego(session).ask(0, messages["car-1"])
+    assert answer.rejected["car-2"]["reason"] == "malformed"
+    refused = [r["detail"] for r in await served.ego(session).audit() if r["event"] == "message_refused"]
+    assert len(refused) == 2
+
+
+async def test_many_small_containers_are_refused_before_they_cost_anything(served):
+    import time
+
+    bomb = b"\xde\x04\x00" + b"".join(msgpack.packb(str(i)) + b"\xdc\x00\x40" + b"\x80" * 64 for i in range(1024))
+    session = await served.open()
+    started = time.process_time()
+    problem(await served.post(session, "messages", bomb, session.teammate_tokens["car-2"]), 400, "malformed-msgpack")
+    assert time.process_time() - started < 1.0
+
+
+async def test_a_flood_of_refused_messages_is_counted_not_recorded(served, messages, good_frame):
+    session = await served.open()
+    for _ in range(40):
+        await served.post(session, "messages", b"junk", session.teammate_tokens["car-2"])
+    await served.post(session, "frames", good_frame(0))
+    records = await served.ego(session).audit()
+    assert sum(record["event"] == "message_refused" for record in records) == 16
+    assert records[-1]["unlogged_refusals"] == {"car-2": 24}
+
+
+async def test_a_client_that_goes_away_in_mid_body_is_no_error_of_the_gateway(caplog):
+    from service.app import create_app
+
+    app = create_app()
+    async with app.router.lifespan_context(app):
+        sent = []
+        session = None
+
+        async def call(method, path, headers, messages):
+            queue = list(messages)
+
+            async def receive():
+                return queue.pop(0)
+
+            async def send(message):
+                sent.append(message)
+
+            scope = {
+                "type": "http", "method": method, "path": path, "raw_path": path.encode(), "query_string": b"",
+                "headers": headers, "http_version": "1.1", "scheme": "http", "server": ("x", 1), "client": ("y", 2),
+                "root_path": "", "asgi": {"version": "3.0"},
+            }  # fmt: skip
+            await app(scope, receive, send)
+
+        body = b'{"ego_id": "a", "teammates": ["b"]}'
+        json_type = [(b"content-type", b"application/json")]
+        await call("POST", "/v1/sessions", json_type, [{"type": "http.request", "body": body, "more_body": False}])
+        import json
+
+        session = json.loads(sent[1]["body"])
+        sent.clear()
+        headers = [
+            (b"content-type", b"application/msgpack"),
+            (b"authorization", b"Bearer " + session["ego_token"].encode()),
+            (b"content-length", b"50000"),
+        ]
+        half = [{"type": "http.request", "body": b"\x83", "more_body": True}, {"type": "http.disconnect"}]
+        await call("POST", f"/v1/sessions/{session['session_id']}/frames", headers, half)
+    assert sent[0]["status"] == 400
+    assert not [record for record in caplog.records if record.levelname == "ERROR"]

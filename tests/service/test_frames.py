@@ -41,12 +41,12 @@ async def test_over_http_and_through_the_library_the_answer_is_the_same(detector
 
 
 async def test_the_audit_log_replays_a_decision(detector, served, ego_message, attacked):
-    session = await served.open(defense={"collaborators": 3})
+    session = await served.open(defense={"kind": "sample_consensus", "sampling_budget": 7, "collaborators": 3})
     answer = await served.ego(session).post_frame(0, ego_message, attacked)
     record = (await served.ego(session).audit())[-1]
     again = fuse(
         detector,
-        SampleConsensus(collaborators=3),
+        SampleConsensus(sampling_budget=7, collaborators=3),
         ego_message,
         {name: attacked[name] for name in TEAM},
         rng=np.random.default_rng(int(record["seed"])),
@@ -140,13 +140,55 @@ async def test_with_nobody_there_the_ego_answers_alone(served, messages):
 async def test_messages_may_come_some_frames_ahead_but_only_so_many(messages):
     async with serve(max_pending_frames=2) as served:
         session = await served.open(gather_ms=20)
+        token = session.teammate_tokens["car-2"]
+
+        async def post(frame):
+            return await served.post(session, "messages", wire.pack_message(frame, "car-2", messages["car-2"]), token)
+
+        for frame in (0, 1, 2):
+            assert (await post(frame)).status_code == 202
+        problem(await post(3), 409, "too-far-ahead")
+        for frame in (0, 1, 2):
+            assert "car-2" in (await served.ego(session).ask(frame, messages[EGO])).accepted
+
+
+async def test_absurd_frame_numbers_do_not_lock_their_sender_out(messages):
+    async with serve(max_pending_frames=2) as served:
+        session = await served.open(gather_ms=20)
         teammate = served.teammate(session, "car-2")
-        for frame in (0, 1, 10**12):
+        for frame in (10**6, 10**6 + 1, 10**6 + 2):
             await teammate.send(frame, messages["car-2"])
-        first = await served.ego(session).ask(0, messages[EGO])
-        assert first.rejected["car-2"]["reason"] == "missing"  # its oldest made way for its newest
-        second = await served.ego(session).ask(1, messages[EGO])
-        assert "car-2" in second.accepted
+        for frame in range(4):
+            await teammate.send(frame, messages["car-2"])
+            assert "car-2" in (await served.ego(session).ask(frame, messages[EGO])).accepted
+
+
+async def test_a_refused_message_counts_for_its_own_frame(served, messages):
+    session = await served.open(gather_ms=20)
+    ego, token = served.ego(session), session.teammate_tokens["rsu"]
+    await served.teammate(session, "rsu").send(0, messages["rsu"])
+    early = msgpack.unpackb(wire.pack_message(2, "rsu", messages["rsu"]))
+    early["pose"] = [0.0] * 16
+    problem(await served.post(session, "messages", msgpack.packb(early), token), 422, "bad-pose")
+    assert (await ego.ask(0, messages[EGO])).accepted == ("rsu",)
+    assert (await ego.ask(1, messages[EGO])).rejected["rsu"]["reason"] == "missing"
+    assert (await ego.ask(2, messages[EGO])).rejected["rsu"]["reason"] == "malformed"
+    assert (await ego.ask(3, messages[EGO])).rejected["rsu"]["reason"] == "missing"
+
+
+async def test_a_message_for_a_session_that_has_ended_is_not_accepted(served, messages, monkeypatch):
+    from service.frames import Frames
+
+    session = await served.open()
+    reading = Frames.body_limit
+
+    def ends_meanwhile(self, caller, *, whole_frame):
+        served.gateway.sessions._store._sessions.pop(session.session_id)
+        return reading(self, caller, whole_frame=whole_frame)
+
+    monkeypatch.setattr(Frames, "body_limit", ends_meanwhile)
+    body = wire.pack_message(0, "rsu", messages["rsu"])
+    problem(await served.post(session, "messages", body, session.teammate_tokens["rsu"]), 404, "unknown-session")
 
 
 async def test_late_stale_and_second_messages_are_refused_and_named(served, messages):
@@ -220,7 +262,7 @@ async def test_a_fault_inside_still_gives_the_ego_its_own_boxes(served, good_fra
 async def test_an_empty_street_is_no_evidence_and_earns_nobody_trust(served, ego_message):
     blank = {"features": np.zeros((64, 32, 32), dtype=np.float16)}
     nothing = Message(pose_matrix(0, 0, 1.7, 0), blank)
-    session = await served.open(defense={"sampling_budget": 3, "collaborators": 3})
+    session = await served.open(defense={"kind": "sample_consensus", "sampling_budget": 3, "collaborators": 3})
     answer = await served.ego(session).post_frame(0, nothing, dict.fromkeys(TEAM, nothing))
     if len(answer.boxes) == 0:
         assert answer.source == "ego_only"
@@ -228,7 +270,7 @@ async def test_an_empty_street_is_no_evidence_and_earns_nobody_trust(served, ego
 
 
 async def test_the_audit_log_is_json_lines_from_any_point(served, ego_message, attacked):
-    session = await served.open(defense={"collaborators": 3})
+    session = await served.open(defense={"kind": "sample_consensus", "sampling_budget": 7, "collaborators": 3})
     ego = served.ego(session)
     for frame in range(3):
         await ego.post_frame(frame, ego_message, attacked)

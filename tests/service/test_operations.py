@@ -20,7 +20,7 @@ async def test_alive_at_once_and_ready_after_the_warm_up():
 
 
 async def test_metrics_count_what_happened(served, ego_message, attacked, messages):
-    session = await served.open(defense={"collaborators": 3})
+    session = await served.open(defense={"kind": "sample_consensus", "sampling_budget": 7, "collaborators": 3})
     for frame in range(4):
         await served.ego(session).post_frame(frame, ego_message, attacked)
     bad = wire.pack_message(0, "car-3", messages["car-3"])
@@ -62,7 +62,7 @@ async def test_an_error_nobody_foresaw_is_a_problem_without_its_inside(served, m
     def broken(*_):
         raise RuntimeError("secret")
 
-    monkeypatch.setattr(served.gateway, "detector_list", broken)
+    monkeypatch.setattr("service.routes.DetectorEntry.of", broken)
     response = await served.http.get("/v1/detectors")
     problem(response, 500, "internal-error")
     assert "secret" not in response.text

@@ -14,7 +14,7 @@ async def test_the_detectors_say_what_to_send(served, detector):
 
 
 async def test_a_session_answers_with_everything_its_vehicles_need(served):
-    session = await served.open(defense={"kind": "sample_consensus", "collaborators": 3})
+    session = await served.open(defense={"kind": "sample_consensus", "sampling_budget": 7, "collaborators": 3})
     assert set(session.teammate_tokens) == set(TEAM)
     assert len({session.ego_token, *session.teammate_tokens.values()}) == 6
     assert session.detector["name"] == "intersection-mean"
@@ -50,16 +50,32 @@ async def test_state_and_end(served, good_frame):
         ({"ego_id": "a", "teammates": ["b"], "latency_budget_ms": 0}, "latency_budget_ms", "greater than 0"),
         ({"ego_id": "a", "teammates": ["b"], "latency_budget_ms": 50, "gather_ms": 51}, "gather_ms", "50 ms"),
         ({"ego_id": "a", "teammates": ["b"], "detector": "nonesuch"}, "detector", "intersection-mean"),
-        ({"ego_id": "a", "teammates": ["b"], "defense": {"kind": "magic"}}, "defense.kind", "sample_consensus"),
+        ({"ego_id": "a", "teammates": ["b"], "defense": {"kind": "magic"}}, "defense", "sample_consensus"),
         (
-            {"ego_id": "a", "teammates": ["b"], "defense": {"attacker_ratio": 1.0}},
+            {"ego_id": "a", "teammates": ["b"], "defense": {"kind": "sample_consensus", "attacker_ratio": 1.0}},
             "defense.attacker_ratio",
             "less than 1",
         ),
-        ({"ego_id": "a", "teammates": ["b"], "defense": {"attacker_ratio": 0}}, "defense.attacker_ratio", "greater"),
-        ({"ego_id": "a", "teammates": ["b"], "defense": {"sampling_budget": 0}}, "defense.sampling_budget", "greater"),
-        ({"ego_id": "a", "teammates": ["b", "c"], "defense": {"collaborators": 3}}, "defense", "between 1 and"),
-        ({"ego_id": "a", "teammates": list("bcdef"), "defense": {"collaborators": 5}}, "defense", "at most 4"),
+        (
+            {"ego_id": "a", "teammates": ["b"], "defense": {"kind": "sample_consensus", "attacker_ratio": 0}},
+            "defense.attacker_ratio",
+            "greater",
+        ),
+        (
+            {"ego_id": "a", "teammates": ["b"], "defense": {"kind": "sample_consensus", "sampling_budget": 0}},
+            "defense.sampling_budget",
+            "greater",
+        ),
+        (
+            {"ego_id": "a", "teammates": ["b", "c"], "defense": {"kind": "sample_consensus", "sampling_budget": 7, "collaborators": 3}},
+            "defense",
+            "at most 1 can",
+        ),
+        (
+            {"ego_id": "a", "teammates": list("bcdef"), "defense": {"kind": "sample_consensus", "collaborators": 5}},
+            "defense",
+            "at most 4",
+        ),
         ({"ego_id": "a", "teammates": [f"v{i}" for i in range(64)]}, "teammates", "at most 63"),
     ],
 )
@@ -119,7 +135,7 @@ async def test_the_number_of_sessions_is_bounded():
 
 
 async def test_idle_sessions_expire(monkeypatch):
-    monkeypatch.setattr("service.gateway.SWEEP_EVERY_S", 0.02)
+    monkeypatch.setattr("service.sessions.SWEEP_EVERY_S", 0.02)
     async with serve(session_idle_s=0.3) as served:
         idle, busy = await served.open(), await served.open()
         import asyncio

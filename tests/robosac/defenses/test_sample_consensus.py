@@ -1,29 +1,17 @@
-from collections.abc import Iterable
-
 import numpy as np
 import pytest
 
 from robosac.budget import DomainError
 from robosac.consensus import Verdict
-from robosac.defenses import Outcome, Reason, SampleConsensus, Source
+from robosac.defenses import Reason, SampleConsensus, Source
 from robosac.evaluation.oracle import converse_with_oracle
+from tests.robosac.defenses import conversation
 
 TEAM = ["a", "b", "c", "d", "e"]
 
 
-def converse(defense: SampleConsensus, verdicts: Iterable[Verdict], rng, team=TEAM):
-    """Answer the defence with these verdicts, then with silence: the time is up."""
-    verdicts = iter(verdicts)
-    conversation = defense.converse(team, {}, rng)
-    tested: list[Outcome] = []
-    try:
-        batch = next(conversation)
-        while True:
-            outcomes = [Outcome(subset, 0.5, verdict) for subset, verdict in zip(batch, verdicts, strict=False)]
-            tested += outcomes
-            batch = conversation.send(outcomes)
-    except StopIteration as stop:
-        return stop.value, tested
+def converse(defense, verdicts, rng, team=TEAM):
+    return conversation.converse(defense, verdicts, rng, team)
 
 
 def test_the_first_consensus_ends_the_search(rng):
@@ -142,6 +130,6 @@ def test_impossible_settings_are_refused(settings):
 
 
 def test_a_team_without_enough_benign_teammates_is_refused():
-    with pytest.raises(DomainError, match="at most 4 collaborators"):
+    with pytest.raises(DomainError, match="at most 4 can be collaborators"):
         SampleConsensus(0.2, collaborators=5).check_team(5)
     SampleConsensus(0.2, collaborators=4).check_team(5)

@@ -1,0 +1,185 @@
+"""A2CP with retrospect, Algorithm 2: estimate the attacker ratio while answering."""
+
+from __future__ import annotations
+
+from collections.abc import Generator, Sequence
+from dataclasses import dataclass
+from math import comb
+from typing import ClassVar
+
+import numpy as np
+
+from robosac.budget import DEFAULT_CONFIDENCE, DomainError, eq2_budget
+from robosac.consensus import DEFAULT_THRESHOLD, Verdict
+from robosac.defenses.protocol import (
+    Conversation,
+    Decision,
+    Hypothesis,
+    Outcome,
+    Reference,
+    Source,
+    State,
+    explain_rejections,
+)
+from robosac.defenses.sampling import check_budget, check_threshold, draw, search
+
+DEFAULT_BUDGET = 5
+
+
+@dataclass(frozen=True)
+class A2CP:
+    """Aggressive-to-conservative probing with retrospect (Algorithm 2 of *Among Us*, ICCV 2023), with errata.
+
+    For ascending ratios R_k of a team of S, ``U_k`` (Eq. 2 at eta = R_k, s = S (1 - R_k)) bounds the attempts and
+    ``T_k`` counts the failed ones.
+
+    1. A frame visits k = 1..K as long as its budget N lasts and some ``T_k < U_k``, and tests one hypothesis of
+       S (1 - R_k) teammates for each k with ``T_k < U_k``.
+    2. At a dissensus T_k grows by one. At a consensus the estimate becomes R_k, and k and all higher ratios are
+    settled;
+       lower ratios go on being tried, in this and in later frames, until their U is spent (the retrospect).
+    3. The frame's answer is its largest hypothesis in consensus, else the ego's own perception.
+    4. Once all is settled, frames go on as Algorithm 1 at the estimated ratio.
+
+    Errata: U_1 is 1 at R_1 = 0, where Eq. 2 gives 0 (one dissensus with everybody proves that there is an attacker); N
+    is a hard limit, which the listing's inner loop overruns; and the listing keeps no answer for the frame. A verdict
+    of no evidence spends a step and moves no counter. In a frame with teammates missing nothing is counted, since the
+    bounds hold for the full team.
+
+    Parameters
+    ----------
+    ratios : tuple of float, optional
+        Ascending, in [0, 1), multiples of 1 / S; by default 0, 1/S, ..., (S-1)/S.
+    sampling_budget : int
+        N, from 1 to 10,000.
+    confidence : float
+        p of Eq. 2.
+    consensus_threshold : float
+        Jaccard index from which on two perceptions agree.
+    reference : Reference
+        What hypotheses are compared with.
+
+    Raises
+    ------
+    DomainError
+        If an argument is outside its range.
+    """
+
+    kind: ClassVar[str] = "a2cp"
+
+    ratios: tuple[float, ...] | None = None
+    sampling_budget: int = DEFAULT_BUDGET
+    confidence: float = DEFAULT_CONFIDENCE
+    consensus_threshold: float = DEFAULT_THRESHOLD
+    reference: Reference = Reference.EGO
+
+    def __post_init__(self) -> None:
+        check_budget(self.sampling_budget)
+        if not 0.0 < self.confidence < 1.0:
+            raise DomainError(f"confidence must lie strictly between 0 and 1, got {self.confidence}")
+        check_threshold(self.consensus_threshold)
+        if self.ratios is not None:
+            ascending = all(a < b for a, b in zip(self.ratios, self.ratios[1:], strict=False))
+            if not self.ratios or not ascending or not all(0.0 <= r < 1.0 for r in self.ratios):
+                raise DomainError(f"ratios must ascend within [0, 1), got {list(self.ratios)}")
+
+    def check_team(self, team_size: int) -> None:
+        """Raise `DomainError` if a ratio does not mean a whole number of attackers in a team of this size."""
+        self._benign(team_size)
+
+    def initial_state(self, team: Sequence[str]) -> State:
+        """No attempts yet; the estimate starts at 1, everybody an attacker.
+
+        Returns
+        -------
+        dict
+            ``team_size``; ``ratios``, ``bounds`` (U), ``attempts`` (T), lists of one length; ``estimate``.
+        """
+        benign = self._benign(len(team))
+        bounds = [1 if s == len(team) else eq2_budget(s, 1 - s / len(team), self.confidence) for s in benign]
+        return {
+            "team_size": len(team),
+            "ratios": [(len(team) - s) / len(team) for s in benign],
+            "bounds": bounds,
+            "attempts": [0] * len(bounds),
+            "estimate": 1.0,
+        }
+
+    def change_team(self, state: State, team: Sequence[str]) -> State:  # noqa: ARG002
+        """A new team has a new ratio: the estimate begins again."""
+        return self.initial_state(team)
+
+    def converse(self, team: Sequence[str], state: State, rng: np.random.Generator) -> Conversation:
+        """Probe, or go on at the estimate."""
+        outcomes: list[Outcome] = []
+        attempts, estimate = list(state["attempts"]), float(state["estimate"])
+        complete = len(team) == state["team_size"]
+        if not team:
+            accepted: Hypothesis = ()
+        elif all(t >= u for t, u in zip(attempts, state["bounds"], strict=True)):
+            accepted = yield from self._settled(team, estimate, rng, outcomes)
+        else:
+            probed = yield from self._probe(team, state, attempts, rng, outcomes)
+            if complete:
+                attempts, found = probed
+                estimate = estimate if found is None else found
+            in_consensus = [o.teammates for o in outcomes if o.verdict is Verdict.CONSENSUS]
+            accepted = max(in_consensus, key=len, default=())
+        return Decision(
+            accepted=accepted,
+            source=Source.CONSENSUS if accepted else Source.EGO_ONLY,
+            rejected=explain_rejections(team, accepted, outcomes),
+            attacker_ratio=estimate if complete or estimate < 1.0 else None,
+            state={**state, "attempts": attempts if complete else list(state["attempts"]), "estimate": estimate},
+        )
+
+    def _probe(
+        self, team: Sequence[str], state: State, attempts: list[int], rng: np.random.Generator, outcomes: list[Outcome]
+    ) -> Generator[Sequence[Hypothesis], Sequence[Outcome], tuple[list[int], float | None]]:
+        """Steps 1 and 2; returns the counters and the estimate, if there is a new one."""
+        bounds, ratios = list(state["bounds"]), list(state["ratios"])
+        attempts = list(attempts)
+        estimate: float | None = None
+        spent = 0
+        while spent < self.sampling_budget:
+            before = spent
+            for k, ratio in enumerate(ratios):
+                s = round(state["team_size"] * (1 - ratio))
+                if spent == self.sampling_budget or attempts[k] >= bounds[k] or s > len(team):
+                    continue
+                tested = yield [draw(team, s, rng)]
+                if not tested:
+                    return attempts, estimate
+                outcomes.extend(tested)
+                spent += 1
+                if tested[0].verdict is Verdict.CONSENSUS:
+                    estimate = ratio
+                    attempts[k:] = bounds[k:]
+                    break
+                if tested[0].verdict is Verdict.DISSENSUS:
+                    attempts[k] += 1
+            if spent == before:
+                break
+        return attempts, estimate
+
+    def _settled(
+        self, team: Sequence[str], estimate: float, rng: np.random.Generator, outcomes: list[Outcome]
+    ) -> Generator[Sequence[Hypothesis], Sequence[Outcome], Hypothesis]:
+        """Step 4."""
+        s = round(len(team) * (1 - estimate))
+        if s == 0:
+            return ()
+        accepted = yield from search(team, s, min(self.sampling_budget, comb(len(team), s)), True, rng, outcomes)
+        return accepted
+
+    def _benign(self, team_size: int) -> list[int]:
+        """Benign teammates that each ratio means, S (1 - R_k)."""
+        if self.ratios is None:
+            return list(range(team_size, 0, -1))
+        benign = []
+        for ratio in self.ratios:
+            s = team_size * (1 - ratio)
+            if team_size and (abs(s - round(s)) > 1e-6 or round(s) < 1):
+                raise DomainError(f"ratio {ratio} does not mean a whole number of attackers in a team of {team_size}")
+            benign.append(round(s))
+        return benign if team_size else []

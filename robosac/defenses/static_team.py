@@ -1,0 +1,113 @@
+"""The static team: find trustworthy teammates once, then rely on them, and look again now and then."""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from dataclasses import dataclass
+from typing import ClassVar
+
+import numpy as np
+
+from robosac.budget import DomainError
+from robosac.consensus import Verdict
+from robosac.defenses.protocol import (
+    Conversation,
+    Decision,
+    Hypothesis,
+    Outcome,
+    Reason,
+    Source,
+    State,
+    explain_rejections,
+)
+from robosac.defenses.sampling import SamplingSettings, search
+
+DEFAULT_RECHECK = 10
+
+
+@dataclass(frozen=True)
+class StaticTeam(SamplingSettings):
+    """The paper's static team, with a re-check.
+
+    1. Until there is a consensus, Algorithm 1. Its subset becomes the trust list.
+    2. From then on, the answer is the fusion of the trusted teammates that are present: one pass a frame, and no pass
+    of
+       the ego alone.
+    3. Every ``recheck_every`` frames the trusted fusion is compared with the ego again. A dissensus empties the list,
+    and
+       the frame goes on with 1. (The paper never looks again; but a trusted vehicle can be hijacked.) No evidence, or
+       no time, leaves the list as it is, and the next frame tries again.
+
+    The list survives frames in which trusted teammates are missing. If none of them is there, the frame is sampled as
+    in 1, and the teammates it finds in consensus are added.
+
+    Parameters
+    ----------
+    recheck_every : int or None
+        Frames between two re-checks, at least 1; None never looks again, as in the paper. The other settings are those
+        of `SamplingSettings`.
+
+    Raises
+    ------
+    DomainError
+        If an argument is outside its range.
+    """
+
+    kind: ClassVar[str] = "static_team"
+
+    recheck_every: int | None = DEFAULT_RECHECK
+
+    def __post_init__(self) -> None:
+        super().__post_init__()
+        if self.recheck_every is not None and self.recheck_every < 1:
+            raise DomainError(f"recheck_every must be at least 1 or null, got {self.recheck_every}")
+
+    def initial_state(self, team: Sequence[str]) -> State:  # noqa: ARG002
+        """Nobody is trusted; ``frames_since_check`` counts from the latest consensus."""
+        return {"trusted": [], "frames_since_check": 0}
+
+    def change_team(self, state: State, team: Sequence[str]) -> State:
+        """Those who left are no longer trusted; those who joined are not trusted yet."""
+        return {**state, "trusted": [name for name in state["trusted"] if name in team]}
+
+    def converse(self, team: Sequence[str], state: State, rng: np.random.Generator) -> Conversation:
+        """Answer from the trust list, re-check it, or build it."""
+        outcomes: list[Outcome] = []
+        trusted = list(state["trusted"])
+        present: Hypothesis = tuple(name for name in team if name in trusted)
+        waited = int(state["frames_since_check"]) + 1
+        if present:
+            if self.recheck_every is None or waited < self.recheck_every:
+                return self._decide(team, present, Source.TRUSTED, outcomes, trusted, waited)
+            tested = yield [present]
+            outcomes.extend(tested)
+            if not tested or tested[0].verdict is Verdict.NO_EVIDENCE:
+                return self._decide(team, present, Source.TRUSTED, outcomes, trusted, waited)
+            if tested[0].verdict is Verdict.CONSENSUS:
+                return self._decide(team, present, Source.CONSENSUS, outcomes, trusted, 0)
+            trusted = []
+        accepted: Hypothesis = ()
+        if team:
+            s, n = self.plan(len(team))
+            accepted = yield from search(team, s, n - len(outcomes), self.distinct, rng, outcomes)
+        source = Source.CONSENSUS if accepted else Source.EGO_ONLY
+        kept = [*trusted, *(name for name in accepted if name not in trusted)]
+        return self._decide(team, accepted, source, outcomes, kept, 0)
+
+    def _decide(
+        self,
+        team: Sequence[str],
+        accepted: Hypothesis,
+        source: Source,
+        outcomes: Sequence[Outcome],
+        trusted: Sequence[str],
+        waited: int,
+    ) -> Decision:
+        otherwise = Reason.DISTRUSTED if source is Source.TRUSTED else Reason.NOT_SAMPLED
+        return Decision(
+            accepted=accepted,
+            source=source,
+            rejected=explain_rejections(team, accepted, outcomes, otherwise),
+            attacker_ratio=self.attacker_ratio,
+            state={"trusted": list(trusted), "frames_since_check": waited},
+        )

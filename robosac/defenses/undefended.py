@@ -1,0 +1,41 @@
+"""No defence: fuse everybody. A baseline, and what a gateway without an adversary would do."""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from dataclasses import dataclass
+from typing import ClassVar
+
+import numpy as np
+
+from robosac.consensus import DEFAULT_THRESHOLD
+from robosac.defenses.protocol import Conversation, Decision, Reference, Source, State
+
+
+@dataclass(frozen=True)
+class Undefended:
+    """Every teammate is on the trust list from the start, because whoever chose this says so; nothing is ever
+    tested.
+    """
+
+    kind: ClassVar[str] = "none"
+
+    consensus_threshold: float = DEFAULT_THRESHOLD
+    reference: Reference = Reference.EGO
+
+    def initial_state(self, team: Sequence[str]) -> State:
+        """Everybody is trusted."""
+        return {"trusted": list(team)}
+
+    def change_team(self, state: State, team: Sequence[str]) -> State:  # noqa: ARG002
+        """Everybody is trusted."""
+        return self.initial_state(team)
+
+    def check_team(self, team_size: int) -> None:
+        """Any team will do."""
+
+    def converse(self, team: Sequence[str], state: State, rng: np.random.Generator) -> Conversation:  # noqa: ARG002
+        """Fuse all that are present."""
+        yield from ()
+        source = Source.TRUSTED if team else Source.EGO_ONLY
+        return Decision(tuple(team), source, rejected={}, attacker_ratio=None, state=state)

@@ -1,0 +1,274 @@
+"""Sessions: opening and ending them, who speaks in them, who belongs to them."""
+
+from __future__ import annotations
+
+import asyncio
+import hashlib
+import secrets
+import time
+from collections import Counter
+from collections.abc import Mapping, Sequence
+from dataclasses import dataclass, field
+from typing import Any
+
+from robosac.budget import DomainError
+from robosac.defenses import Defense, Reason
+from robosac.detectors import Detector, Role
+from robosac.fusion import PreviousAnswer
+from service import audit
+from service.engine import Engine
+from service.gathering import Gathering
+from service.metrics import Metrics
+from service.problems import Problem
+from service.schemas import DetectorEntry, SessionCreated, SessionRequest, SessionState, TeamChanged, read_defense
+from service.settings import Settings
+from service.store import AuditRecord, SessionRecord, Store
+
+SWEEP_EVERY_S = 30.0
+REFUSALS_LOGGED = 16
+"""Refused messages of one vehicle between two frames that get a record each; the others are counted."""
+
+
+@dataclass
+class LiveSession:
+    """What a session holds in this process only; the lock is held while a frame is answered or the team changes."""
+
+    detector: Detector
+    defense: Defense
+    gathering: Gathering
+    previous: PreviousAnswer | None = None
+    lock: asyncio.Lock = field(default_factory=asyncio.Lock)
+    last_used: float = field(default_factory=time.monotonic)
+    refusals: Counter[str] = field(default_factory=Counter)
+
+    def unlogged(self) -> dict[str, int]:
+        """Refused messages by vehicle that got no record since the last call; the count begins again."""
+        counted, self.refusals = self.refusals, Counter()
+        return {name: n - REFUSALS_LOGGED for name, n in counted.items() if n > REFUSALS_LOGGED}
+
+
+@dataclass(frozen=True)
+class Caller:
+    """Who speaks: the vehicle that a token belongs to, in the session it belongs to."""
+
+    record: SessionRecord
+    live: LiveSession
+    vehicle_id: str
+
+    @property
+    def is_ego(self) -> bool:
+        """Whether the ego speaks."""
+        return self.vehicle_id == self.record.ego_id
+
+    @property
+    def role(self) -> Role:
+        """In which role the vehicle speaks."""
+        return "ego" if self.is_ego else "teammate"
+
+
+class Sessions:
+    """All sessions of this gateway."""
+
+    def __init__(self, settings: Settings, store: Store, engine: Engine, metrics: Metrics) -> None:
+        self._settings = settings
+        self._store = store
+        self._engine = engine
+        self._metrics = metrics
+        self._live: dict[str, LiveSession] = {}
+
+    async def open(self, request: SessionRequest) -> SessionCreated:
+        """Begin a session; the answer is the only place where its tokens are shown."""
+        detector = self._detector(self._settings.detector if request.detector is None else request.detector)
+        self._check_size(request.teammates)
+        try:
+            defense = request.defense.build()
+            defense.check_team(len(request.teammates))
+        except DomainError as error:
+            raise Problem(422, "impossible-defense", str(error), "defense") from error
+        budget_ms = request.latency_budget_ms or self._settings.latency_budget_ms
+        gather_ms = min(self._settings.gather_ms, budget_ms / 2) if request.gather_ms is None else request.gather_ms
+        if gather_ms > budget_ms:
+            raise Problem(
+                422, "invalid-request", f"must not exceed the latency budget of {budget_ms:g} ms", "gather_ms"
+            )
+        if await self._store.count() >= self._settings.max_sessions:
+            raise Problem(
+                503, "too-many-sessions", "the gateway holds as many sessions as it may", headers={"Retry-After": "30"}
+            )
+        tokens = _new_tokens((request.ego_id, *request.teammates))
+        record = SessionRecord(
+            session_id=secrets.token_hex(16),
+            ego_id=request.ego_id,
+            teammates=tuple(request.teammates),
+            detector=detector.info.name,
+            defense=request.defense.model_dump(mode="json"),
+            latency_budget_ms=budget_ms,
+            gather_ms=gather_ms,
+            token_digests={_digest(token): vehicle for vehicle, token in tokens.items()},
+            created_at=audit.now(),
+            state=defense.initial_state(request.teammates),
+        )
+        await self._store.create(record, audit.session_opened(record, detector.info))
+        self._live[record.session_id] = self._revive(record)
+        self._metrics.sessions.set(await self._store.count())
+        return SessionCreated(
+            session_id=record.session_id,
+            ego_token=tokens.pop(request.ego_id),
+            teammate_tokens=tokens,
+            detector=DetectorEntry.of(detector.info),
+            defense=request.defense,
+            latency_budget_ms=record.latency_budget_ms,
+            gather_ms=record.gather_ms,
+        )
+
+    async def authenticate(self, session_id: str, token: str | None) -> Caller:
+        """The vehicle that a token belongs to.
+
+        Raises
+        ------
+        Problem
+            404 for an unknown session, 401 without a token of it.
+        """
+        record = await self._store.get(session_id)
+        if record is None:
+            raise Problem(404, "unknown-session", "there is no such session; it may have ended or expired")
+        vehicle = record.token_digests.get(_digest(token)) if token else None
+        if vehicle is None:
+            raise Problem(
+                401,
+                "unauthenticated",
+                "a bearer token of a vehicle of this session is needed",
+                headers={"WWW-Authenticate": "Bearer"},
+            )
+        live = self._live.get(session_id)
+        if live is None:
+            live = self._live[session_id] = self._revive(record)
+        live.last_used = time.monotonic()
+        return Caller(record, live, vehicle)
+
+    async def authenticate_ego(self, session_id: str, token: str | None) -> Caller:
+        """As `authenticate`, but 403 for anybody but the ego."""
+        caller = await self.authenticate(session_id, token)
+        if not caller.is_ego:
+            raise Problem(403, "ego-only", f"only the ego of the session may do this, not {caller.vehicle_id}")
+        return caller
+
+    async def enrol(self, caller: Caller, newcomers: Sequence[str]) -> TeamChanged:
+        """Let teammates join, from the next frame on; the answer is the only place where their tokens are shown."""
+        async with caller.live.lock:
+            record = await self.current(caller)
+            for name in newcomers:
+                if name == record.ego_id or name in record.teammates:
+                    raise Problem(409, "already-enrolled", f"{name} is in the session already", "teammates")
+            tokens = _new_tokens(newcomers)
+            digests = {**record.token_digests, **{_digest(token): name for name, token in tokens.items()}}
+            await self._change_team(caller, (*record.teammates, *newcomers), digests)
+            return TeamChanged(teammates=[*record.teammates, *newcomers], teammate_tokens=tokens)
+
+    async def dismiss(self, caller: Caller, leaver: str) -> None:
+        """Let a teammate leave, from the next frame on; its token is worth nothing any more."""
+        async with caller.live.lock:
+            record = await self.current(caller)
+            if leaver not in record.teammates:
+                raise Problem(404, "unknown-teammate", "there is no such teammate in the session")
+            digests = {digest: name for digest, name in record.token_digests.items() if name != leaver}
+            await self._change_team(caller, tuple(name for name in record.teammates if name != leaver), digests)
+
+    async def describe(self, caller: Caller) -> SessionState:
+        """The session's state."""
+        record = await self.current(caller)
+        return SessionState(
+            session_id=record.session_id,
+            ego_id=record.ego_id,
+            teammates=list(record.teammates),
+            detector=record.detector,
+            defense=read_defense(record.defense),
+            latency_budget_ms=record.latency_budget_ms,
+            gather_ms=record.gather_ms,
+            created_at=record.created_at,
+            last_frame=record.last_frame,
+            frames_answered=record.frames_answered,
+            state=dict(record.state),
+            audit_seq=record.audit_seq,
+        )
+
+    async def audit_log(self, caller: Caller, after: int) -> list[AuditRecord]:
+        """The session's audit records with a number above ``after``."""
+        return await self._store.audit(caller.record.session_id, after)
+
+    async def close(self, caller: Caller) -> None:
+        """End a session, after the frame in hand."""
+        async with caller.live.lock:
+            await self._forget(caller.record.session_id)
+
+    async def expire_idle(self) -> None:
+        """End, every so often and for ever, the sessions that nobody has used for too long."""
+        while True:
+            await asyncio.sleep(min(SWEEP_EVERY_S, self._settings.session_idle_s / 2))
+            oldest = time.monotonic() - self._settings.session_idle_s
+            idle = [s for s, live in self._live.items() if live.last_used < oldest and not live.lock.locked()]
+            for session_id in idle:
+                await self._forget(session_id)
+
+    async def current(self, caller: Caller) -> SessionRecord:
+        """The session as it is now; it may have moved on, or ended, since the caller was authenticated."""
+        record = await self._store.get(caller.record.session_id)
+        if record is None:
+            raise Problem(404, "unknown-session", "the session has ended")
+        return record
+
+    async def decide(self, caller: Caller, frame: int, state: Mapping[str, Any], event: AuditRecord) -> None:
+        """Keep a decision and its record."""
+        await self._store.decide(caller.record.session_id, frame, state, event)
+
+    async def log_refusal(self, caller: Caller, reason: Reason, detail: str, frame: int | None, field: str) -> None:
+        """Record that a vehicle's message was refused."""
+        self._metrics.refused(reason.value)
+        caller.live.refusals[caller.vehicle_id] += 1
+        if caller.live.refusals[caller.vehicle_id] > REFUSALS_LOGGED:
+            return
+        event = audit.message_refused(caller.vehicle_id, reason, detail, frame=frame, field=field)
+        await self._store.log(caller.record.session_id, event)
+
+    async def _change_team(self, caller: Caller, team: Sequence[str], digests: Mapping[str, str]) -> None:
+        """Keep a new team. The session's lock is held."""
+        self._check_size(team)
+        record = await self.current(caller)
+        try:
+            state = caller.live.defense.change_team(record.state, team)
+        except DomainError as error:
+            raise Problem(422, "impossible-defense", str(error), "teammates") from error
+        event = audit.team_changed(record.teammates, team)
+        await self._store.change_team(record.session_id, tuple(team), digests, state, event)
+        caller.live.gathering.change_team(team)
+
+    def _check_size(self, team: Sequence[str]) -> None:
+        most = self._settings.max_teammates
+        if len(team) > most:
+            raise Problem(422, "too-many-teammates", f"at most {most} teammates are allowed", "teammates")
+
+    def _detector(self, name: str) -> Detector:
+        if not self._engine.ready:
+            raise Problem(503, "not-ready", "the gateway is still warming up", headers={"Retry-After": "5"})
+        if name not in self._engine.detectors:
+            known = ", ".join(self._engine.detectors)
+            raise Problem(422, "unknown-detector", f"there is no detector of that name; known: {known}", "detector")
+        return self._engine.detectors[name]
+
+    def _revive(self, record: SessionRecord) -> LiveSession:
+        closed = -1 if record.last_frame is None else record.last_frame
+        gathering = Gathering(record.teammates, self._settings.max_pending_frames, closed)
+        return LiveSession(self._detector(record.detector), read_defense(record.defense).build(), gathering)
+
+    async def _forget(self, session_id: str) -> None:
+        self._live.pop(session_id, None)
+        await self._store.delete(session_id)
+        self._metrics.sessions.set(await self._store.count())
+
+
+def _new_tokens(vehicles: Sequence[str]) -> dict[str, str]:
+    return {vehicle: secrets.token_urlsafe(32) for vehicle in vehicles}
+
+
+def _digest(token: str) -> str:
+    return hashlib.sha256(token.encode()).hexdigest()
