@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from dataclasses import dataclass
 from pathlib import Path
 from typing import Annotated
 
@@ -18,27 +19,72 @@ from rich.progress import (
     TimeRemainingColumn,
 )
 
-from robosac.detectors.embedded import NAME
+from robosac.detectors.embedded import ADVERSARIAL_WEIGHTS, SHIPPED_WEIGHTS, WeightsError, read_weights
+from robosac.training.adversary import AdversaryConfig
 from robosac.training.export import export_weights
 from robosac.training.loop import TrainingConfig, train_network
-from robosac.training.validation import GAINS, choose_operating_point
+from robosac.training.validation import GAINS, HARM, choose_operating_point
 
 _DEFAULTS = TrainingConfig()
+_ADVERSARIAL_STEPS = 900
+_ADVERSARIAL_RATE = 1e-3
 
 
 def run(
     out: Annotated[Path, typer.Option(help="Folder for the checkpoint and the weights.")],
     seed: Annotated[int, typer.Option(help="Of the initial weights and of every draw.")] = _DEFAULTS.seed,
-    steps: Annotated[int, typer.Option(min=100, help="Optimiser steps.")] = _DEFAULTS.steps,
+    steps: Annotated[int | None, typer.Option(min=100, help="Optimiser steps; 2600, or 900 if adversarial.")] = None,
     scenes: Annotated[int, typer.Option(min=1, help="Training scenes, five frames each.")] = _DEFAULTS.scenes,
+    adversarial: Annotated[str | None, typer.Option(help="pgd: go on from the shipped weights, under attack.")] = None,
     threads: Annotated[int, typer.Option(min=1, help="CPU threads.")] = 1,
 ) -> None:
     """Train the embedded detector on generated scenes. Run it again with the same options to go on after a break."""
+    if adversarial not in (None, "pgd"):
+        raise typer.BadParameter(f"unknown attack {adversarial!r}; known: pgd", param_hint="--adversarial")
     torch.set_num_threads(threads)
-    config = TrainingConfig(seed=seed, steps=steps, scenes=scenes)
-    out.mkdir(parents=True, exist_ok=True)
-    weights = out / f"{NAME}.safetensors"
     console = Console()
+    try:
+        out.mkdir(parents=True, exist_ok=True)
+        _train(console, out, (_plain if adversarial is None else _hardened)(seed, steps, scenes))
+    except (OSError, ValueError, WeightsError) as error:
+        console.print(f"[red]{error}[/red]")
+        raise typer.Exit(1) from error
+
+
+@dataclass(frozen=True)
+class _Plan:
+    """What is trained from what, and where its operating point is looked for."""
+
+    config: TrainingConfig
+    weights: str
+    command: str
+    initial: dict[str, torch.Tensor] | None = None
+    gains: tuple[float, ...] = GAINS
+    harm: float = HARM
+
+
+def _plain(seed: int, steps: int | None, scenes: int) -> _Plan:
+    config = TrainingConfig(seed=seed, steps=steps or _DEFAULTS.steps, scenes=scenes)
+    command = f"robosac train --out DIR --seed {seed} --steps {config.steps} --scenes {scenes}"
+    return _Plan(config, SHIPPED_WEIGHTS.name, command)
+
+
+def _hardened(seed: int, steps: int | None, scenes: int) -> _Plan:
+    tensors, recipe = read_weights(SHIPPED_WEIGHTS)
+    gain = float(recipe["feature_gain"])  # kept, so that an attack means the same to both detectors
+    adversary = AdversaryConfig(epsilon=0.5 / gain, step_size=0.25 / gain)
+    config = TrainingConfig(
+        seed=seed,
+        steps=steps or _ADVERSARIAL_STEPS,
+        scenes=scenes,
+        learning_rate=_ADVERSARIAL_RATE,
+        adversary=adversary,
+    )
+    command = f"robosac train --adversarial pgd --out DIR --seed {seed} --steps {config.steps} --scenes {scenes}"
+    return _Plan(config, ADVERSARIAL_WEIGHTS.name, command, tensors, (gain,), -1.0)
+
+
+def _train(console: Console, out: Path, plan: _Plan) -> None:
     columns = (
         TextColumn("{task.description:<9}"),
         BarColumn(),
@@ -46,6 +92,7 @@ def run(
         TimeElapsedColumn(),
         TimeRemainingColumn(),
     )
+    weights = out / plan.weights
     with Progress(*columns, TextColumn("{task.fields[remark]}"), console=console) as progress:
         tasks: dict[str, TaskID] = {}
 
@@ -54,17 +101,11 @@ def run(
                 tasks[stage] = progress.add_task(stage, total=total, remark="")
             progress.update(tasks[stage], completed=done, remark=remark)
 
-        try:
-            network = train_network(config, out / "checkpoint.pt", show)
-        except ValueError as error:
-            console.print(f"[red]{error}[/red]")
-            raise typer.Exit(1) from error
-        validating = progress.add_task("validate", total=len(GAINS), remark="choosing the feature gain")
-        point = choose_operating_point(network, lambda: progress.advance(validating))
-        progress.update(validating, completed=len(GAINS), remark="")
-    command = f"robosac train --out DIR --seed {seed} --steps {steps} --scenes {scenes}"
-    recipe = export_weights(network, config, point, command, weights)
+        network = train_network(plan.config, weights.with_suffix(".checkpoint"), show, plan.initial)
+        validating = progress.add_task("validate", total=len(plan.gains), remark="choosing the operating point")
+        point = choose_operating_point(network, lambda: progress.advance(validating), plan.gains, plan.harm)
+        progress.update(validating, completed=len(plan.gains), remark="")
+    recipe = export_weights(network, plan.config, point, plan.command, weights)
     console.print(f"{weights}: {weights.stat().st_size / 1e6:.2f} MB")
-    console.print_json(
-        data={key: recipe[key] for key in ("feature_gain", "consensus_score", "validation", "tensors_sha256")}
-    )
+    shown = ("feature_gain", "consensus_score", "validation", "tensors_sha256")
+    console.print_json(data={key: recipe[key] for key in shown})

@@ -21,6 +21,10 @@ from robosac.detectors.warp import sampling_matrix, warp
 
 NAME = "intersection-mean"
 SHIPPED_WEIGHTS = Path(__file__).parent / "weights" / "intersection-mean.safetensors"
+ADVERSARIAL_WEIGHTS = SHIPPED_WEIGHTS.with_name("intersection-mean-adversarial.safetensors")
+"""The same network after adversarial training against PGD, at the same feature gain: a baseline, not a defence to
+serve.
+"""
 _TENSOR = "features"
 _SPEC = TensorSpec("float16", (FEATURES, MAP, MAP))
 

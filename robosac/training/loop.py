@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable
+from collections.abc import Callable, Mapping, Sequence
 from dataclasses import asdict, dataclass
 from pathlib import Path
 from typing import Any
@@ -10,10 +10,12 @@ from typing import Any
 import numpy as np
 import torch
 
+from robosac.boxes import FloatArray
 from robosac.detectors.network import MeanFusionNetwork
 from robosac.detectors.voxels import AREA_M
 from robosac.detectors.warp import sampling_matrix, warp
 from robosac.scenes.splits import TRAINING_SEEDS
+from robosac.training.adversary import AdversaryConfig, add_adversary
 from robosac.training.data import TrainingFrame, generate
 from robosac.training.loss import detection_loss, stack, targets
 
@@ -40,6 +42,8 @@ class TrainingConfig:
         AdamW; one cycle with cosine decay to zero.
     ego_only_share : float
         Share of egos decoded alone; the others get a uniform number of teammates, at least one.
+    adversary : AdversaryConfig or None
+        Adversarial training, on top of weights that are trained already.
     """
 
     seed: int = 1
@@ -51,9 +55,12 @@ class TrainingConfig:
     learning_rate: float = 3e-3
     weight_decay: float = 1e-2
     ego_only_share: float = 0.2
+    adversary: AdversaryConfig | None = None
 
 
-def train_network(config: TrainingConfig, checkpoint: Path, progress: Progress) -> MeanFusionNetwork:
+def train_network(
+    config: TrainingConfig, checkpoint: Path, progress: Progress, initial: Mapping[str, torch.Tensor] | None = None
+) -> MeanFusionNetwork:
     """Train, or go on from ``checkpoint`` if it is there.
 
     Parameters
@@ -62,6 +69,8 @@ def train_network(config: TrainingConfig, checkpoint: Path, progress: Progress) 
     checkpoint : Path
         Written every 200 steps and at the end; read first if it exists.
     progress : callable
+    initial : mapping of name to tensor, optional
+        Weights to begin with; random ones by default.
 
     Returns
     -------
@@ -75,6 +84,8 @@ def train_network(config: TrainingConfig, checkpoint: Path, progress: Progress) 
     """
     torch.manual_seed(config.seed)
     network = MeanFusionNetwork()
+    if initial is not None:
+        network.load_state_dict({name: tensor.float() for name, tensor in initial.items()})
     network.to(memory_format=torch.channels_last)  # type: ignore[call-overload]
     optimiser = torch.optim.AdamW(network.parameters(), lr=config.learning_rate, weight_decay=config.weight_decay)
     schedule = torch.optim.lr_scheduler.OneCycleLR(
@@ -117,30 +128,36 @@ def _step(
     chosen = [frames[i] for i in rng.integers(0, len(frames), config.frames_per_step)]
     grids = torch.from_numpy(np.concatenate([frame.grids() for frame in chosen])).float()
     features = network.encode(grids.contiguous(memory_format=torch.channels_last))
-    fused, goals, first = [], [], 0
+    maps, goals, matrices, first = [], [], [], 0
     for frame in chosen:
         agents = len(frame.poses)
         for ego in rng.permutation(agents)[: config.egos_per_frame]:
             others = rng.permutation(np.delete(np.arange(agents), ego))
             count = 0 if rng.random() < config.ego_only_share else int(rng.integers(1, agents))
             selected = others[:count]
-            fused.append(_fuse(features[first : first + agents], frame, int(ego), selected))
+            moves = [sampling_matrix(frame.poses[ego], frame.poses[j], AREA_M) for j in selected]
+            maps.append(_fuse(features[first : first + agents], int(ego), selected, moves))
+            matrices.append(moves)
             goals.append(targets(frame.near[ego], frame.hits[ego][np.append(selected, ego)].sum(axis=0)))
         first += agents
-    logits, codes = network.decode(torch.stack(fused))
-    loss = detection_loss(logits, codes, stack(goals))
+    fused, goal = torch.stack(maps), stack(goals)
+    if config.adversary is not None:
+        fused = add_adversary(network, fused, matrices, goal, config.adversary, rng)
+    logits, codes = network.decode(fused)
+    loss = detection_loss(logits, codes, goal)
     optimiser.zero_grad()
     loss.backward()  # type: ignore[no-untyped-call]
     optimiser.step()
     return float(loss.detach())
 
 
-def _fuse(features: torch.Tensor, frame: TrainingFrame, ego: int, selected: np.ndarray[Any, Any]) -> torch.Tensor:
+def _fuse(
+    features: torch.Tensor, ego: int, selected: np.ndarray[Any, Any], moves: Sequence[FloatArray]
+) -> torch.Tensor:
     own = features[ego : ego + 1]
     if not len(selected):
         return own[0]
-    matrices = np.stack([sampling_matrix(frame.poses[ego], frame.poses[j], AREA_M) for j in selected])
-    warped = warp(features[torch.from_numpy(selected)], torch.from_numpy(matrices).float())
+    warped = warp(features[torch.from_numpy(selected)], torch.from_numpy(np.stack(moves)).float())
     return torch.cat([own, warped]).mean(dim=0)
 
 

@@ -4,7 +4,7 @@ test.
 
 from __future__ import annotations
 
-from collections.abc import Callable
+from collections.abc import Callable, Sequence
 from dataclasses import dataclass
 from itertools import combinations
 
@@ -50,7 +50,9 @@ class OperatingPoint:
     figures: dict[str, float]
 
 
-def choose_operating_point(network: MeanFusionNetwork, tick: Callable[[], None]) -> OperatingPoint:
+def choose_operating_point(
+    network: MeanFusionNetwork, tick: Callable[[], None], gains: Sequence[float] = GAINS, harm: float = HARM
+) -> OperatingPoint:
     """Choose gain and consensus score on 60 frames of 20 validation scenes.
 
     The network is positively homogeneous where the message is taken, so a gain changes no perception, only what a
@@ -64,6 +66,10 @@ def choose_operating_point(network: MeanFusionNetwork, tick: Callable[[], None])
     network : MeanFusionNetwork
     tick : callable
         Called after each gain tried.
+    gains : sequence of float
+        Tried in this order.
+    harm : float
+        How far below the ego alone the undefended fusion must fall, in AP50.
 
     Raises
     ------
@@ -71,16 +77,16 @@ def choose_operating_point(network: MeanFusionNetwork, tick: Callable[[], None])
         If not even the smallest gain lets the attack do that much harm.
     """
     figures: dict[str, float] = {}
-    for gain in GAINS:
+    for gain in gains:
         detector = EmbeddedDetector.from_network(network, gain, SCORE_THRESHOLD, SCORE_THRESHOLD)
         rng = np.random.default_rng(0)
         frames = list(evaluation_frames(detector, VALIDATION_SEEDS[:SCENES], FRAMES_PER_SCENE, PGD(), 1, rng))
         figures = _average_precision(detector, frames)
         tick()
-        if figures["no_defence_ap50"] <= figures["ego_only_ap50"] - HARM:
+        if figures["no_defence_ap50"] <= figures["ego_only_ap50"] - harm:
             score, errors = _consensus_score(detector, frames)
             return OperatingPoint(gain, SCORE_THRESHOLD, score, {**figures, **errors})
-    raise ValueError(f"at no gain down to {GAINS[-1]} does the attack harm by {HARM} of AP50: {figures}")
+    raise ValueError(f"at no gain down to {gains[-1]} does the attack harm by {harm} of AP50: {figures}")
 
 
 def _average_precision(detector: EmbeddedDetector, frames: list[EvaluationFrame]) -> dict[str, float]:

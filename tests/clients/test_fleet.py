@@ -19,7 +19,8 @@ from robosac.scenes import IntersectionScene
 def options(url, **changes):
     values = {
         "url": url, "scenes": 1, "frames": 3, "first_scene": 3, "egos": 1, "attackers": 1, "attack": "pgd", "seed": 0,
-        "defense": {"kind": "sample_consensus", "sampling_budget": 7, "collaborators": 3}, "real_time": False, "report": None,
+        "defense": {"kind": "sample_consensus", "sampling_budget": 7, "collaborators": 3},
+        "real_time": False, "report": None,
     }  # fmt: skip
     return FleetOptions(**{**values, **changes})
 

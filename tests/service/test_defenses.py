@@ -10,7 +10,7 @@ async def run(served, session, ego_message, teammates, frames, start=0):
 
 
 async def test_a_static_team_is_found_once_and_then_trusted(served, ego_message, attacked):
-    defense = {"kind": "static_team", "attacker_ratio": 0.2, "sampling_budget": 7, "collaborators": 3, "recheck_every": 3}
+    defense = {"kind": "static_team", "sampling_budget": 7, "collaborators": 3, "recheck_every": 3}
     session = await served.open(defense=defense)
     answers = await run(served, session, ego_message, attacked, 7)
     assert [answer.source for answer in answers] == [

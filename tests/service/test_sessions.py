@@ -67,7 +67,11 @@ async def test_state_and_end(served, good_frame):
             "greater",
         ),
         (
-            {"ego_id": "a", "teammates": ["b", "c"], "defense": {"kind": "sample_consensus", "sampling_budget": 7, "collaborators": 3}},
+            {
+                "ego_id": "a",
+                "teammates": ["b", "c"],
+                "defense": {"kind": "sample_consensus", "sampling_budget": 7, "collaborators": 3},
+            },
             "defense",
             "at most 1 can",
         ),
