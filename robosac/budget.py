@@ -42,13 +42,16 @@ def eq1_collaborators(sampling_budget: int, attacker_ratio: float, confidence: f
     Raises
     ------
     DomainError
-        If an argument is outside its range.
+        If an argument is outside its range, or too close to its ends for floating point.
     """
     _check_budget(sampling_budget)
     _check_open_unit("attacker_ratio", attacker_ratio)
     _check_open_unit("confidence", confidence)
     clean_needed = -math.expm1(math.log1p(-confidence) / sampling_budget)
-    return math.floor(math.log(clean_needed) / math.log1p(-attacker_ratio) + _ROUNDING)
+    try:
+        return math.floor(math.log(clean_needed) / math.log1p(-attacker_ratio) + _ROUNDING)
+    except (OverflowError, ValueError) as error:
+        raise DomainError("the arguments are too close to 0 or 1 for the formula") from error
 
 
 def eq2_budget(collaborators: int, attacker_ratio: float, confidence: float = DEFAULT_CONFIDENCE) -> int:
@@ -162,7 +165,7 @@ def exact_budget(
         bound = math.ceil(-total * math.expm1(math.log1p(-confidence) / clean))
         return max(1, min(bound, _trials(clean / total, confidence)))
     failure, tries = 1.0, 0
-    while failure > 1.0 - confidence + 1e-12:
+    while failure > (1.0 - confidence) * (1.0 + _ROUNDING):
         failure *= (total - clean - tries) / (total - tries)
         tries += 1
     return max(1, tries)
@@ -206,10 +209,10 @@ def _trials(success: float, confidence: float) -> int:
     """Independent trials until one succeeds with the given confidence."""
     if success >= 1.0:
         return 1
-    failure = math.log1p(-success)
-    if failure == 0.0:
-        raise DomainError("the chance of an attacker-free hypothesis is too small for any budget")
-    return max(1, math.ceil(math.log1p(-confidence) / failure - _ROUNDING))
+    try:
+        return max(1, math.ceil(math.log1p(-confidence) / math.log1p(-success) - _ROUNDING))
+    except (OverflowError, ZeroDivisionError) as error:
+        raise DomainError("the chance of an attacker-free hypothesis is too small for any budget") from error
 
 
 def _check_budget(sampling_budget: int) -> None:

@@ -15,9 +15,9 @@ from dataclasses import dataclass, field
 import numpy as np
 
 from robosac.boxes import FloatArray, from_world, to_world
-from robosac.consensus import Verdict, compare
+from robosac.consensus import Verdict, at_least, compare
 from robosac.defenses import Decision, Defense, Hypothesis, Outcome, Reason, Reference, Rejection, Source, State
-from robosac.detectors import Detector, Message, PreparedFrame
+from robosac.detectors import Message, PreparedFrame, Preparer
 
 logger = logging.getLogger(__name__)
 
@@ -26,7 +26,7 @@ SAFETY = 1.2
 
 
 class UnverifiedAnswer(Exception):
-    """A defence tried to answer with, or to trust, teammates that were not in consensus."""
+    """A defence tried to answer with, or to trust, teammates that were not in consensus, or left one unexplained."""
 
 
 @dataclass(frozen=True)
@@ -104,7 +104,7 @@ class FusionResult:
 
 
 def fuse(
-    detector: Detector,
+    detector: Preparer,
     defense: Defense,
     ego: Message,
     teammates: Mapping[str, Message],
@@ -122,7 +122,8 @@ def fuse(
 
     Parameters
     ----------
-    detector : Detector
+    detector : Preparer
+        Any `Detector`.
     defense : Defense
     ego : Message
     teammates : mapping of teammate id to Message
@@ -153,7 +154,7 @@ def fuse(
 class _FrameRun:
     """The state of one call of `fuse`."""
 
-    detector: Detector
+    detector: Preparer
     defense: Defense
     ego: Message
     frame: int
@@ -212,22 +213,24 @@ class _FrameRun:
                 batch = conversation.send(self._test(prepared, batch))
         except StopIteration as stop:
             decision: Decision = stop.value
-        self._check(decision, state)
+        self._check(decision, team, state)
         return decision
 
-    def _check(self, decision: Decision, state: State) -> None:
+    def _check(self, decision: Decision, team: list[str], state: State) -> None:
         """Nothing reaches the answer that was not verified in this frame or trusted before; nor does trust come from
         less.
         """
         verified = {o.teammates for o in self.outcomes if o.verdict is Verdict.CONSENSUS}
         trusted = set(state.get("trusted", ()))
         allowed = {
-            Source.CONSENSUS: decision.accepted in verified,
+            Source.CONSENSUS: bool(decision.accepted) and decision.accepted in verified,
             Source.TRUSTED: bool(decision.accepted) and trusted.issuperset(decision.accepted),
             Source.EGO_ONLY: not decision.accepted,
         }
         if not allowed[decision.source]:
             raise UnverifiedAnswer(f"{self.defense.kind} answered {decision.source} with {decision.accepted}")
+        if sorted([*decision.accepted, *decision.rejected]) != team:
+            raise UnverifiedAnswer(f"{self.defense.kind} neither accepted nor rejected some of {team}")
         if not trusted.union(*verified).issuperset(decision.state.get("trusted", ())):
             raise UnverifiedAnswer(f"{self.defense.kind} trusts {decision.state['trusted']} without a consensus")
 
@@ -262,7 +265,7 @@ class _FrameRun:
         return self.boxes[subset]
 
     def _confident(self, boxes: FloatArray) -> FloatArray:
-        return boxes[boxes[:, 5] >= self.detector.info.consensus_score]
+        return at_least(boxes, self.detector.info.consensus_score)
 
     def _spend(self, stage: str, started: float) -> None:
         self.timings[stage] += (self.clock() - started) * 1e3

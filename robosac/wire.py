@@ -78,18 +78,19 @@ class FrameEnvelope:
 
 def pack_message(frame: int, vehicle_id: str, message: Message) -> bytes:
     """The body of a vehicle's own message."""
-    return _pack({"frame": frame, "vehicle_id": vehicle_id, **_message_fields(message)})
+    return pack({"frame": frame, "vehicle_id": vehicle_id, **_message_fields(message)})
 
 
 def pack_frame(frame: int, ego: Message, teammates: Mapping[str, Message]) -> bytes:
     """The body of a whole frame."""
     fields = {name: _message_fields(message) for name, message in teammates.items()}
-    return _pack({"frame": frame, "ego": _message_fields(ego), "teammates": fields})
+    return pack({"frame": frame, "ego": _message_fields(ego), "teammates": fields})
 
 
 def pack(value: Any) -> bytes:
     """Any value of plain types, such as a frame result."""
-    return _pack(value)
+    packed: bytes = msgpack.packb(value, use_bin_type=True)
+    return packed
 
 
 def unpack(body: bytes, *, trusted: bool = False) -> Any:
@@ -177,11 +178,6 @@ def check_message(payload: Any, info: DetectorInfo, role: Role, path: str = "") 
         )
     checked = {name: _tensor(_get(tensors, name, where), spec, _join(where, name)) for name, spec in specs.items()}
     return Message(pose, checked)
-
-
-def _pack(value: Any) -> bytes:
-    packed: bytes = msgpack.packb(value, use_bin_type=True)
-    return packed
 
 
 def _message_fields(message: Message) -> dict[str, Any]:

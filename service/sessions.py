@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import asyncio
 import hashlib
+import logging
 import secrets
 import time
 from collections import Counter
@@ -23,6 +24,8 @@ from service.problems import Problem
 from service.schemas import DetectorEntry, SessionCreated, SessionRequest, SessionState, TeamChanged, read_defense
 from service.settings import Settings
 from service.store import AuditRecord, SessionRecord, Store
+
+logger = logging.getLogger(__name__)
 
 SWEEP_EVERY_S = 30.0
 REFUSALS_LOGGED = 16
@@ -208,7 +211,10 @@ class Sessions:
             oldest = time.monotonic() - self._settings.session_idle_s
             idle = [s for s, live in self._live.items() if live.last_used < oldest and not live.lock.locked()]
             for session_id in idle:
-                await self._forget(session_id)
+                try:
+                    await self._forget(session_id)
+                except Exception:  # one session must not keep the others from expiring
+                    logger.exception("session %s could not be ended", session_id)
 
     async def current(self, caller: Caller) -> SessionRecord:
         """The session as it is now; it may have moved on, or ended, since the caller was authenticated."""

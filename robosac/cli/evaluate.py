@@ -58,8 +58,16 @@ def run(
     _print(console, report, attack, attackers)
     if out is not None:
         out.mkdir(parents=True, exist_ok=True)
-        settings = {"scenes": scenes, "frames": frames, "attackers": attackers, "attack": attack, "seed": seed}
-        text = json.dumps({"settings": settings, **asdict(report)}, indent=2)
+        settings = {
+            "scenes": scenes,
+            "frames": frames,
+            "attackers": attackers,
+            "attack": attack,
+            "collaborators": collaborators,
+            "seed": seed,
+            "weights_digest": detector.info.weights_digest,
+        }
+        text = json.dumps({"settings": settings, **asdict(report)}, indent=2, allow_nan=False)
         (out / "bounds.json").write_text(text + "\n")
         console.print(f"Written: {out / 'bounds.json'}")
 
@@ -83,11 +91,12 @@ def _print(console: Console, report: BoundsReport, attack: str, attackers: int) 
             "" if row.infiltrated is None else f"{row.infiltrated:.3f}",
         )
     console.print(table)
-    console.print(
-        f"Consensus test: {report.false_alarm_rate:.2%} false alarms "
-        f"({report.benign_hypotheses} attacker-free hypotheses), "
-        f"{report.miss_rate:.2%} misses ({report.attacked_hypotheses} attacked ones)."
-    )
+    for rate, error, count, kind in (
+        (report.false_alarm_rate, "false alarms", report.benign_hypotheses, "attacker-free"),
+        (report.miss_rate, "misses", report.attacked_hypotheses, "attacked"),
+    ):
+        if rate is not None:
+            console.print(f"Consensus test: {rate:.2%} {error} ({count} {kind} hypotheses).")
     console.print(
         f"The perturbation's bound is {report.perturbation_to_feature_ratio:.2f} times the 95th percentile of the "
         "magnitude of benign messages; it is added to the message, before the ego warps it."

@@ -21,7 +21,7 @@ from rich.progress import (
 
 from robosac.detectors.embedded import ADVERSARIAL_WEIGHTS, SHIPPED_WEIGHTS, WeightsError, read_weights
 from robosac.training.adversary import AdversaryConfig
-from robosac.training.export import export_weights
+from robosac.training.export import export_weights, shipped_tensors
 from robosac.training.loop import TrainingConfig, train_network
 from robosac.training.validation import GAINS, HARM, choose_operating_point
 
@@ -102,6 +102,8 @@ def _train(console: Console, out: Path, plan: _Plan) -> None:
             progress.update(tasks[stage], completed=done, remark=remark)
 
         network = train_network(plan.config, weights.with_suffix(".checkpoint"), show, plan.initial)
+        rounded = {name: tensor.float() for name, tensor in shipped_tensors(network).items()}
+        network.load_state_dict(rounded)  # what is chosen is chosen for the weights that ship
         validating = progress.add_task("validate", total=len(plan.gains), remark="choosing the operating point")
         point = choose_operating_point(network, lambda: progress.advance(validating), plan.gains, plan.harm)
         progress.update(validating, completed=len(plan.gains), remark="")

@@ -76,10 +76,11 @@ class SamplingSettings:
         """Raise `DomainError` if more collaborators are asked for than the full team has benign teammates."""
         if self.collaborators is not None and team_size > 0:
             attackers = attackers_in_team(team_size, self.attacker_ratio)
-            if self.collaborators > team_size - attackers:
+            most = max(1, team_size - attackers)
+            if self.collaborators > most:
                 raise DomainError(
-                    f"of {team_size} teammates with {attackers} attackers at most {team_size - attackers} can be "
-                    f"collaborators, {self.collaborators} are asked for"
+                    f"of {team_size} teammates with {attackers} attackers at most {most} can be collaborators, "
+                    f"{self.collaborators} are asked for"
                 )
 
     def plan(self, team_size: int) -> tuple[int, int]:
@@ -90,16 +91,15 @@ class SamplingSettings:
         """
         attackers = attackers_in_team(team_size, self.attacker_ratio)
         most = max(1, team_size - attackers)
-        if self.collaborators is not None:
+        n = self.sampling_budget or DEFAULT_BUDGET
+        if self.collaborators is None:
+            s = max(1, exact_collaborators(team_size, attackers, n, self.confidence, distinct=self.distinct))
+        else:
             s = min(self.collaborators, most)
-        else:
-            budget = self.sampling_budget or DEFAULT_BUDGET
-            s = max(1, exact_collaborators(team_size, attackers, budget, self.confidence, distinct=self.distinct))
-        if self.sampling_budget is not None or self.collaborators is None:
-            n = self.sampling_budget or DEFAULT_BUDGET
-        else:
-            n = exact_budget(team_size, min(attackers, team_size - s), s, self.confidence, distinct=self.distinct)
-            n = min(n, MAX_BUDGET)
+            if self.sampling_budget is None:
+                attackers = min(attackers, team_size - s)
+                needed = exact_budget(team_size, attackers, s, self.confidence, distinct=self.distinct)
+                n = min(needed, MAX_BUDGET)
         return s, min(n, comb(team_size, s)) if self.distinct else n
 
 

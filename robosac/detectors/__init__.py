@@ -10,6 +10,7 @@ from robosac.detectors.base import (
     DetectorInfo,
     Message,
     PreparedFrame,
+    Preparer,
     Role,
     TensorSpec,
 )
@@ -46,6 +47,7 @@ __all__ = [
     "EmbeddedDetector",
     "Message",
     "PreparedFrame",
+    "Preparer",
     "Role",
     "TensorSpec",
     "WeightsError",

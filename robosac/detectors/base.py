@@ -107,20 +107,26 @@ class AttackSurface(Protocol):
         ...
 
 
-class Detector(Protocol):
-    """A collaborative detector. Implementations hold no state but their weights, and may be used from one thread at
-    a time.
-    """
+class Preparer(Protocol):
+    """What fusion needs of a detector."""
 
     @property
-    def info(self) -> DetectorInfo: ...
-
-    def encode(self, points: FloatArray, pose: FloatArray) -> Message:
-        """The message for a LiDAR scan (P, 3) in the sensor's frame, taken at ``pose`` (world_from_sensor)."""
+    def info(self) -> DetectorInfo:
+        """Name, message layout, area and digest."""
         ...
 
     def prepare(self, ego: Message, teammates: Mapping[str, Message]) -> PreparedFrame:
         """Do once what all hypotheses of a frame share. Messages must already be checked against `info`."""
+        ...
+
+
+class Detector(Preparer, Protocol):
+    """A collaborative detector. Implementations hold no state but their weights, and may be used from one thread at
+    a time.
+    """
+
+    def encode(self, points: FloatArray, pose: FloatArray) -> Message:
+        """The message for a LiDAR scan (P, 3) in the sensor's frame, taken at ``pose`` (world_from_sensor)."""
         ...
 
     def attack_surface(self, ego: Message, teammates: Mapping[str, Message]) -> AttackSurface:

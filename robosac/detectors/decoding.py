@@ -38,8 +38,9 @@ def box_codes(box: FloatArray, xs: FloatArray, ys: FloatArray) -> FloatArray:
 def decode_boxes(logits: torch.Tensor, codes: torch.Tensor, score_threshold: float) -> FloatArray:
     """Boxes of one ego.
 
-    Peaks of the heatmap (3 x 3 maxima) from the score threshold on, at most 200 of the best, then greedy non-maximum
-    suppression at IoU 0.1. The yaw is known up to half a turn.
+    Peaks of the heatmap (3 x 3 maxima) from the score threshold on, at most 200 of the best; of these, boxes centred
+    within the area and not on the ego itself; then greedy non-maximum suppression at IoU 0.1. The yaw is known up to
+    half a turn.
 
     Parameters
     ----------
@@ -56,7 +57,7 @@ def decode_boxes(logits: torch.Tensor, codes: torch.Tensor, score_threshold: flo
     floor = float(np.log(score_threshold / (1 - score_threshold)))
     candidate = (peak & (logits >= floor)).numpy()
     xs, ys = cell_centres()
-    row, column = np.nonzero(candidate & (np.hypot(xs, ys) >= OWN_BODY_M))
+    row, column = np.nonzero(candidate)
     values = logits.numpy()[row, column].astype(np.float64)
     if len(values) > MAX_PEAKS:
         best = np.argpartition(-values, MAX_PEAKS)[:MAX_PEAKS]
@@ -70,7 +71,10 @@ def decode_boxes(logits: torch.Tensor, codes: torch.Tensor, score_threshold: flo
             size[0],
             size[1],
             np.arctan2(code[5], code[4]) / 2,
-            1 / (1 + np.exp(-values)),
+            1 / (1 + np.exp(-np.clip(values, -60.0, 60.0))),
         ]
     )
-    return boxes[nms(boxes, boxes[:, 5], NMS_IOU)]
+    inside = (np.hypot(boxes[:, 0], boxes[:, 1]) >= OWN_BODY_M) & (np.abs(boxes[:, :2]) <= AREA_M).all(axis=1)
+    boxes = boxes[inside]
+    kept: FloatArray = boxes[nms(boxes, boxes[:, 5], NMS_IOU)]
+    return kept

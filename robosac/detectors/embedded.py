@@ -61,9 +61,16 @@ def read_weights(path: Path) -> tuple[dict[str, torch.Tensor], dict[str, Any]]:
         recipe: dict[str, Any] = json.loads(metadata["robosac"])
     except (KeyError, ValueError) as error:
         raise WeightsError(f"{path} carries no recipe in its metadata") from error
-    if recipe.get("tensors_sha256") != tensors_digest(tensors):
+    if not isinstance(recipe, dict) or recipe.get("tensors_sha256") != tensors_digest(tensors):
         raise WeightsError(f"{path} is damaged: its tensors do not have the digest in its metadata")
     return tensors, recipe
+
+
+def _number(recipe: Mapping[str, Any], name: str, most: float) -> float:
+    value = recipe.get(name)
+    if not isinstance(value, float) or not 0.0 < value < most:
+        raise WeightsError(f"the recipe's {name} must be a number above 0 and below {most:g}, got {value!r}")
+    return value
 
 
 class EmbeddedDetector:
@@ -93,9 +100,9 @@ class EmbeddedDetector:
             raise WeightsError(f"{weights} does not fit the network of {NAME}: {error}") from error
         self._configure(
             network,
-            gain=float(self.recipe["feature_gain"]),
-            score_threshold=float(self.recipe["score_threshold"]),
-            consensus_score=float(self.recipe["consensus_score"]),
+            gain=_number(self.recipe, "feature_gain", np.inf),
+            score_threshold=_number(self.recipe, "score_threshold", 1.0),
+            consensus_score=_number(self.recipe, "consensus_score", 1.0),
             digest=hashlib.sha256(weights.read_bytes()).hexdigest(),
         )
 

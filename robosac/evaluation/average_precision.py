@@ -52,7 +52,7 @@ class AveragePrecision:
         self._truths += len(truth)
 
     def at(self, iou_threshold: float) -> float:
-        """Average precision in [0, 1] at an IoU threshold; nan without any true box."""
+        """Average precision in [0, 1] at an IoU threshold in (0, 1]; nan without any true box."""
         precision, recall = self.curve(iou_threshold)
         if self._truths == 0:
             return float("nan")
@@ -60,7 +60,15 @@ class AveragePrecision:
         return float(np.sum(np.diff(recall, prepend=0.0) * envelope))
 
     def curve(self, iou_threshold: float) -> tuple[FloatArray, FloatArray]:
-        """Precision and recall after each detection, best score first."""
+        """Precision and recall after each detection, best score first.
+
+        Raises
+        ------
+        ValueError
+            If the threshold is not in (0, 1].
+        """
+        if not 0.0 < iou_threshold <= 1.0:
+            raise ValueError(f"iou_threshold must be in (0, 1], got {iou_threshold}")
         if not self._scores:
             return np.empty(0), np.empty(0)
         order = np.argsort(-np.concatenate(self._scores), kind="stable")

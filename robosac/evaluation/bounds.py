@@ -10,14 +10,13 @@ import numpy as np
 
 from robosac.attacks import Attack
 from robosac.boxes import FloatArray
-from robosac.consensus import Verdict, compare
+from robosac.consensus import Verdict, at_least, compare
 from robosac.defenses import SampleConsensus
 from robosac.detectors import Detector, Message, PreparedFrame
 from robosac.evaluation.average_precision import AveragePrecision
 from robosac.fusion import fuse
-from robosac.scenes import IntersectionScene
+from robosac.scenes import FRAMES_PER_SECOND, IntersectionScene
 
-FRAME_STRIDE = 5
 TEAM_SIZE = 5
 ASSUMED_RATIO = 0.2
 
@@ -74,9 +73,9 @@ class BoundsReport:
     ----------
     rows : list of BoundsRow
     frames : int
-    false_alarm_rate, miss_rate : float
+    false_alarm_rate, miss_rate : float or None
         Share of attacker-free hypotheses refused, and of attacked ones let through, over all hypotheses of the size
-        used.
+        used; None where there is no such hypothesis.
     benign_hypotheses, attacked_hypotheses : int
         How many those are.
     perturbation_to_feature_ratio : float
@@ -85,8 +84,8 @@ class BoundsReport:
 
     rows: list[BoundsRow]
     frames: int
-    false_alarm_rate: float
-    miss_rate: float
+    false_alarm_rate: float | None
+    miss_rate: float | None
     benign_hypotheses: int
     attacked_hypotheses: int
     perturbation_to_feature_ratio: float
@@ -104,7 +103,7 @@ def evaluation_frames(
     turn = 0
     for seed in seeds:
         scene = IntersectionScene(seed)
-        for frame in scene.frames(frames_per_scene, stride=FRAME_STRIDE):
+        for frame in scene.frames(frames_per_scene, stride=FRAMES_PER_SECOND):
             messages = {name: detector.encode(view.points, view.pose) for name, view in frame.views.items()}
             ego_id = f"car-{turn % scene.car_agents + 1}"
             turn += 1
@@ -154,7 +153,6 @@ def evaluate_bounds(
     tick : callable
         Called after each frame.
     """
-    rng = np.random.default_rng(seed)
     ratio = attackers / TEAM_SIZE if attackers else ASSUMED_RATIO
     samplers = {
         f"Algorithm 1, N = {n}": SampleConsensus(ratio, sampling_budget=n, collaborators=collaborators, distinct=False)
@@ -164,8 +162,10 @@ def evaluate_bounds(
         ratio, sampling_budget=budgets[0], collaborators=collaborators
     )
     table = _Table(detector, collaborators, samplers, repeats)
-    for frame in evaluation_frames(detector, seeds, frames_per_scene, attack, attackers, rng):
-        table.add(frame, rng)
+    attack_rng = np.random.default_rng([seed, 0])
+    frames = evaluation_frames(detector, seeds, frames_per_scene, attack, attackers, attack_rng)
+    for index, frame in enumerate(frames):
+        table.add(frame, [seed, 1, index])  # the same attacks, and each row the same luck, whatever else is evaluated
         tick()
     return table.report(attack.epsilon)
 
@@ -175,9 +175,6 @@ class _Memo:
 
     def __init__(self, detector: Detector, ego: Message, teammates: Mapping[str, Message]) -> None:
         self.info = detector.info
-        self.encode = detector.encode
-        self.attack_surface = detector.attack_surface
-        self.perturbed = detector.perturbed
         self._prepared = detector.prepare(ego, teammates)
         self._boxes: dict[frozenset[str], FloatArray] = {}
 
@@ -207,7 +204,7 @@ class _Table:
         self._missed: list[bool] = []
         self._magnitudes: list[float] = []
 
-    def add(self, frame: EvaluationFrame, rng: np.random.Generator) -> None:
+    def add(self, frame: EvaluationFrame, seed: Sequence[int]) -> None:
         benign = _Memo(self._detector, frame.ego, frame.benign)
         received = _Memo(self._detector, frame.ego, frame.received)
         team = list(frame.benign)
@@ -218,19 +215,17 @@ class _Table:
         self._ap["no defence"].add(received.detect(team), frame.truth)
         self._judge_all(received, frame)
         for name in self._samplers:
-            for _ in range(self._repeats):
-                self._sample(received, frame, name, rng)
+            for repeat in range(self._repeats):
+                self._sample(received, frame, name, np.random.default_rng([*seed, repeat]))
         magnitudes = np.abs(np.concatenate([t.ravel() for m in frame.benign.values() for t in m.tensors.values()]))
         self._magnitudes.append(float(np.percentile(magnitudes, 95)))
         self._frames += 1
 
     def _judge_all(self, received: PreparedFrame, frame: EvaluationFrame) -> None:
         score = self._detector.info.consensus_score
-        ego_only = received.detect()
-        reference = ego_only[ego_only[:, 5] >= score]
+        reference = at_least(received.detect(), score)
         for subset in combinations(frame.benign, self._s):
-            boxes = received.detect(subset)
-            verdict = compare(reference, boxes[boxes[:, 5] >= score]).verdict
+            verdict = compare(reference, at_least(received.detect(subset), score)).verdict
             if frame.attackers.isdisjoint(subset):
                 self._refused.append(verdict is Verdict.DISSENSUS)
             else:
@@ -250,8 +245,8 @@ class _Table:
         return BoundsReport(
             rows=rows,
             frames=self._frames,
-            false_alarm_rate=float(np.mean(self._refused)) if self._refused else float("nan"),
-            miss_rate=float(np.mean(self._missed)) if self._missed else float("nan"),
+            false_alarm_rate=float(np.mean(self._refused)) if self._refused else None,
+            miss_rate=float(np.mean(self._missed)) if self._missed else None,
             benign_hypotheses=len(self._refused),
             attacked_hypotheses=len(self._missed),
             perturbation_to_feature_ratio=epsilon / float(np.mean(self._magnitudes)),

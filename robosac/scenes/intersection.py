@@ -12,7 +12,8 @@ from robosac.boxes import FloatArray, from_world, pose_matrix
 from robosac.scenes.lidar import IntArray, Lidar
 from robosac.scenes.world import CAR_SENSOR_HEIGHT_M, RSU_HEIGHT_M, Traffic, build_traffic
 
-FRAME_PERIOD_S = 0.2
+FRAMES_PER_SECOND = 5
+FRAME_PERIOD_S = 1 / FRAMES_PER_SECOND
 TRUTH_MIN_HITS = 6
 TRUTH_RANGE_M = 31.0
 

@@ -131,11 +131,13 @@ def _beam_ranges(
     z: float,
     slope: np.ndarray[tuple[int], np.dtype[np.float32]],
 ) -> np.ndarray[tuple[int, int], np.dtype[np.float32]]:
-    """Horizontal range at which each beam meets the box of its pair: at the side, on the roof, or never (inf)."""
+    """Horizontal range at which each beam meets the box of its pair: at the side, on the roof, or never (inf).
+
+    A beam that is below the ground there has met the ground nearer, which the caller sees.
+    """
     side_z = z + enter[:, None] * slope
     far_z = z + leave[:, None] * slope
     top = height[:, None]
     with np.errstate(divide="ignore", invalid="ignore"):
         roof = (top - np.float32(z)) / slope
-    hit = np.where(side_z <= top, enter[:, None], np.where(far_z < top, roof, np.float32(np.inf)))
-    return np.where(side_z >= 0, hit, np.float32(np.inf))
+    return np.where(side_z <= top, enter[:, None], np.where(far_z < top, roof, np.float32(np.inf)))

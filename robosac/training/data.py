@@ -10,9 +10,7 @@ import numpy as np
 
 from robosac.boxes import FloatArray, IntArray
 from robosac.detectors.voxels import GRID, LAYERS, occupancy
-from robosac.scenes import IntersectionScene, SceneFrame
-
-FRAME_STRIDE = 5
+from robosac.scenes import FRAMES_PER_SECOND, IntersectionScene, SceneFrame
 
 
 @dataclass(frozen=True)
@@ -58,7 +56,7 @@ def generate(seeds: Sequence[int], frames_per_scene: int, tick: Callable[[], Non
     """Frames 1 s apart of every scene; ``tick`` is called after each."""
     frames = []
     for seed in seeds:
-        for frame in IntersectionScene(seed).frames(frames_per_scene, stride=FRAME_STRIDE):
+        for frame in IntersectionScene(seed).frames(frames_per_scene, stride=FRAMES_PER_SECOND):
             frames.append(TrainingFrame.from_scene(frame))
             tick()
     return frames

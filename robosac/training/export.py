@@ -17,6 +17,14 @@ from robosac.training.loop import TrainingConfig
 from robosac.training.validation import FRAMES_PER_SCENE, SCENES, OperatingPoint
 
 
+def shipped_tensors(network: MeanFusionNetwork) -> dict[str, torch.Tensor]:
+    """The network's tensors as they are shipped, floats rounded to float16."""
+    return {
+        name: tensor.half().contiguous() if tensor.is_floating_point() else tensor.contiguous()
+        for name, tensor in network.state_dict().items()
+    }
+
+
 def export_weights(
     network: MeanFusionNetwork, config: TrainingConfig, point: OperatingPoint, command: str, path: Path
 ) -> dict[str, Any]:
@@ -37,10 +45,7 @@ def export_weights(
         The recipe in the file's metadata: command, seed, data, operating point, validation figures, and the SHA-256 of
         the tensors.
     """
-    tensors = {
-        name: tensor.half().contiguous() if tensor.is_floating_point() else tensor.contiguous()
-        for name, tensor in network.state_dict().items()
-    }
+    tensors = shipped_tensors(network)
     recipe = {
         "detector": NAME,
         "command": command,

@@ -10,6 +10,7 @@ from torch.nn import functional
 
 from robosac.boxes import FloatArray, IntArray
 from robosac.detectors.decoding import HEAD_CELL_M, OWN_BODY_M, box_codes, cell_centres
+from robosac.detectors.voxels import AREA_M
 
 POSITIVE_HITS = 4
 SIGMA_M = 0.9
@@ -47,8 +48,8 @@ def targets(near: FloatArray, hits: IntArray) -> tuple[FloatArray, FloatArray, F
         if count < POSITIVE_HITS:
             weight[bump > IGNORE_FROM] = 0.0
             continue
-        row = int(np.floor((box[1] + 32.0) / HEAD_CELL_M))
-        column = int(np.floor((box[0] + 32.0) / HEAD_CELL_M))
+        row = int(np.floor((box[1] + AREA_M) / HEAD_CELL_M))
+        column = int(np.floor((box[0] + AREA_M) / HEAD_CELL_M))
         bump[row, column] = 1.0
         closest = (bump > heat) & (bump >= REGRESSION_FROM)
         codes[:, closest] = box_codes(box, xs[closest], ys[closest])

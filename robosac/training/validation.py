@@ -11,7 +11,7 @@ from itertools import combinations
 import numpy as np
 
 from robosac.attacks import PGD
-from robosac.consensus import DEFAULT_THRESHOLD, compare
+from robosac.consensus import DEFAULT_THRESHOLD, at_least, compare
 from robosac.detectors import EmbeddedDetector
 from robosac.detectors.network import MeanFusionNetwork
 from robosac.evaluation.average_precision import AveragePrecision
@@ -110,7 +110,7 @@ def _consensus_score(detector: EmbeddedDetector, frames: list[EvaluationFrame]) 
             fused = received.detect(subset)
             indices = benign if frame.attackers.isdisjoint(subset) else attacked
             for score in CONSENSUS_SCORES:
-                comparison = compare(ego_only[ego_only[:, 5] >= score], fused[fused[:, 5] >= score])
+                comparison = compare(at_least(ego_only, score), at_least(fused, score))
                 indices[score].append(comparison.jaccard_index)
 
     def margin(score: float) -> float:

@@ -63,6 +63,8 @@ def test_from_world_inverts_the_pose():
     np.testing.assert_allclose(back[:2], [12.0, 0.0], atol=1e-12)
     assert moved[0, 4] == pytest.approx(0.5)
     assert moved[0, 5] == 0.9
+    turned = from_world(np.array([[0.0, 0.0, 4.0, 2.0, -2.0]]), pose_matrix(0.0, 0.0, 0.0, 0.5))
+    assert turned[0, 4] == pytest.approx(-2.5)
 
 
 def greedy_nms(boxes, scores, threshold):

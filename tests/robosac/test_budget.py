@@ -100,7 +100,27 @@ def test_an_attacker_free_team_needs_one_hypothesis():
     assert exact_budget(5, 0, 5) == exact_budget(5, 0, 5, distinct=False) == 1
 
 
+def test_large_teams_are_planned_at_once():
+    import time
+
+    started = time.process_time()
+    assert exact_collaborators(63, 13, 7) == 3
+    assert exact_budget(63, 32, 20) > 10**6
+    assert exact_budget(30, 10, 5) == exact_budget(30, 10, 5, distinct=False) == 40
+    for size in (36, 63, 1000):
+        SampleConsensus(0.5, collaborators=size // 2).plan(size)
+        SampleConsensus(0.2).plan(size)
+    assert time.process_time() - started < 1.0
+
+
+def test_beyond_what_can_be_enumerated_the_bound_still_suffices():
+    total, clean = 142506, 15504  # C(30, 5), C(20, 5): just beyond
+    n = exact_budget(30, 10, 5)
+    assert np.prod([(total - clean - i) / (total - i) for i in range(n)]) <= 0.01
+
+
 def test_a_fraction_of_an_attacker_counts_as_one():
+    assert attackers_in_team(100, 0.07) == 7
     assert [attackers_in_team(5, eta) for eta in (0.0, 0.01, 0.2, 0.21, 0.6, 1.0)] == [0, 1, 1, 2, 3, 5]
 
 
@@ -132,6 +152,9 @@ def test_certainty_is_refused(p):
         (lambda: attackers_in_team(0, 0.2), "team_size"),
         (lambda: attackers_in_team(5, 1.2), "attacker_ratio"),
         (lambda: eq2_budget(10_000, 0.9), "too small"),
+        (lambda: eq2_budget(320, 0.9), "too small"),
+        (lambda: eq1_collaborators(5, 1e-320), "too close"),
+        (lambda: eq1_collaborators(5, 0.2, 5e-324), "too close"),
     ],
 )
 def test_other_arguments_outside_the_domain_are_refused(call, message):

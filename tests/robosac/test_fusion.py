@@ -125,14 +125,88 @@ class Liar(SampleConsensus):
 
     def converse(self, team, state, rng):
         yield [("a",)]
-        return Decision(("a", "b"), Source.CONSENSUS, {}, None, state)
+        return Decision(("a", "b"), Source.CONSENSUS, dict.fromkeys("cde"), None, state)
 
 
-def test_nothing_unverified_reaches_the_answer(caplog):
+class Stubborn(SampleConsensus):
+    """Answers with what it tested, whatever the verdict."""
+
+    def converse(self, team, state, rng):
+        yield [("a", "c")]
+        return Decision(("a", "c"), Source.CONSENSUS, dict.fromkeys("bde"), None, state)
+
+
+class Muddled(SampleConsensus):
+    """Says one thing and does another."""
+
+    def __init__(self, accepted, source, rejected):
+        super().__init__()
+        object.__setattr__(self, "decision", (accepted, source, rejected))
+
+    def converse(self, team, state, rng):
+        yield [("a",)]
+        accepted, source, rejected = self.decision
+        return Decision(accepted, source, dict.fromkeys(rejected), None, state)
+
+
+@pytest.mark.parametrize(
+    ("defense", "attackers"),
+    [
+        (Liar(), ""),
+        (Stubborn(), "c"),
+        (Muddled((), Source.CONSENSUS, "abcde"), ""),
+        (Muddled(("a",), Source.EGO_ONLY, "bcde"), ""),
+        (Muddled(("a",), Source.CONSENSUS, "bcd"), ""),
+        (Muddled(("a",), Source.CONSENSUS, "abcde"), ""),
+    ],
+)
+def test_nothing_unverified_or_unexplained_reaches_the_answer(defense, attackers, caplog):
     with caplog.at_level(logging.CRITICAL):
-        result = run(FakeDetector(), Liar())
+        result = run(FakeDetector(attackers), defense)
     assert (result.source, result.accepted) == (Source.EGO_ONLY, ())
     assert "UnverifiedAnswer" in result.fault
+    assert set(result.rejected) == set(TEAM)
+
+
+def test_no_evidence_verifies_nothing(caplog):
+    blind = FakeDetector()
+    blind.detect = lambda teammates=(): SEEN[:0]
+    with caplog.at_level(logging.CRITICAL):
+        assert "UnverifiedAnswer" in run(blind, Stubborn()).fault
+
+
+def test_the_threshold_of_the_defence_decides():
+    detector = FakeDetector()
+    half = np.vstack([SEEN, NOISE])
+    detector.detect = lambda teammates=(): half if teammates else SEEN
+    for threshold, source in ((0.3, Source.CONSENSUS), (0.5, Source.CONSENSUS), (0.6, Source.EGO_ONLY)):
+        result = run(detector, SampleConsensus(consensus_threshold=threshold))
+        assert (result.hypotheses[0].jaccard_index, result.source) == (0.5, source)
+
+
+def test_a_box_at_the_consensus_score_takes_part():
+    detector = FakeDetector()
+    detector.detect = lambda teammates=(): SEEN - [[0, 0, 0, 0, 0, 0.4 if teammates else 0.0]]
+    assert run(detector).hypotheses[0].jaccard_index == 1.0
+
+
+def test_the_new_state_is_handed_back():
+    result = run(FakeDetector(), StaticTeam())
+    assert result.state["trusted"] == list(result.accepted)
+
+
+def test_the_dearest_pass_counts_not_the_latest():
+    detector = FakeDetector("abcde")
+    costs = iter([1.0, 3.0, 1.0, 1.0, 1.0])
+    plain = detector.detect
+
+    def detect(teammates=()):
+        detector.now += next(costs)
+        return plain(teammates)
+
+    detector.detect = detect
+    result = run(detector, deadline=8.0)
+    assert result.sampling_steps == 2
 
 
 class Usurper(StaticTeam):
@@ -140,7 +214,8 @@ class Usurper(StaticTeam):
 
     def converse(self, team, state, rng):
         yield [("a",)]
-        return Decision(("a",), Source.CONSENSUS, {}, None, {"trusted": ["a", "b"], "frames_since_check": 0})
+        trusted = {"trusted": ["a", "b"], "frames_since_check": 0}
+        return Decision(("a",), Source.CONSENSUS, dict.fromkeys("bcde"), None, trusted)
 
 
 class Flatterer(StaticTeam):
@@ -148,7 +223,7 @@ class Flatterer(StaticTeam):
 
     def converse(self, team, state, rng):
         yield from ()
-        return Decision(("a", "b"), Source.TRUSTED, {}, None, state)
+        return Decision(("a", "b"), Source.TRUSTED, dict.fromkeys("cde"), None, state)
 
 
 @pytest.mark.parametrize("defense", [Usurper(), Flatterer()])

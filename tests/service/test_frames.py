@@ -221,6 +221,59 @@ async def test_frames_of_the_ego_must_increase(served, good_frame):
     assert (await served.post(session, "frames", good_frame(4))).status_code == 200
 
 
+async def test_a_frame_sent_again_is_a_replay_and_an_older_one_is_stale(served, good_frame):
+    session = await served.open()
+    for frame in (3, 3, 2):
+        await served.post(session, "frames", good_frame(frame))
+    refused = [r["reason"] for r in await served.ego(session).audit() if r["event"] == "message_refused"]
+    assert refused == ["replayed", "stale"]
+
+
+async def test_the_budget_counts_from_the_last_byte_not_from_the_fusion(served, good_frame):
+    session = await served.open(latency_budget_ms=150, gather_ms=0)
+    live = served.gateway.sessions._live[session.session_id]
+    async with live.lock:
+        posting = asyncio.create_task(served.post(session, "frames", good_frame(0)))
+        await asyncio.sleep(0.3)
+    result = (await posting).json()
+    assert (result["degraded_by"], result["deadline_met"]) == ("deadline", False)
+
+
+async def test_waiting_for_teammates_costs_nothing(served, messages, monkeypatch):
+    waits = []
+    wait_for = asyncio.wait_for
+
+    async def counted(*arguments):
+        waits.append(1)
+        return await wait_for(*arguments)
+
+    monkeypatch.setattr("service.gathering.asyncio.wait_for", counted)
+    session = await served.open(gather_ms=5000)
+    asking = asyncio.create_task(served.ego(session).ask(0, messages[EGO]))
+    await asyncio.sleep(0.1)
+    for name in TEAM:
+        await served.teammate(session, name).send(0, messages[name])
+    answer = await asking
+    assert answer.timings_ms["gather"] < 3000
+    assert len(waits) <= len(TEAM) + 1
+
+
+async def test_the_wait_for_the_detectors_thread_is_measured(served, good_frame):
+    import time
+
+    session = await served.open()
+    busy = served.gateway.engine._executor.submit(time.sleep, 0.2)
+    result = (await served.post(session, "frames", good_frame(0))).json()
+    busy.result()
+    assert 100 < result["timings_ms"]["queue"] < 1000
+
+
+async def test_a_refusal_of_the_ego_blames_no_teammate(served, good_frame):
+    session = await served.open()
+    await served.post(session, "messages", b"junk")
+    assert served.gateway.sessions._live[session.session_id].gathering._refusals == {}
+
+
 async def test_the_same_frame_sent_twice_at_once_is_answered_once(served, good_frame):
     session = await served.open()
     responses = await asyncio.gather(*(served.post(session, "frames", good_frame(0)) for _ in range(5)))

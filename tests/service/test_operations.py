@@ -36,6 +36,20 @@ async def test_metrics_count_what_happened(served, ego_message, attacked, messag
     assert rejected == 4 * 2
 
 
+async def test_late_frames_are_counted(served, ego_message, attacked):
+    for budget in (0.01, 20_000):
+        session = await served.open(latency_budget_ms=budget, gather_ms=0)
+        await served.ego(session).post_frame(0, ego_message, attacked)
+    assert "robosac_late_frames_total 1.0" in (await served.http.get("/metrics")).text
+
+
+async def test_a_default_detector_that_does_not_exist_keeps_the_gateway_from_starting():
+    app = create_app(Settings(detector="nonesuch"))
+    with pytest.raises(ValueError, match="ROBOSAC_DETECTOR"):
+        async with app.router.lifespan_context(app):
+            pytest.fail("it started")
+
+
 async def test_the_api_describes_itself(served):
     description = (await served.http.get("/openapi.json")).json()
     paths = set(description["paths"])

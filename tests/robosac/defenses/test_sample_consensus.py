@@ -105,6 +105,22 @@ def test_what_is_not_given_follows_from_the_exact_law(defense, plan):
     assert defense.plan(5) == plan
 
 
+def test_a_lone_teammate_is_tested_once():
+    assert SampleConsensus(0.2, collaborators=3).plan(1) == (1, 1)
+    SampleConsensus(0.9, collaborators=1).check_team(5)
+
+
+def test_the_lowest_index_is_the_evidence():
+    from robosac.defenses import Outcome
+    from robosac.defenses.protocol import explain_rejections
+
+    outcomes = [Outcome(("a", "b"), index, Verdict.DISSENSUS) for index in (0.2, 0.1, 0.25)]
+    assert explain_rejections(["a"], (), outcomes)["a"].evidence == {
+        "hypotheses": [0, 1, 2],
+        "lowest_jaccard_index": 0.1,
+    }
+
+
 def test_with_a_perfect_oracle_the_plan_always_finds_the_benign(rng):
     for _ in range(50):
         decision, _ = converse_with_oracle(SampleConsensus(0.4, collaborators=3), TEAM, {"b", "d"}, {}, rng)

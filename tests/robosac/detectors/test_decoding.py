@@ -41,7 +41,25 @@ def test_overlapping_boxes_are_suppressed():
 
 def test_a_flooded_map_is_bounded_and_finite(rng):
     logits = torch.from_numpy(rng.normal(0.0, 500.0, (64, 64)).astype(np.float32))
-    codes = torch.from_numpy(rng.normal(0.0, 1e4, (6, 64, 64)).astype(np.float32))
+    codes = torch.from_numpy(rng.normal(0.0, [[[1.0]]] * 2 + [[[1e4]]] * 4, (6, 64, 64)).astype(np.float32))
     boxes = decode_boxes(logits, codes, 0.1)
     assert len(boxes) <= MAX_PEAKS
     assert np.isfinite(boxes).all()
+    assert np.abs(boxes[:, :2]).max() <= 32.0
+
+
+def test_of_too_many_peaks_the_best_are_decoded():
+    logits = torch.full((64, 64), -10.0)
+    logits[::2, ::2] = torch.linspace(-1.0, 1.0, 1024).reshape(32, 32)
+    best = decode_boxes(logits, torch.zeros(6, 64, 64), 0.1)
+    assert best[0, 5] == pytest.approx(1 / (1 + np.exp(-1.0)))
+
+
+def test_what_counts_is_where_the_box_is_not_where_its_peak_is():
+    xs, ys = cell_centres()
+    logits, codes = torch.full((64, 64), -10.0), torch.zeros(6, 64, 64)
+    for (row, column), centre in {(32, 40): (0.5, 0.5), (10, 10): (-40.0, -20.0), (32, 32): (5.0, 0.0)}.items():
+        logits[row, column] = 3.0
+        codes[0, row, column] = centre[0] - xs[row, column]
+        codes[1, row, column] = centre[1] - ys[row, column]
+    np.testing.assert_allclose(decode_boxes(logits, codes, 0.1)[:, :2], [[5.0, 0.0]], atol=1e-5)

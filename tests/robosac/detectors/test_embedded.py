@@ -141,6 +141,21 @@ def test_weights_that_cannot_be_trusted_are_refused(change, message, tmp_path):
         EmbeddedDetector(rewritten(tmp_path, change))
 
 
+@pytest.mark.parametrize("name", ["feature_gain", "score_threshold", "consensus_score"])
+@pytest.mark.parametrize("value", [None, 0.0, -1.0, "0.3", float("nan"), float("inf"), ...])
+def test_recipes_with_impossible_numbers_are_refused(name, value, tmp_path):
+    def change(tensors, metadata):
+        recipe = json.loads(metadata["robosac"])
+        if value is ...:
+            del recipe[name]
+        else:
+            recipe[name] = value
+        metadata["robosac"] = json.dumps(recipe)
+
+    with pytest.raises(WeightsError, match=name):
+        EmbeddedDetector(rewritten(tmp_path, change))
+
+
 def test_a_file_that_is_no_weights_file_is_refused(tmp_path):
     path = tmp_path / "weights.safetensors"
     with pytest.raises(WeightsError, match="not a readable safetensors file"):

@@ -53,6 +53,18 @@ def test_a_true_box_is_found_once():
     assert ap.at(0.5) == 1.0
 
 
+def test_a_pair_counts_from_the_threshold_on():
+    ap = AveragePrecision()
+    ap.add(scored(TRUTH[:1] * [[1, 1, 0.5, 1, 1]], [0.9]), TRUTH[:1])
+    assert (ap.at(0.5), ap.at(0.51)) == (1.0, 0.0)
+
+
+@pytest.mark.parametrize("threshold", [0.0, -1.0, 1.1, float("nan")])
+def test_thresholds_without_meaning_are_refused(threshold):
+    with pytest.raises(ValueError, match="iou_threshold"):
+        AveragePrecision().at(threshold)
+
+
 def test_scores_rank_across_frames():
     ap = AveragePrecision()
     ap.add(scored(TRUTH[:1] + [[0, 50, 0, 0, 0]], [0.99]), TRUTH[:1])

@@ -1,7 +1,9 @@
+import numpy as np
 import pytest
 
-from robosac.attacks import PGD
+from robosac.attacks import PGD, Erase
 from robosac.evaluation import evaluate_bounds
+from robosac.evaluation.bounds import evaluation_frames
 
 
 @pytest.fixture(scope="module")
@@ -29,6 +31,40 @@ def test_steps_and_success_follow_the_exact_law(report):
     assert rows["Algorithm 1, N = 7"].mean_steps == pytest.approx(2.4, abs=0.8)
     assert rows["no subset twice, N = 7"].success_rate >= 0.95
     assert rows["ego only"].mean_steps is None
+
+
+def test_rows_do_not_depend_on_what_else_is_evaluated(detector):
+    def evaluate(**options):
+        report = evaluate_bounds(detector, PGD(steps=3), seeds=range(1), frames_per_scene=2, **options)
+        return {row.name: row for row in report.rows}
+
+    few, many = evaluate(budgets=(1,), repeats=1), evaluate(budgets=(7, 1), repeats=3)
+    for name in ("all benign", "3 benign", "ego only", "no defence"):
+        assert few[name] == many[name]
+
+
+def test_an_attack_that_passes_is_counted_as_infiltration(detector):
+    report = evaluate_bounds(detector, Erase(), seeds=range(2), frames_per_scene=1, repeats=5, budgets=(7,))
+    assert report.miss_rate > 0.9
+    assert report.rows[2].infiltrated > 0.3
+    honest = evaluate_bounds(detector, Erase(), seeds=range(1), frames_per_scene=1, attackers=0, budgets=(7,))
+    assert honest.rows[2].infiltrated == 0.0
+    assert honest.miss_rate is None
+
+
+def test_the_cars_take_turns_as_ego(detector):
+    frames = evaluation_frames(detector, range(2), 3, PGD(steps=1), 1, np.random.default_rng(0))
+    everybody = {"car-1", "car-2", "car-3", "car-4", "car-5", "rsu"}
+    assert [(everybody - set(frame.benign)).pop() for frame in frames] == [
+        "car-1", "car-2", "car-3", "car-4", "car-5", "car-1",
+    ]  # fmt: skip
+
+
+def test_the_attack_is_measured_against_the_features(detector):
+    report = evaluate_bounds(detector, PGD(steps=1, epsilon=0.25), seeds=range(1), frames_per_scene=1, budgets=(1,))
+    (frame,) = evaluation_frames(detector, range(1), 1, PGD(steps=1), 1, np.random.default_rng(0))
+    magnitudes = np.concatenate([message.tensors["features"].ravel() for message in frame.benign.values()])
+    assert report.perturbation_to_feature_ratio == pytest.approx(0.25 / np.percentile(np.abs(magnitudes), 95))
 
 
 def test_the_consensus_test_is_counted_over_all_hypotheses(report):

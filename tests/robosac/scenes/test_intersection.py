@@ -1,8 +1,8 @@
 import numpy as np
 import pytest
 
-from robosac.boxes import corners, from_world, pairwise_iou
-from robosac.scenes import IntersectionScene, Lidar
+from robosac.boxes import corners, from_world, pairwise_iou, pose_matrix
+from robosac.scenes import AgentView, IntersectionScene, Lidar, SceneFrame
 from robosac.scenes.splits import TEST_SEEDS, TRAINING_SEEDS, VALIDATION_SEEDS
 from robosac.scenes.world import LANES_M, PARKED_ROW_M
 
@@ -105,6 +105,19 @@ def test_truth_is_in_the_egos_frame_and_without_the_ego():
     truth = frame.truth("car-1")
     assert np.abs(truth[:, :2]).max() <= 31.0
     assert np.hypot(truth[:, 0], truth[:, 1]).min() > 2.0
+
+
+def test_a_vehicle_is_true_from_six_returns_of_one_agent_on():
+    vehicles = np.array(
+        [[0, 0, 4, 2, 0], [10, 0, 4, 2, 0], [0, 10, 4, 2, 0], [-10, 0, 4, 2, 0], [50, 0, 4, 2, 0]], float
+    )
+    here, there = pose_matrix(0, 0, 1.7, 0), pose_matrix(5, 5, 1.7, 0)
+    views = {
+        "ego": AgentView(here, np.empty((0, 3)), np.array([9, 3, 6, 0, 9])),
+        "mate": AgentView(there, np.empty((0, 3)), np.array([9, 5, 0, 0, 9])),
+    }
+    truth = SceneFrame(0, vehicles, views, {"ego": 0}).truth("ego")
+    np.testing.assert_allclose(truth[:, :2], [[0, 10]], atol=1e-12)
 
 
 def test_a_scene_may_have_other_agents_than_six():

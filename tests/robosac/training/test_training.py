@@ -8,6 +8,7 @@ from safetensors import safe_open
 
 from robosac.detectors import EmbeddedDetector
 from robosac.detectors.decoding import cell_centres
+from robosac.detectors.network import MeanFusionNetwork
 from robosac.training.export import export_weights
 from robosac.training.loop import TrainingConfig, train_network
 from robosac.training.loss import detection_loss, stack, targets
@@ -62,6 +63,7 @@ def test_exported_weights_load_with_their_recipe(tmp_path):
     assert detector.info.consensus_score == 0.3
     with safe_open(path, framework="pt") as file:
         assert json.loads(file.metadata()["robosac"])["feature_gain"] == 0.5
+        assert file.get_tensor("class_head.weight").dtype is torch.float16
 
 
 def test_targets_know_what_was_seen_what_is_doubtful_and_what_nobody_can_know():
@@ -77,6 +79,29 @@ def test_targets_know_what_was_seen_what_is_doubtful_and_what_nobody_can_know():
     xs, ys = cell_centres()
     np.testing.assert_allclose(codes[:2, *seen], near[0, :2] - [xs[seen], ys[seen]], atol=1e-6)
     np.testing.assert_allclose(codes[2:, *seen], [np.log(4.5), np.log(1.9), np.cos(0.6), np.sin(0.6)], atol=1e-6)
+
+
+def test_a_doubtful_neighbour_does_not_hide_what_was_seen():
+    near = np.array([[10.5, 0.5, 4.5, 1.9, 0.0], [11.5, 0.5, 4.5, 1.9, 0.0]])
+    for hits in ([9, 2], [2, 9]):
+        heat, weight, _, _ = targets(near, np.array(hits))
+        seen = (32, 42) if hits[0] == 9 else (32, 43)
+        assert (heat[seen], weight[seen]) == (1.0, 1.0)
+
+
+def test_what_only_others_saw_is_background(monkeypatch):
+    from robosac.scenes import IntersectionScene
+    from robosac.training import loop
+    from robosac.training.data import TrainingFrame
+
+    frame = TrainingFrame.from_scene(IntersectionScene(0).frame(0))
+    seen = []
+    monkeypatch.setattr(loop, "targets", lambda near, hits: seen.append(hits) or targets(near, hits))
+    network = MeanFusionNetwork()
+    config = replace(TINY, frames_per_step=1, egos_per_frame=6, ego_only_share=1.0)
+    loop._step(network, torch.optim.SGD(network.parameters(), lr=0.0), [frame], config, np.random.default_rng(0))
+    own = {tuple(frame.hits[ego][ego]) for ego in range(6)}
+    assert {tuple(hits) for hits in seen} == own
 
 
 def test_the_loss_is_least_at_the_truth():
