@@ -15,7 +15,7 @@ from robosac.defenses import SampleConsensus
 from robosac.detectors import Detector, Message, PreparedFrame
 from robosac.evaluation.average_precision import AveragePrecision
 from robosac.fusion import fuse
-from robosac.scenes import FRAMES_PER_SECOND, IntersectionScene
+from robosac.scenes import FRAMES_PER_SECOND, IntersectionScene, SceneFrame
 
 TEAM_SIZE = 5
 ASSUMED_RATIO = 0.2
@@ -91,6 +91,25 @@ class BoundsReport:
     perturbation_to_feature_ratio: float
 
 
+def under_attack(
+    detector: Detector,
+    frame: SceneFrame,
+    ego_id: str,
+    attackers: Sequence[str],
+    attack: Attack,
+    rng: np.random.Generator,
+) -> EvaluationFrame:
+    """A frame of a scene as one ego meets it, with some teammates under the adversary's control."""
+    messages = {name: detector.encode(view.points, view.pose) for name, view in frame.views.items()}
+    ego = messages.pop(ego_id)
+    adversarial = attack.run(detector.attack_surface(ego, messages), attackers, rng) if attackers else {}
+    received = {
+        name: detector.perturbed(message, adversarial[name]) if name in adversarial else message
+        for name, message in messages.items()
+    }
+    return EvaluationFrame(ego, messages, received, frozenset(adversarial), frame.truth(ego_id))
+
+
 def evaluation_frames(
     detector: Detector,
     seeds: Sequence[int],
@@ -104,18 +123,11 @@ def evaluation_frames(
     for seed in seeds:
         scene = IntersectionScene(seed)
         for frame in scene.frames(frames_per_scene, stride=FRAMES_PER_SECOND):
-            messages = {name: detector.encode(view.points, view.pose) for name, view in frame.views.items()}
             ego_id = f"car-{turn % scene.car_agents + 1}"
             turn += 1
-            ego = messages.pop(ego_id)
-            chosen = rng.choice(sorted(messages), attackers, replace=False)
-            surface = detector.attack_surface(ego, messages)
-            adversarial = attack.run(surface, [str(name) for name in chosen], rng)
-            received = {
-                name: detector.perturbed(m, adversarial[name]) if name in adversarial else m
-                for name, m in messages.items()
-            }
-            yield EvaluationFrame(ego, messages, received, frozenset(adversarial), frame.truth(ego_id))
+            teammates = sorted(set(scene.agents) - {ego_id})
+            chosen = [str(name) for name in rng.choice(teammates, attackers, replace=False)]
+            yield under_attack(detector, frame, ego_id, chosen, attack, rng)
 
 
 def evaluate_bounds(
