@@ -48,7 +48,10 @@ class FrameAnswer:
     hypotheses : list of mapping
         ``teammates``, ``jaccard_index``, ``verdict``.
     sampling_steps : int
+    attacker_ratio : float or None
     deadline_met : bool
+    degraded_by : str or None
+        ``deadline`` or ``fault``, if the defence was cut short.
     timings_ms : mapping of stage to float
     """
 
@@ -59,7 +62,9 @@ class FrameAnswer:
     rejected: Mapping[str, Mapping[str, Any]]
     hypotheses: list[Mapping[str, Any]]
     sampling_steps: int
+    attacker_ratio: float | None
     deadline_met: bool
+    degraded_by: str | None
     timings_ms: Mapping[str, float]
 
     @classmethod
@@ -80,7 +85,9 @@ class FrameAnswer:
                 rejected={entry["vehicle_id"]: entry for entry in fields["rejected"]},
                 hypotheses=list(fields["hypotheses"]),
                 sampling_steps=int(fields["sampling_steps"]),
+                attacker_ratio=fields["attacker_ratio"],
                 deadline_met=bool(fields["deadline_met"]),
+                degraded_by=fields["degraded_by"],
                 timings_ms=dict(fields["timings_ms"]),
             )
         except (KeyError, TypeError, ValueError, OverflowError) as error:
@@ -182,7 +189,8 @@ class GatewayClient:
         try:
             response = await self._http.request(method, path, **options)
         except (httpx.HTTPError, httpx.InvalidURL) as error:
-            raise GatewayUnreachable(f"{method} {path}: {type(error).__name__} {error}") from error
+            where = f"{method} {self._http.base_url.join(path)}"
+            raise GatewayUnreachable(f"{where}: {type(error).__name__} {error}; is the gateway running?") from error
         if response.is_success:
             return response
         try:

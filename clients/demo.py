@@ -35,6 +35,9 @@ def main(
     except (GatewayError, OSError) as error:
         console.print(f"[red]The demo failed:[/red] {error}")
         sys.exit(1)
+    except asyncio.CancelledError:
+        console.print("[red]The demo was ended.[/red]")
+        sys.exit(143)
     close_run(options, summary, console)
     if summary.clean_share < CLEAN_SHARE:
         console.print(f"[red]The demo failed:[/red] expected no attacker in at least {CLEAN_SHARE:.0%} of the answers.")
@@ -44,7 +47,7 @@ def main(
 async def _run(report: Path, scenes: int, frames: int, console: Console) -> tuple[FleetOptions, FleetSummary]:
     console.print("Starting the gateway (uvicorn service.app:app) ...")
     async with local_gateway(report / "gateway.log") as url:
-        console.print(f"It is ready at {url}. Six vehicles, one of them a PGD attacker, post feature maps at 5 Hz.")
+        console.print(f"It is ready at {url}. Six vehicles, one of them a PGD attacker, post 5 Hz of simulated time.")
         options = FleetOptions(
             url=url,
             scenes=scenes,

@@ -19,7 +19,7 @@ from rich.table import Table
 
 from clients.client import FrameAnswer, GatewayClient, OpenedSession
 from clients.errors import GatewayError
-from clients.simulation import EgoFrame, Fleet
+from clients.simulation import EgoFrame, Fleet, make_folder
 from clients.summary import FleetSummary
 from robosac.attacks import ATTACKS
 from robosac.detectors import load
@@ -207,6 +207,8 @@ def main(
     """Drive a simulated fleet, some of it hostile, through a running gateway."""
     torch.set_num_threads(1)
     console = Console()
+    if report is not None:
+        make_folder(report, "--report")
     if attack not in ATTACKS:
         raise typer.BadParameter(f"unknown attack {attack!r}; known: {', '.join(ATTACKS)}", param_hint="--attack")
     chosen = {"attacker_ratio": attacker_ratio, "sampling_budget": sampling_budget, "collaborators": collaborators}

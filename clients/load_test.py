@@ -32,7 +32,7 @@ from rich.table import Table
 from clients.client import FrameAnswer, GatewayClient, VehicleClient
 from clients.errors import GatewayError
 from clients.local_gateway import local_gateway
-from clients.simulation import Fleet
+from clients.simulation import Fleet, make_folder
 from robosac import wire
 from robosac.attacks import PGD
 from robosac.detectors import load
@@ -196,7 +196,7 @@ def show(console: Console, results: Sequence[Figures], bytes_a_frame: int, budge
     figures_of_load = ("FPS", "p50", "p95", "p99", "in time", "steps", "errors")
     table = _table(f"Six vehicles, {size}; latencies in ms, budget {budget_ms:.0f} ms", figures_of_load)
     names = list(dict.fromkeys(stage for figures in results for stage in figures.stages))
-    stages = _table("The gateway's own median timings, ms", [name.replace("_", " ") for name in names])
+    stages = _table("The gateway's own median timings, ms", [_HEADINGS.get(name, name) for name in names])
     for figures in results:
         values, work = figures.as_dict(), figures.load
         loop = work.loop if work.rate_hz is None else f"{work.loop} {work.rate_hz:g} Hz"
@@ -212,6 +212,9 @@ def show(console: Console, results: Sequence[Figures], bytes_a_frame: int, budge
         stages.add_row(*label, *(_shown(values["stages_ms"].get(name), 1) for name in names))
     console.print(table)
     console.print(stages)
+
+
+_HEADINGS = {"receive": "recv", "prepare": "prep", "ego_only": "ego", "hypotheses": "fused", "consensus": "match"}
 
 
 def _shown(value: float | None, digits: int) -> str:
@@ -237,6 +240,8 @@ def main(
     """Measure a gateway's capacity and latency, with and without attackers, for one ego and for several."""
     torch.set_num_threads(1)
     console = Console()
+    if out is not None:
+        make_folder(out, "--out")
     bodies = {attacked: prepare(attacked, scene, console) for attacked in (False, True)}
     loads = [
         Load(loop, count, attacked, rate if loop == "open" else None)
@@ -246,13 +251,14 @@ def main(
     ]
     try:
         results = asyncio.run(_run_all(url, loads, bodies, seconds, budget_ms, console))
+    except asyncio.CancelledError:
+        sys.exit(143)
     except (GatewayError, OSError) as error:
         console.print(f"[red]The load test stopped:[/red] {error}")
         sys.exit(1)
     size = bodies[False].bytes_a_frame
     show(console, results, size, budget_ms)
     if out is not None:
-        out.mkdir(parents=True, exist_ok=True)
         report = {
             "machine": {
                 "platform": platform.platform(),

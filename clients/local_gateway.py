@@ -5,11 +5,12 @@ from __future__ import annotations
 import asyncio
 import contextlib
 import os
+import signal
 import socket
 import subprocess
 import sys
 import time
-from collections.abc import AsyncIterator
+from collections.abc import AsyncIterator, Iterator
 from pathlib import Path
 
 from clients.client import GatewayClient
@@ -47,8 +48,9 @@ async def local_gateway(log: Path) -> AsyncIterator[str]:
             env=dict(os.environ),
         )
         try:
-            await _until_ready(url, process, log)
-            yield url
+            with _cancelled_by_sigterm():
+                await _until_ready(url, process, log)
+                yield url
         finally:
             process.terminate()
             try:
@@ -56,6 +58,21 @@ async def local_gateway(log: Path) -> AsyncIterator[str]:
             except subprocess.TimeoutExpired:
                 process.kill()
                 process.wait()
+
+
+@contextlib.contextmanager
+def _cancelled_by_sigterm() -> Iterator[None]:
+    """Let a SIGTERM end the block as an exception would, so that the gateway does not outlive it."""
+    loop, task = asyncio.get_running_loop(), asyncio.current_task()
+    try:
+        loop.add_signal_handler(signal.SIGTERM, task.cancel if task else loop.stop)
+    except (NotImplementedError, RuntimeError, ValueError):  # not on this platform, or not in the main thread
+        yield
+        return
+    try:
+        yield
+    finally:
+        loop.remove_signal_handler(signal.SIGTERM)
 
 
 async def _until_ready(url: str, process: subprocess.Popen[bytes], log: Path) -> None:

@@ -4,8 +4,10 @@ from __future__ import annotations
 
 from collections.abc import Mapping
 from dataclasses import dataclass
+from pathlib import Path
 
 import numpy as np
+import typer
 
 from robosac.attacks import Attack
 from robosac.boxes import FloatArray
@@ -19,6 +21,8 @@ class EgoFrame:
 
     Attributes
     ----------
+    scene : int
+        Its seed.
     ego_id : str
     attackers : frozenset of str
     benign : mapping of teammate to Message
@@ -32,6 +36,7 @@ class EgoFrame:
         The ego's LiDAR returns.
     """
 
+    scene: int
     ego_id: str
     attackers: frozenset[str]
     benign: Mapping[str, Message]
@@ -39,6 +44,14 @@ class EgoFrame:
     message: Message
     truth: FloatArray
     points: FloatArray
+
+
+def make_folder(path: Path, option: str) -> None:
+    """Make an output folder before any work is done; a bad one is the option's fault."""
+    try:
+        path.mkdir(parents=True, exist_ok=True)
+    except OSError as error:
+        raise typer.BadParameter(str(error), param_hint=option) from error
 
 
 class Fleet:
@@ -108,4 +121,6 @@ class Fleet:
             for name, message in benign.items()
         }
         view = frame.views[ego_id]
-        return EgoFrame(ego_id, self.attackers, benign, sent, messages[ego_id], frame.truth(ego_id), view.points)
+        return EgoFrame(
+            self.scene.seed, ego_id, self.attackers, benign, sent, messages[ego_id], frame.truth(ego_id), view.points
+        )

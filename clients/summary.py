@@ -15,6 +15,7 @@ from rich.table import Table
 from clients.client import FrameAnswer
 from clients.simulation import EgoFrame
 from robosac.boxes import FloatArray
+from robosac.consensus import at_least
 from robosac.detectors import Detector
 from robosac.evaluation import AveragePrecision
 from robosac.scenes.drawing import FOUND_COLOUR, TRUE_COLOUR, draw_boxes, draw_points, frame_axes
@@ -25,10 +26,11 @@ BASELINES = ("all benign", "ego only", "no defence")
 
 @dataclass(frozen=True)
 class Example:
-    """A frame for the picture: who asked, what is true, and what came of it."""
+    """A frame for the picture: who asked, what is true, and what came of it; boxes from the consensus score on."""
 
     frame: EgoFrame
     undefended: FloatArray
+    answered: FloatArray
     answer: FrameAnswer
 
 
@@ -77,13 +79,18 @@ class FleetSummary:
             tally = self.participation.setdefault(role, Counter())
             for vehicle in members:
                 tally["accepted" if vehicle in answer.accepted else str(answer.rejected[vehicle]["reason"])] += 1
-        self._keep_example(Example(frame, undefended, answer))
+        self._keep_example(frame, undefended, answer)
 
-    def _keep_example(self, example: Example) -> None:
-        """The picture shows the frame in which the attack did most, with a verified answer where there is one."""
-        harm = abs(len(example.undefended) - len(example.frame.truth)) * 2 + (example.answer.source != "ego_only")
+    def _keep_example(self, frame: EgoFrame, undefended: FloatArray, answer: FrameAnswer) -> None:
+        """The picture shows the frame where the attacked fusion finds most too many or too few boxes, rather one with a
+        verified answer.
+        """
+        score = self.detector.info.consensus_score
+        found = at_least(undefended, score)
+        harm = abs(len(found) - len(frame.truth)) * 2 + (answer.source != "ego_only")
         if harm > self._harm:
-            self._harm, self.example = harm, example
+            self._harm = harm
+            self.example = Example(frame, found, at_least(answer.boxes, score), answer)
 
     def as_dict(self) -> dict[str, Any]:
         """Plain values for JSON."""
@@ -150,13 +157,13 @@ def _draw(example: Example, path: Path) -> None:
     from matplotlib.figure import Figure  # noqa: PLC0415 (a second to import, and only pictures need it)
 
     frame, answer = example.frame, example.answer
-    attackers = ", ".join(sorted(frame.attackers)) or "nobody"
+    attack = f"attacked by {', '.join(sorted(frame.attackers))}" if frame.attackers else "nobody attacks"
     panels = (
         ("True boxes", frame.truth, TRUE_COLOUR, "true"),
-        (f"Fusion of all, attacked by {attackers}", example.undefended, "#b2182b", "found"),
+        (f"Fusion of all, {attack}", example.undefended, "#b2182b", "found"),
         (
             f"Gateway: {answer.source.replace('_', ' ')} with {', '.join(answer.accepted) or 'nobody'}",
-            answer.boxes,
+            example.answered,
             FOUND_COLOUR,
             "found",
         ),
@@ -168,5 +175,5 @@ def _draw(example: Example, path: Path) -> None:
             draw_boxes(axes, frame.truth, TRUE_COLOUR, "true", dashed=True, width=1.0)
         draw_boxes(axes, boxes, colour, label)
         frame_axes(axes, title)
-    figure.suptitle(f"Frame {answer.frame} of {frame.ego_id}")
+    figure.suptitle(f"Scene {frame.scene}, frame {answer.frame}, {frame.ego_id}; boxes from the consensus score on")
     figure.savefig(path, dpi=90)

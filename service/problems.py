@@ -25,6 +25,25 @@ MEDIA_TYPE = "application/problem+json"
 TYPE_PREFIX = "urn:robosac:problem:"
 
 
+def documented(*statuses: int) -> dict[int | str, dict[str, Any]]:
+    """Problem responses of a route, for its OpenAPI description."""
+    schema = {
+        "type": "object",
+        "required": ["type", "title", "status", "detail"],
+        "properties": {
+            "type": {"type": "string", "examples": [TYPE_PREFIX + "wrong-shape"]},
+            "title": {"type": "string"},
+            "status": {"type": "integer"},
+            "detail": {"type": "string"},
+            "field": {"type": "string", "description": "The part of the request that is to blame, if one is."},
+        },
+    }
+    return {
+        status: {"description": HTTPStatus(status).phrase, "content": {MEDIA_TYPE: {"schema": schema}}}
+        for status in statuses
+    }
+
+
 class Problem(Exception):
     """A request that is refused.
 
@@ -59,7 +78,7 @@ class Problem(Exception):
     def from_wire(cls, error: WireError) -> Problem:
         """400 for a body that is no msgpack, 422 for one that says the wrong thing."""
         status = 400 if error.code == "malformed-msgpack" else 422
-        return cls(status, error.code, error.detail, error.field)
+        return cls(status, error.code, error.detail, error.field or None)
 
     def response(self) -> JSONResponse:
         """The problem as a response."""
@@ -89,7 +108,7 @@ def install(app: FastAPI) -> None:
                 400, "malformed-json", f"not JSON: {first.get('ctx', {}).get('error', first['msg'])}"
             ).response()
         where = [str(part) for part in first["loc"] if part not in ("body", "query", "path", *DEFENSE_KINDS)]
-        return Problem(422, "invalid-request", str(first["msg"]), ".".join(where)).response()
+        return Problem(422, "invalid-request", str(first["msg"]), ".".join(where) or None).response()
 
     @app.exception_handler(HTTPException)
     async def _http(_: Request, error: HTTPException) -> JSONResponse:

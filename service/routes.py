@@ -12,7 +12,7 @@ from fastapi.security import HTTPAuthorizationCredentials, HTTPBearer
 from robosac import wire
 from service.gateway import Gateway
 from service.limits import read_bounded
-from service.problems import Problem
+from service.problems import Problem, documented
 from service.schemas import (
     DetectorEntry,
     DetectorList,
@@ -29,7 +29,7 @@ from service.sessions import Caller
 MSGPACK = "application/vnd.msgpack"
 MSGPACK_TYPES = (MSGPACK, "application/msgpack", "application/x-msgpack")
 
-v1 = APIRouter(prefix="/v1")
+v1 = APIRouter(prefix="/v1", responses=documented(422))
 operations = APIRouter()
 _bearer = HTTPBearer(auto_error=False)
 
@@ -54,11 +54,17 @@ async def _ego(sid: str, gateway: GatewayDep, credentials: Credentials) -> Calle
 Vehicle = Annotated[Caller, Depends(_vehicle)]
 Ego = Annotated[Caller, Depends(_ego)]
 
-_TENSOR_BODY: dict[str, Any] = {
-    "requestBody": {"required": True, "content": {MSGPACK: {"schema": {"type": "string", "format": "binary"}}}}
+_TENSOR_SCHEMA = {
+    "type": "string",
+    "format": "binary",
+    "description": "msgpack of {frame, vehicle_id, pose, tensors: {NAME: {dtype, shape, data}}} for a message, of "
+    "{frame, ego: {pose, tensors}, teammates: {ID: {pose, tensors}}} for a whole frame",
 }
+_TENSOR_BODY: dict[str, Any] = {"requestBody": {"required": True, "content": {MSGPACK: {"schema": _TENSOR_SCHEMA}}}}
+_EGO_PROBLEMS = documented(401, 403, 404)
 _FRAME_RESPONSES: dict[int | str, dict[str, Any]] = {
-    200: {"model": FrameResult, "description": "The answer to the frame, as JSON or msgpack by `Accept`."}
+    **documented(400, 401, 403, 404, 409, 413, 415),
+    200: {"model": FrameResult, "description": "The answer to the frame, as JSON or msgpack by `Accept`."},
 }
 
 
@@ -68,37 +74,41 @@ async def list_detectors(gateway: GatewayDep) -> DetectorList:
     return DetectorList(detectors=[DetectorEntry.of(detector.info) for detector in gateway.engine.detectors.values()])
 
 
-@v1.post("/sessions", status_code=201)
+@v1.post("/sessions", status_code=201, responses=documented(400, 413, 503))
 async def open_session(request: SessionRequest, gateway: GatewayDep) -> SessionCreated:
     """Open a session of one ego with its teammates. The tokens are shown only in this answer."""
     return await gateway.sessions.open(request)
 
 
-@v1.get("/sessions/{sid}")
+@v1.get("/sessions/{sid}", responses=_EGO_PROBLEMS)
 async def get_session(caller: Ego, gateway: GatewayDep) -> SessionState:
     """The session's settings and what its defence remembers."""
     return await gateway.sessions.describe(caller)
 
 
-@v1.delete("/sessions/{sid}", status_code=204)
+@v1.delete("/sessions/{sid}", status_code=204, responses=_EGO_PROBLEMS)
 async def delete_session(caller: Ego, gateway: GatewayDep) -> None:
     """End the session; its audit log goes with it, so fetch that first."""
     await gateway.sessions.close(caller)
 
 
-@v1.post("/sessions/{sid}/teammates", status_code=201)
+@v1.post("/sessions/{sid}/teammates", status_code=201, responses={**_EGO_PROBLEMS, **documented(400, 409)})
 async def enrol_teammates(request: EnrolmentRequest, caller: Ego, gateway: GatewayDep) -> TeamChanged:
     """Let teammates join from the next frame on. Their tokens are shown only in this answer."""
     return await gateway.sessions.enrol(caller, request.teammates)
 
 
-@v1.delete("/sessions/{sid}/teammates/{vehicle_id}", status_code=204)
+@v1.delete("/sessions/{sid}/teammates/{vehicle_id}", status_code=204, responses=_EGO_PROBLEMS)
 async def dismiss_teammate(vehicle_id: str, caller: Ego, gateway: GatewayDep) -> None:
     """Let a teammate leave from the next frame on; its token is worth nothing any more."""
     await gateway.sessions.dismiss(caller, vehicle_id)
 
 
-@v1.get("/sessions/{sid}/audit", response_class=Response, responses={200: {"content": {"application/jsonl": {}}}})
+@v1.get(
+    "/sessions/{sid}/audit",
+    response_class=Response,
+    responses={**_EGO_PROBLEMS, 200: {"content": {"application/jsonl": {}}}},
+)
 async def get_audit(caller: Ego, gateway: GatewayDep, after: Annotated[int, Query(ge=0)] = 0) -> Response:
     """The audit log as JSON Lines: records with a number above `after`."""
     records = await gateway.sessions.audit_log(caller, after)

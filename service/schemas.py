@@ -142,6 +142,7 @@ class DetectorEntry(BaseModel):
     area_m: tuple[float, float, float, float] = Field(description="xmin, ymin, xmax, ymax; ego frame, metres")
     cell_m: float
     weights_digest: str = Field(description="SHA-256 of the weights file")
+    consensus_score: float = Field(description="boxes from this score on take part in the consensus test")
 
     @classmethod
     def of(cls, info: DetectorInfo) -> DetectorEntry:
@@ -155,6 +156,7 @@ class DetectorEntry(BaseModel):
             area_m=info.area_m,
             cell_m=info.cell_m,
             weights_digest=info.weights_digest,
+            consensus_score=info.consensus_score,
         )
 
 

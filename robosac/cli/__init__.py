@@ -2,11 +2,32 @@
 
 from __future__ import annotations
 
+from importlib import metadata
+from typing import Annotated
+
 import typer
 
 from robosac.cli import evaluate, reproduce, scene, train
 
+
+def _show_version(wanted: bool) -> None:
+    if wanted:
+        typer.echo(metadata.version("robosac"))
+        raise typer.Exit
+
+
 app = typer.Typer(no_args_is_help=True, add_completion=False, help="Consensus-verified collaborative perception.")
+
+
+@app.callback()
+def main(
+    version: Annotated[
+        bool, typer.Option("--version", is_eager=True, callback=_show_version, help="Print the version and end.")
+    ] = False,
+) -> None:
+    """Consensus-verified collaborative perception."""
+
+
 app.command("scene")(scene.run)
 app.command("train")(train.run)
 app.command("evaluate")(evaluate.run)

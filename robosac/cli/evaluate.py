@@ -40,6 +40,11 @@ def run(
             f"no {collaborators} of five teammates can be free of {attackers} attackers", param_hint="--collaborators"
         )
     try:
+        if out is not None:
+            out.mkdir(parents=True, exist_ok=True)
+    except OSError as error:
+        raise typer.BadParameter(str(error), param_hint="--out") from error
+    try:
         detector = EmbeddedDetector(weights)
     except WeightsError as error:
         raise typer.BadParameter(str(error), param_hint="--weights") from error
@@ -57,7 +62,6 @@ def run(
         )
     _print(console, report, attack, attackers)
     if out is not None:
-        out.mkdir(parents=True, exist_ok=True)
         settings = {
             "scenes": scenes,
             "frames": frames,

@@ -29,7 +29,10 @@ def run(
         raise typer.BadParameter(f"unknown {', '.join(unknown)}; known: {', '.join(EXPERIMENTS)}", param_hint="--only")
     torch.set_num_threads(1)
     console = Console()
-    out.mkdir(parents=True, exist_ok=True)
+    try:
+        out.mkdir(parents=True, exist_ok=True)
+    except OSError as error:
+        raise typer.BadParameter(str(error), param_hint="--out") from error
     started = time.monotonic()
     columns = (TextColumn("{task.description:<28}"), BarColumn(), MofNCompleteColumn(), TimeElapsedColumn())
     sections: list[Section] = []

@@ -22,7 +22,7 @@ def run(
     if agent not in scene.agents:
         raise typer.BadParameter(f"no agent {agent!r}; there are {', '.join(scene.agents)}", param_hint="--agent")
     try:
-        seen, hidden = draw_view(scene.frame(frame), agent, out)
-    except ValueError as error:  # matplotlib names the formats it knows
+        seen, hidden = draw_view(scene.frame(frame), agent, out, f"scene {seed}, ")
+    except (OSError, ValueError) as error:  # matplotlib names the formats it knows
         raise typer.BadParameter(str(error), param_hint="--out") from error
     typer.echo(f"{out}: {agent} sees {seen} vehicles; {hidden} more are hidden from it and seen by a teammate")

@@ -38,7 +38,9 @@ def run(
     adversarial: Annotated[str | None, typer.Option(help="pgd: go on from the shipped weights, under attack.")] = None,
     threads: Annotated[int, typer.Option(min=1, help="CPU threads.")] = 1,
 ) -> None:
-    """Train the embedded detector on generated scenes. Run it again with the same options to go on after a break."""
+    """Train the embedded detector on generated scenes. Checkpoints come every 50 steps; the same command goes on
+    from there.
+    """
     if adversarial not in (None, "pgd"):
         raise typer.BadParameter(f"unknown attack {adversarial!r}; known: pgd", param_hint="--adversarial")
     torch.set_num_threads(threads)
@@ -46,6 +48,9 @@ def run(
     try:
         out.mkdir(parents=True, exist_ok=True)
         _train(console, out, (_plain if adversarial is None else _hardened)(seed, steps, scenes))
+    except KeyboardInterrupt:
+        console.print("Stopped. The same command goes on from the latest checkpoint, if there is one yet.")
+        raise typer.Exit(130) from None
     except (OSError, ValueError, WeightsError) as error:
         console.print(f"[red]{error}[/red]")
         raise typer.Exit(1) from error

@@ -156,8 +156,8 @@ def evaluate_bounds(
     collaborators : int
         s, the size of a hypothesis.
     budgets : sequence of int
-        One row of Algorithm 1 for each, with independent draws as in the paper; and one for the first of them where no
-        subset is drawn twice in a frame, as the gateway does.
+        One row of Algorithm 1 for each, with independent draws as in the paper; one for the first of them where no
+        subset is drawn twice in a frame; and one with the gateway's defaults, which choose the hypotheses' size too.
     repeats : int
         Runs of Algorithm 1 on each frame, so that the luck of its draws averages out; the fused passes are shared.
     seed : int
@@ -173,6 +173,7 @@ def evaluate_bounds(
     samplers[f"no subset twice, N = {budgets[0]}"] = SampleConsensus(
         ratio, sampling_budget=budgets[0], collaborators=collaborators
     )
+    samplers["gateway default"] = SampleConsensus(ratio)
     table = _Table(detector, collaborators, samplers, repeats)
     attack_rng = np.random.default_rng([seed, 0])
     frames = evaluation_frames(detector, seeds, frames_per_scene, attack, attackers, attack_rng)

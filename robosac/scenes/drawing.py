@@ -36,16 +36,16 @@ def draw_boxes(
         axes.plot(closed[:, 0], closed[:, 1], style, color=colour, linewidth=width, label=text)
 
 
-def frame_axes(axes: Axes, title: str) -> None:
+def frame_axes(axes: Axes, title: str, viewer: str = "ego") -> None:
     """Limits, labels and legend of one bird's eye view."""
-    axes.plot(0.0, 0.0, marker="^", color="black", markersize=9, linestyle="none", label="ego")
+    axes.plot(0.0, 0.0, marker="^", color="black", markersize=9, linestyle="none", label=viewer)
     axes.set(
         xlim=(-VIEW_M, VIEW_M), ylim=(-VIEW_M, VIEW_M), aspect="equal", title=title, xlabel="x (m)", ylabel="y (m)"
     )
-    axes.legend(loc="upper right", fontsize="small", framealpha=0.9)
+    axes.legend(loc="upper center", bbox_to_anchor=(0.5, -0.08), ncols=4, fontsize="small", frameon=False)
 
 
-def draw_view(frame: SceneFrame, agent: str, path: Path) -> tuple[int, int]:
+def draw_view(frame: SceneFrame, agent: str, path: Path, title: str = "") -> tuple[int, int]:
     """Draw what one agent senses, the true boxes, and which of them it cannot see itself.
 
     Parameters
@@ -54,6 +54,8 @@ def draw_view(frame: SceneFrame, agent: str, path: Path) -> tuple[int, int]:
     agent : str
     path : Path
         The picture; its suffix chooses the format.
+    title : str
+        What the picture's title begins with.
 
     Returns
     -------
@@ -83,7 +85,8 @@ def draw_view(frame: SceneFrame, agent: str, path: Path) -> tuple[int, int]:
     if others:
         places = from_world(np.column_stack([np.array(others), np.ones((len(others), 3))]), view.pose)
         axes.plot(places[:, 0], places[:, 1], "s", color="#762a83", markersize=6, linestyle="none", label="teammate")
-    frame_axes(axes, f"{agent}, frame {frame.index}: {len(seen)} vehicles seen, {len(hidden)} hidden")
+    heading = f"{title}frame {frame.index}, {agent}: {len(seen)} vehicles seen, {len(hidden)} hidden"
+    frame_axes(axes, heading, viewer=agent)
     path.parent.mkdir(parents=True, exist_ok=True)
     figure.savefig(path, dpi=110)
     return len(seen), len(hidden)

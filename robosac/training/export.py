@@ -67,4 +67,5 @@ def export_weights(
     }
     path.parent.mkdir(parents=True, exist_ok=True)
     save_file(tensors, path, metadata={"robosac": json.dumps(recipe)})
+    path.chmod(0o644)  # safetensors writes for the owner alone
     return recipe

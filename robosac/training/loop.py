@@ -19,7 +19,7 @@ from robosac.training.adversary import AdversaryConfig, add_adversary
 from robosac.training.data import TrainingFrame, generate
 from robosac.training.loss import detection_loss, stack, targets
 
-CHECKPOINT_EVERY = 200
+CHECKPOINT_EVERY = 50
 
 Progress = Callable[[str, int, int, str], None]
 """Told the stage, the steps done, the steps in all, and a remark."""
@@ -67,7 +67,7 @@ def train_network(
     ----------
     config : TrainingConfig
     checkpoint : Path
-        Written every 200 steps and at the end; read first if it exists.
+        Written every 50 steps and at the end; read first if it exists.
     progress : callable
     initial : mapping of name to tensor, optional
         Weights to begin with; random ones by default.
@@ -173,7 +173,11 @@ def _resume(checkpoint: Path, config: TrainingConfig, parts: dict[str, Any]) -> 
         return 0
     state = torch.load(checkpoint, weights_only=True)
     if state["config"] != asdict(config):
-        raise ValueError(f"{checkpoint} was made with another configuration: {state['config']}")
+        ours = asdict(config)
+        other = sorted(name for name in ours if state["config"].get(name) != ours[name])
+        raise ValueError(
+            f"{checkpoint} was made with another configuration ({', '.join(other)}); choose another folder or delete it"
+        )
     for name, part in parts.items():
         part.load_state_dict(state[name])
     return int(state["step"])

@@ -92,7 +92,7 @@ async def test_a_vehicle_sends_its_token_and_asks_for_msgpack(ego_message):
 def test_a_frame_without_boxes_has_an_empty_array():
     fields = {
         "frame": 0, "boxes": [], "source": "ego_only", "accepted": [], "rejected": [], "hypotheses": [],
-        "sampling_steps": 0, "deadline_met": True, "timings_ms": {},
+        "sampling_steps": 0, "attacker_ratio": None, "deadline_met": True, "degraded_by": None, "timings_ms": {},
     }  # fmt: skip
     assert FrameAnswer.parse(fields).boxes.shape == (0, 6)
     np.testing.assert_array_equal(

@@ -73,7 +73,7 @@ async def test_a_bad_message_is_refused_recorded_and_costs_its_sender_only(
     body = spoil(wire.pack_message(0, "car-2", messages["car-2"]))
     token = session.teammate_tokens["car-2"]
     fields = problem(await served.post(session, "messages", body, token), status, slug)
-    assert fields["field"] == field
+    assert fields.get("field", "") == field
     for name in ("car-3", "car-4", "car-5", "rsu"):
         await served.teammate(session, name).send(0, messages[name])
     answer = await ego.ask(0, messages["car-1"])
@@ -107,7 +107,7 @@ async def test_a_malformed_ego_part_refuses_the_whole_frame(served, good_frame, 
         frame["ego"] = msgpack.unpackb(spoil(msgpack.packb(frame["ego"])))
         body, expected = msgpack.packb(frame), f"ego.{field}"
     fields = problem(await served.post(session, "frames", body), status, slug)
-    assert fields["field"] == expected
+    assert fields.get("field", "") == expected
     assert (await served.post(session, "frames", good_frame(0))).json()["source"] == "consensus"
 
 
