@@ -7,7 +7,7 @@ from typing import Annotated
 
 import typer
 
-from robosac.cli import evaluate, reproduce, scene, train
+from robosac.cli import convert, evaluate, reproduce, scene, train
 
 
 def _show_version(wanted: bool) -> None:
@@ -32,5 +32,6 @@ app.command("scene")(scene.run)
 app.command("train")(train.run)
 app.command("evaluate")(evaluate.run)
 app.command("reproduce")(reproduce.run)
+app.command("convert-checkpoint")(convert.run)
 
 __all__ = ["app"]

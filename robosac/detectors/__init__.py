@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Callable
+from pathlib import Path
 
 from robosac.detectors.base import (
     AttackSurface,
@@ -15,7 +16,9 @@ from robosac.detectors.base import (
     TensorSpec,
 )
 from robosac.detectors.embedded import NAME as EMBEDDED
-from robosac.detectors.embedded import EmbeddedDetector, WeightsError
+from robosac.detectors.embedded import EmbeddedDetector, WeightsError, read_weights
+from robosac.detectors.v2xsim import FAMILY as V2XSIM
+from robosac.detectors.v2xsim import V2XSimDetector
 
 _REGISTRY: dict[str, Callable[[], Detector]] = {EMBEDDED: EmbeddedDetector}
 DEFAULT_DETECTOR = EMBEDDED
@@ -39,6 +42,23 @@ def load(name: str = DEFAULT_DETECTOR) -> Detector:
     return _REGISTRY[name]()
 
 
+def open_weights(path: Path) -> Detector:
+    """The detector that a weights file is for, with those weights.
+
+    Raises
+    ------
+    WeightsError
+        If the file cannot be used, or is for a detector that is not known.
+    """
+    _, recipe = read_weights(path)
+    name = str(recipe.get("detector"))
+    if name == EMBEDDED:
+        return EmbeddedDetector(path)
+    if name.startswith(f"{V2XSIM}-"):
+        return V2XSimDetector(path)
+    raise WeightsError(f"{path} is for an unknown detector, {name!r}")
+
+
 __all__ = [
     "DEFAULT_DETECTOR",
     "AttackSurface",
@@ -50,7 +70,9 @@ __all__ = [
     "Preparer",
     "Role",
     "TensorSpec",
+    "V2XSimDetector",
     "WeightsError",
     "available",
     "load",
+    "open_weights",
 ]

@@ -75,6 +75,11 @@ class Message:
     tensors: Mapping[str, np.ndarray[Any, np.dtype[Any]]]
 
 
+def for_role(message: Message, info: DetectorInfo, role: Role) -> Message:
+    """The message with only those tensors that the detector wants from a sender in this role."""
+    return Message(message.pose, {name: message.tensors[name] for name in info.tensors[role]})
+
+
 class PreparedFrame(Protocol):
     """One frame, encoded and warped once, to be decoded for many subsets of teammates."""
 

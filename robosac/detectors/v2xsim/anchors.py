@@ -1,0 +1,122 @@
+"""Anchors of the V2X-Sim detector: from logits and codes to boxes.
+
+Every cell of a 256 x 256 map (0.25 m) has six anchors: 2 x 4 m and 3 x 12 m (w x h), each at three angles. Anchors and
+codes live in the *anchor frame*, whose x is minus the LiDAR's x; its y is the LiDAR's. A box there is x, y, w, h, sin,
+cos: its corners (+-w/2, +-h/2) are turned by ``x' = cos x + sin y``, ``y' = -sin x + cos y`` before x, y is added. Sin
+and cos come from a regression and need not have the norm 1, so the norm scales the box.
+
+Source of layout, decoding and thresholds: the published implementation (coperception/ROBOSAC, revision 4642aa2).
+"""
+
+from __future__ import annotations
+
+import math
+
+import numpy as np
+import torch
+
+from robosac.boxes import FloatArray, IntArray, nms
+from robosac.detectors.v2xsim.network import ANCHORS, GRID
+from robosac.detectors.v2xsim.voxels import AREA_M, CELL_M
+
+SCORE_THRESHOLD = 0.7
+"""Softmax score of the vehicle class; a detection scores more than this."""
+NMS_IOU = 0.01
+MAX_CANDIDATES = 1000
+"""Best anchors that are decoded: bounds the work that a flooded frame (393,216 candidates) can cause."""
+MAX_LOG_SIZE = 8.0
+"""Bound on the codes of w and h, so that no message makes a box of infinite size."""
+
+_SIZES_M = ((2.0, 4.0), (3.0, 12.0))
+_ANGLES = (0.0, math.pi / 2, -math.pi / 4)
+_SHAPES = np.array([[w, h, math.sin(a), math.cos(a)] for w, h in _SIZES_M for a in _ANGLES])
+
+
+def anchor_boxes(index: IntArray) -> FloatArray:
+    """Anchors of the given numbers.
+
+    Parameters
+    ----------
+    index : (n,) int64 ndarray
+        ``(row * 256 + column) * 6 + k``.
+
+    Returns
+    -------
+    (n, 6) float64 ndarray
+        x, y, w, h, sin, cos; anchor frame, metres.
+    """
+    cell, k = np.divmod(np.asarray(index), ANCHORS)
+    row, column = np.divmod(cell, GRID)
+    centre = -AREA_M + CELL_M * (np.column_stack([column, row]) + 0.5)
+    return np.hstack([centre, _SHAPES[k]])
+
+
+def decode(anchors: FloatArray, codes: FloatArray) -> FloatArray:
+    """Boxes that codes make of anchors.
+
+    ``w = w_a / exp(w_p)``, ``h = h_a / exp(h_p)``, ``x = x_a - w x_p``, ``y = y_a - h y_p``; sin and cos of the sum of
+    both angles, by the addition theorem.
+
+    Parameters
+    ----------
+    anchors : (n, 6) ndarray
+        As `anchor_boxes` returns them.
+    codes : (n, 6) ndarray
+        ``x_p, y_p, w_p, h_p, sin_p, cos_p``; the sizes are cut at +-8.
+
+    Returns
+    -------
+    (n, 6) float64 ndarray
+        x, y, w, h, sin, cos; anchor frame, metres.
+    """
+    codes = np.asarray(codes, dtype=np.float64)
+    size = anchors[:, 2:4] * np.exp(-np.clip(codes[:, 2:4], -MAX_LOG_SIZE, MAX_LOG_SIZE))
+    centre = anchors[:, :2] - size * codes[:, :2]
+    sin_a, cos_a, sin_p, cos_p = anchors[:, 4], anchors[:, 5], codes[:, 4], codes[:, 5]
+    sine, cosine = sin_a * cos_p + cos_a * sin_p, cos_a * cos_p - sin_a * sin_p
+    return np.column_stack([centre, size, sine, cosine])
+
+
+def to_lidar(boxes: FloatArray) -> FloatArray:
+    """Boxes (n, 6) of the anchor frame as x, y, length, width, yaw (n, 5) in the LiDAR's; length is h."""
+    x, y, w, h, sine, cosine = boxes.T
+    norm = np.hypot(sine, cosine)
+    return np.column_stack([-x, y, h * norm, w * norm, np.arctan2(cosine, -sine)])
+
+
+def detections(
+    logits: torch.Tensor, codes: torch.Tensor, score_threshold: float = SCORE_THRESHOLD
+) -> tuple[FloatArray, IntArray]:
+    """Boxes of one ego.
+
+    1. An anchor is a candidate if its softmax score exceeds the threshold t, that is if the difference of its logits
+       exceeds ``ln(t / (1 - t))``; of more than 1000 the best are kept.
+    2. Candidates are decoded, and by descending score each suppresses what overlaps it at an IoU above 0.01.
+
+    Parameters
+    ----------
+    logits : (A, 2) float32 tensor
+        Background and vehicle.
+    codes : (A, 6) float32 tensor
+    score_threshold : float
+        Strictly between 0 and 1.
+
+    Returns
+    -------
+    boxes : (n, 6) float64 ndarray
+        x, y, length, width, yaw, score; LiDAR frame, best first.
+    anchor : (n,) int64 ndarray
+        The anchor that each comes from.
+    """
+    margin = (logits[:, 1] - logits[:, 0]).numpy()
+    floor = math.log(score_threshold / (1 - score_threshold))
+    index: IntArray = np.flatnonzero(margin > floor)
+    if len(index) > MAX_CANDIDATES:
+        index = np.sort(index[np.argpartition(-margin[index], MAX_CANDIDATES)[:MAX_CANDIDATES]])
+    code = codes[torch.from_numpy(index)].numpy()
+    sound = np.isfinite(code).all(axis=1)  # a message of enormous numbers may overflow single precision
+    index, code = index[sound], code[sound]
+    boxes = to_lidar(decode(anchor_boxes(index), code))
+    score = 1 / (1 + np.exp(-margin[index].astype(np.float64)))
+    kept = nms(boxes, margin[index], NMS_IOU)
+    return np.column_stack([boxes, score])[kept], index[kept]

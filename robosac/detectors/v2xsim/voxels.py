@@ -1,0 +1,75 @@
+"""Occupancy grids of the V2X-Sim layout, and their bit-packed form in messages.
+
+A grid is (256, 256, 13): row (+y), column (*minus* x), layer (+z), in the sensor's frame, cells of 0.25 x 0.25 x 0.4 m
+over +-32 m. Layers begin at whole multiples of 0.4 m, so a vehicle's lowest and highest, cut off at -3 m and
+2 m, are thinner than the others.
+"""
+
+from __future__ import annotations
+
+from typing import Any
+
+import numpy as np
+
+from robosac.boxes import FloatArray
+from robosac.detectors.v2xsim.network import GRID, LAYERS
+
+AREA_M = 32.0
+CELL_M = 0.25
+LAYER_M = 0.4
+BOTTOM_M = -3.0
+ROADSIDE_BOTTOM_M = -8.0
+"""Of a roadside unit's grid, whose sensor stands that much higher."""
+DEPTH_M = 5.0
+PACKED_SHAPE = (GRID, GRID * LAYERS // 8)
+
+BoolArray = np.ndarray[tuple[Any, ...], np.dtype[np.bool_]]
+ByteArray = np.ndarray[tuple[Any, ...], np.dtype[np.uint8]]
+
+
+def occupancy(points: FloatArray, bottom_m: float = BOTTOM_M) -> BoolArray:
+    """Which voxels hold a return.
+
+    Parameters
+    ----------
+    points : (P, 3+) ndarray
+        Returns in the sensor's frame, metres.
+    bottom_m : float
+        Lowest height that counts, sensor's frame; the grid reaches 5 m up from there.
+
+    Returns
+    -------
+    (256, 256, 13) bool ndarray
+    """
+    low, high = np.array([-AREA_M, -AREA_M, bottom_m]), np.array([AREA_M, AREA_M, bottom_m + DEPTH_M])
+    xyz = np.asarray(points, dtype=np.float64)[:, :3]
+    xyz = xyz[np.all((xyz > low) & (xyz < high), axis=1)]
+    cell = np.array([CELL_M, CELL_M, LAYER_M])
+    return from_indices((np.floor(xyz / cell) - np.floor(low / cell)).astype(np.int64))
+
+
+def from_indices(indices: np.ndarray[Any, np.dtype[Any]]) -> BoolArray:
+    """The grid of a list of occupied voxels.
+
+    Parameters
+    ----------
+    indices : (K, 3) int ndarray
+        Along +x, +y, +z of the sensor, as V2X-Sim samples list them; each within (256, 256, 13).
+
+    Returns
+    -------
+    (256, 256, 13) bool ndarray
+    """
+    grid = np.zeros((GRID, GRID, LAYERS), dtype=np.bool_)
+    grid[indices[:, 1], GRID - 1 - indices[:, 0], indices[:, 2]] = True
+    return grid
+
+
+def pack(grid: BoolArray) -> ByteArray:
+    """A grid as bits (256, 416): each row's columns and layers in C order, the first in a byte's highest bit."""
+    return np.packbits(grid.reshape(GRID, -1), axis=1)
+
+
+def unpack(packed: ByteArray) -> BoolArray:
+    """The grid of packed bits (256, 416)."""
+    return np.unpackbits(packed, axis=1).reshape(GRID, GRID, LAYERS).astype(np.bool_)
