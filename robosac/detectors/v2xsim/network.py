@@ -174,7 +174,7 @@ class _Join:
     second: _Conv
 
     def __call__(self, below_term: torch.Tensor, skip_term: torch.Tensor) -> torch.Tensor:
-        return self.second(functional.relu(below_term + skip_term)).relu()
+        return self.second((below_term + skip_term).relu_()).relu_()
 
 
 @dataclass(frozen=True)
@@ -254,14 +254,14 @@ class V2XSimNetwork:
         maps = first(context.deepest, first.skip(_channels_last(fused)))
         for join, skip_term in zip(others, context.skips, strict=True):
             maps = join(join.below(_doubled(maps)), skip_term)
-        logits = self._classes[1](self._classes[0](maps).relu())
-        codes = self._codes[1](self._codes[0](maps).relu())
+        logits = self._classes[1](self._classes[0](maps).relu_())
+        codes = self._codes[1](self._codes[0](maps).relu_())
         return _by_anchor(logits, 2), _by_anchor(codes, CODE)
 
 
 def _through(convs: tuple[_Conv, ...], maps: torch.Tensor) -> torch.Tensor:
     for conv in convs:
-        maps = conv(maps).relu()
+        maps = conv(maps).relu_()
     return maps
 
 

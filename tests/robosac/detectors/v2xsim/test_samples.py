@@ -1,0 +1,45 @@
+import re
+import shutil
+from pathlib import Path
+
+import numpy as np
+import pytest
+
+from robosac.scenes.v2xsim import frames
+
+GUIDE = Path(__file__).parents[4] / "docs" / "v2x-sim.md"
+
+
+@pytest.fixture
+def root(tmp_path, parity):
+    """The golden data's agents as samples of one frame."""
+    root = tmp_path / "V2X-Sim-det" / "test"
+    for agent in range(6):
+        folder = root / f"agent{agent}" / "8_0"
+        folder.mkdir(parents=True)
+        sample = {
+            "voxel_indices_0": parity[f"voxel_indices_{agent}"].astype(np.int32),
+            "trans_matrices": parity["trans_matrices"][agent],
+            "allocation_mask": np.zeros((256, 256, 6), dtype=bool),
+            "reg_loss_mask": np.zeros((256, 256, 6, 1), dtype=bool),
+            "reg_target_sparse": np.zeros((0, 1, 6), dtype=np.float32),
+            "gt_max_iou": np.array([[100, 90, 0, 1]]),
+        }
+        np.save(folder / "0.npy", sample)
+    return root
+
+
+def test_samples_make_the_messages_of_the_golden_data(root, v2xsim, team):
+    frame = next(frames(root, 8))
+    for agent, expected in enumerate(team):
+        message = v2xsim.encode_grid(frame.samples[f"agent{agent}"].grid, frame.pose(f"agent{agent}"))
+        np.testing.assert_allclose(message.pose, expected.pose, atol=1e-9)
+        np.testing.assert_array_equal(message.tensors["features"], expected.tensors["features"])
+
+
+def test_the_guides_example_runs(root, weights, tmp_path, monkeypatch, capsys):
+    shutil.copy(weights, tmp_path / "v2x-sim-mean.safetensors")
+    monkeypatch.chdir(tmp_path)
+    (example,) = re.findall(r"```python\n(.*?)```", GUIDE.read_text(), re.DOTALL)
+    exec(compile(example, str(GUIDE), "exec"), {})
+    assert re.fullmatch(r"0 (ego_only|consensus) \(.*\) \d+ boxes of 1\n", capsys.readouterr().out)
