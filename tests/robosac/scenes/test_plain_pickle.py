@@ -122,6 +122,7 @@ def test_an_array_that_is_not_what_it_says_is_refused(lie, complaint, saved):
         (header() + b"\x80\x04K\x01r\xff\xff\xff\x7f.", "memo"),
         (header() + b"\x80\x04" + b"K\x010" * MAX_OPCODES + b"N.", "steps"),
         (header() + b"\x80\x04cnumpy\nload\n.", r"asks for numpy\.load"),
+        (header() + b"\x80\x04cother\nndarray\n.", r"asks for other\.ndarray"),
         (bytes(MAX_FILE_BYTES + 1), "larger than"),
     ],
 )

@@ -175,7 +175,11 @@ def test_weights_files_are_opened_by_what_they_are_for(weights, tmp_path):
     detector = open_weights(weights)
     assert isinstance(detector, V2XSimDetector)
     assert detector.info.name == "v2x-sim-mean"
-    assert isinstance(open_weights(SHIPPED_WEIGHTS), EmbeddedDetector)
+    other = open_weights(
+        rewritten(tmp_path, SHIPPED_WEIGHTS, lambda tensors, recipe: recipe.update(consensus_score=0.5))
+    )
+    assert isinstance(other, EmbeddedDetector)
+    assert other.info.consensus_score == 0.5
     assert available() == ("intersection-mean",)  # no weights ship
     unknown = rewritten(tmp_path, weights, lambda tensors, recipe: recipe.update(detector="nonesuch"))
     with pytest.raises(WeightsError, match="unknown detector, 'nonesuch'"):
