@@ -47,7 +47,9 @@ def main(
 async def _run(report: Path, scenes: int, frames: int, console: Console) -> tuple[FleetOptions, FleetSummary]:
     console.print("Starting the gateway (uvicorn service.app:app) ...")
     async with local_gateway(report / "gateway.log") as url:
-        console.print(f"It is ready at {url}. Six vehicles, one of them a PGD attacker, post 5 Hz of simulated time.")
+        console.print(
+            f"It is ready at {url}. Six vehicles, one of them a PGD attacker, post at 5 Hz of simulated time."
+        )
         options = FleetOptions(
             url=url,
             scenes=scenes,

@@ -1,7 +1,9 @@
+import json
 import re
 from pathlib import Path
 
 from service.settings import Settings
+from tests.service.conftest import serve
 
 ROOT = Path(__file__).parents[1]
 
@@ -13,6 +15,14 @@ def test_every_setting_is_documented_with_its_default():
     for name, shown in rows.items():
         default = getattr(Settings(), name.lower())
         assert str(default).removesuffix(".0") == shown
+
+
+async def test_the_session_of_the_api_page_can_be_opened():
+    text = (ROOT / "docs" / "api.md").read_text()
+    (block,) = re.findall(r"```json\n(.*?)```", text, re.DOTALL)
+    async with serve() as served:
+        response = await served.http.post("/v1/sessions", json=json.loads(block))
+        assert response.status_code == 201, response.text
 
 
 def test_links_between_pages_lead_somewhere():

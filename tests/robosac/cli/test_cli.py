@@ -26,6 +26,19 @@ def test_evaluate_prints_and_writes_the_table(tmp_path):
     assert {row["name"] for row in report["rows"]} >= {"all benign", "ego only", "no defence"}
 
 
+def test_reproduce_runs_what_is_asked_for(tmp_path):
+    result = runner.invoke(app, ["reproduce", "--only", "numerical", "--out", str(tmp_path)])
+    assert result.exit_code == 0, result.output
+    text = (tmp_path / "report.md").read_text()
+    assert "--only numerical" in text
+    assert "## Numerical figures" in text
+    assert (tmp_path / "numerical.png").exists()
+
+
+def test_the_version_is_told():
+    assert runner.invoke(app, ["--version"]).output.strip()
+
+
 @pytest.mark.parametrize(
     ("arguments", "complaint"),
     [
@@ -35,6 +48,8 @@ def test_evaluate_prints_and_writes_the_table(tmp_path):
         (["evaluate", "--attack", "nonesuch"], "known: pgd"),
         (["evaluate", "--attackers", "3", "--collaborators", "3"], "free of 3 attackers"),
         (["evaluate", "--weights", "/nowhere"], "not a readable"),
+        (["reproduce", "--out", "x", "--only", "nonesuch"], "known: derivation"),
+        (["train", "--out", "x", "--adversarial", "nonesuch"], "known: pgd"),
         (["nonesuch"], "No such command"),
     ],
 )
