@@ -1,7 +1,7 @@
 """Messages and frames as msgpack: the one codec, for service and clients alike.
 
 A tensor travels as ``{dtype, shape, data}`` with its bytes little-endian in C order; a pose as 16 numbers, row-major.
-What is read is never trusted: sizes are bounded before anything is allocated, and types, shapes, lengths and
+What is read is never trusted: sizes and entries are bounded while a body is unpacked, and types, shapes, lengths and
 finiteness are checked against what the detector declares. Each refusal is a `WireError` with a stable code and the
 field it is about.
 """

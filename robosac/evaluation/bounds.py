@@ -183,7 +183,7 @@ def evaluate_bounds(
     return table.report(attack.epsilon)
 
 
-class _Memo:
+class DecodedOnce:
     """A prepared frame that decodes each subset once, posing as the detector that prepared it."""
 
     def __init__(self, detector: Detector, ego: Message, teammates: Mapping[str, Message]) -> None:
@@ -192,9 +192,11 @@ class _Memo:
         self._boxes: dict[frozenset[str], FloatArray] = {}
 
     def prepare(self, ego: Message, teammates: Mapping[str, Message]) -> PreparedFrame:  # noqa: ARG002 (always the same)
+        """The frame itself."""
         return self
 
     def detect(self, teammates: Collection[str] = ()) -> FloatArray:
+        """Boxes of a subset, decoded at most once."""
         key = frozenset(teammates)
         if key not in self._boxes:
             self._boxes[key] = self._prepared.detect(teammates)
@@ -218,8 +220,8 @@ class _Table:
         self._magnitudes: list[float] = []
 
     def add(self, frame: EvaluationFrame, seed: Sequence[int]) -> None:
-        benign = _Memo(self._detector, frame.ego, frame.benign)
-        received = _Memo(self._detector, frame.ego, frame.received)
+        benign = DecodedOnce(self._detector, frame.ego, frame.benign)
+        received = DecodedOnce(self._detector, frame.ego, frame.received)
         team = list(frame.benign)
         for subset in combinations(team, self._s):
             self._ap[f"{self._s} benign"].add(benign.detect(subset), frame.truth)
@@ -244,7 +246,7 @@ class _Table:
             else:
                 self._missed.append(verdict is Verdict.CONSENSUS)
 
-    def _sample(self, received: _Memo, frame: EvaluationFrame, name: str, rng: np.random.Generator) -> None:
+    def _sample(self, received: DecodedOnce, frame: EvaluationFrame, name: str, rng: np.random.Generator) -> None:
         result = fuse(received, self._samplers[name], frame.ego, frame.received, rng=rng)
         self._ap[name].add(result.boxes, frame.truth)
         infiltrated = not frame.attackers.isdisjoint(result.accepted)

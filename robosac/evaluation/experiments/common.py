@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable, Collection, Iterator, Mapping, Sequence
+from collections.abc import Callable, Collection, Iterator, Sequence
 from dataclasses import dataclass, field
 from functools import cached_property
 from pathlib import Path
@@ -13,10 +13,10 @@ import numpy as np
 from robosac.attacks import PGD, Attack
 from robosac.boxes import FloatArray
 from robosac.consensus import at_least
-from robosac.detectors import Detector, DetectorInfo, EmbeddedDetector, Message, PreparedFrame
+from robosac.detectors import Detector, EmbeddedDetector
 from robosac.detectors.embedded import ADVERSARIAL_WEIGHTS
 from robosac.evaluation.average_precision import AveragePrecision
-from robosac.evaluation.bounds import EvaluationFrame, evaluation_frames, under_attack
+from robosac.evaluation.bounds import DecodedOnce, EvaluationFrame, evaluation_frames, under_attack
 from robosac.scenes import IntersectionScene
 from robosac.scenes.splits import TEST_SEEDS
 
@@ -72,25 +72,12 @@ class Section:
     pictures: Sequence[str] = ()
 
 
-class Recorded:
-    """A frame in which each subset is decoded once, whoever asks; it stands for detector and prepared frame alike."""
+class Recorded(DecodedOnce):
+    """A test frame in which each subset is decoded once, whoever asks."""
 
     def __init__(self, detector: Detector, frame: EvaluationFrame) -> None:
-        self.info: DetectorInfo = detector.info
+        super().__init__(detector, frame.ego, frame.received)
         self.frame = frame
-        self._prepared = detector.prepare(frame.ego, frame.received)
-        self._boxes: dict[frozenset[str], FloatArray] = {}
-
-    def prepare(self, ego: Message, teammates: Mapping[str, Message]) -> PreparedFrame:  # noqa: ARG002 (always the same)
-        """The frame itself."""
-        return self
-
-    def detect(self, teammates: Collection[str] = ()) -> FloatArray:
-        """Boxes of a subset, decoded at most once."""
-        key = frozenset(teammates)
-        if key not in self._boxes:
-            self._boxes[key] = self._prepared.detect(teammates)
-        return self._boxes[key]
 
     def confident(self, teammates: Collection[str] = ()) -> FloatArray:
         """Boxes of a subset that take part in the consensus test."""
