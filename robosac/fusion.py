@@ -14,10 +14,11 @@ from dataclasses import dataclass, field
 
 import numpy as np
 
-from robosac.boxes import FloatArray, from_world, to_world
+from robosac.boxes import FloatArray
 from robosac.consensus import Verdict, at_least, compare
 from robosac.defenses import Decision, Defense, Hypothesis, Outcome, Reason, Reference, Rejection, Source, State
 from robosac.detectors import Message, PreparedFrame, Preparer
+from robosac.previous import PreviousAnswer
 
 logger = logging.getLogger(__name__)
 
@@ -27,30 +28,6 @@ SAFETY = 1.2
 
 class UnverifiedAnswer(Exception):
     """A defence tried to answer with, or to trust, teammates that were not in consensus, or left one unexplained."""
-
-
-@dataclass(frozen=True)
-class PreviousAnswer:
-    """A collaborative answer, kept as the reference of the next frame (temporal consistency).
-
-    Attributes
-    ----------
-    frame : int
-    pose : (4, 4) ndarray
-        world_from_sensor of the ego then.
-    boxes : (n, 6) ndarray
-        In the ego's frame then.
-    """
-
-    frame: int
-    pose: FloatArray
-    boxes: FloatArray
-
-    def seen_from(self, pose: FloatArray) -> FloatArray:
-        """The boxes in the frame of the ego at ``pose``: moved by the ego's own motion, other vehicles taken to
-        stand.
-        """
-        return from_world(to_world(self.boxes, self.pose), pose)
 
 
 @dataclass(frozen=True)
@@ -196,7 +173,7 @@ class _FrameRun:
             fault=self.fault,
             timings_ms=self.timings,
             state=decision.state,
-            previous=PreviousAnswer(self.frame, self.ego.pose, boxes) if decision.accepted else None,
+            previous=self._to_remember(boxes) if decision.accepted else None,
         )
 
     def _prepare(self, teammates: Mapping[str, Message]) -> PreparedFrame:
@@ -252,7 +229,7 @@ class _FrameRun:
     def _reference(self, prepared: PreparedFrame) -> FloatArray:
         before = self.previous
         if self.defense.reference is Reference.PREVIOUS and before is not None and before.frame == self.frame - 1:
-            return self._confident(before.seen_from(self.ego.pose))
+            return self._confident(before.expected_at(self.ego.pose))
         return self._confident(self._decode(prepared, ()))
 
     def _decode(self, prepared: PreparedFrame, subset: Hypothesis) -> FloatArray:
@@ -263,6 +240,9 @@ class _FrameRun:
             self._spend("hypotheses" if subset else "ego_only", started)
             self.dearest_pass = max(self.dearest_pass, self.clock() - started)
         return self.boxes[subset]
+
+    def _to_remember(self, boxes: FloatArray) -> PreviousAnswer:
+        return PreviousAnswer.of(self.frame, self.ego.pose, boxes, self.previous)
 
     def _confident(self, boxes: FloatArray) -> FloatArray:
         return at_least(boxes, self.detector.info.consensus_score)

@@ -15,7 +15,8 @@ import torch
 from robosac.boxes import pose_matrix
 from robosac.defenses import Defense, State
 from robosac.detectors import Detector, Message, available, load
-from robosac.fusion import FusionResult, PreviousAnswer, fuse
+from robosac.fusion import FusionResult, fuse
+from robosac.previous import PreviousAnswer
 
 T = TypeVar("T")
 

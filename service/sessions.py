@@ -15,7 +15,7 @@ from typing import Any
 from robosac.budget import DomainError
 from robosac.defenses import Defense, Reason
 from robosac.detectors import Detector, Role
-from robosac.fusion import PreviousAnswer
+from robosac.previous import PreviousAnswer
 from service import audit
 from service.engine import Engine
 from service.gathering import Gathering

@@ -30,7 +30,7 @@ class Reference(StrEnum):
     EGO = "ego"
     """The ego's own perception of the frame."""
     PREVIOUS = "previous"
-    """The previous frame's answer, moved with the ego; saves the pass of the ego's own perception."""
+    """The previous frame's answer, moved on by a frame; saves the pass of the ego's own perception."""
 
 
 class Source(StrEnum):

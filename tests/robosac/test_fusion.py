@@ -8,7 +8,8 @@ from robosac.boxes import from_world, pose_matrix
 from robosac.consensus import Verdict
 from robosac.defenses import Decision, Reason, Reference, SampleConsensus, Source, StaticTeam, Undefended
 from robosac.detectors import DetectorInfo, Message
-from robosac.fusion import SAFETY, PreviousAnswer, fuse
+from robosac.fusion import SAFETY, fuse
+from robosac.previous import PreviousAnswer
 
 EGO = Message(pose_matrix(0, 0, 0, 0), {})
 TEAM = dict.fromkeys("abcde", EGO)
@@ -268,14 +269,14 @@ def test_the_previous_answer_saves_the_pass_of_the_ego_alone():
 def test_the_previous_answer_moves_with_the_ego():
     detector = FakeDetector()
     pose = pose_matrix(3.0, -1.0, 0.0, 0.4)
-    before = PreviousAnswer(0, pose, from_world(SEEN, pose))
+    before = PreviousAnswer.of(0, pose, from_world(SEEN, pose))
     assert run(detector, TEMPORAL, frame=1, previous=before).hypotheses[0].jaccard_index == 1.0
-    unmoved = PreviousAnswer(0, EGO.pose, from_world(SEEN, pose))
+    unmoved = PreviousAnswer.of(0, EGO.pose, from_world(SEEN, pose))
     assert run(detector, TEMPORAL, frame=1, previous=unmoved).hypotheses[0].jaccard_index < 0.3
 
 
 def test_after_a_gap_or_without_a_previous_answer_the_ego_is_the_reference():
-    answered = PreviousAnswer(0, EGO.pose, NOISE)
+    answered = PreviousAnswer.of(0, EGO.pose, NOISE)
     for frame, previous in ((2, answered), (0, answered), (1, None)):
         detector = FakeDetector()
         assert run(detector, TEMPORAL, frame=frame, previous=previous).source is Source.CONSENSUS

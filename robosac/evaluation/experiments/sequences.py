@@ -14,7 +14,8 @@ from robosac.consensus import Verdict, at_least, compare
 from robosac.defenses import Defense, Reference, SampleConsensus, StaticTeam, Undefended
 from robosac.evaluation.experiments import paper
 from robosac.evaluation.experiments.common import Context, Recorded, Section, Table, precision
-from robosac.fusion import PreviousAnswer, fuse
+from robosac.fusion import fuse
+from robosac.previous import PreviousAnswer
 
 STEADY_FROM = 5
 BUDGET = 7
@@ -117,13 +118,15 @@ def teams(context: Context) -> Section:
     )
     columns += ("FPS, paper", "FPS, measured", "median cost", "mean cost")
     ego, previous = _false_alarms(context)
-    alarms = [("ego", round(ego, 4)), ("previous answer, moved with the ego", round(previous, 4))]
+    alarms = [("ego", round(ego, 4)), ("previous answer", round(previous, 4))]
     return Section(
         "Static team, dynamic team, temporal consistency",
         f"{context.scale.sequences} sequences of {context.scale.sequence_frames} frames at 5 Hz, one PGD attacker of "
         f"five, gone through {context.scale.repeats} times. FPS are measured (one CPU thread, fusion alone); those of "
         f"the paper are computed from constants. Costs are of frames from the {STEADY_FROM + 1}th on, over those of an "
-        "undefended fused frame timed in the same run.",
+        "undefended fused frame timed in the same run. The previous answer is compared with after its boxes were moved "
+        f"on by a frame; it refuses {previous:.1%} of the attacker-free hypotheses, the ego's own perception "
+        f"{ego:.1%}.",
         [
             Table("teams", "Sessions with and without memory", columns, rows),
             Table(
@@ -138,9 +141,7 @@ def _ratio(summary: Callable[[list[float]], float], ours: list[float], baseline:
 
 
 def _false_alarms(context: Context) -> tuple[float, float]:
-    """Rates against the ego and against the previous answer (the largest honest fusion of three of the frame
-    before).
-    """
+    """Rates against the ego and against the previous answer (of three random honest teammates in each frame)."""
     by_ego, by_previous = [], []
     for number in range(context.scale.sequences):
         before: PreviousAnswer | None = None
@@ -148,11 +149,11 @@ def _false_alarms(context: Context) -> tuple[float, float]:
             honest = sorted(set(recorded.frame.received) - recorded.frame.attackers)
             subsets = list(combinations(honest, COLLABORATORS))
             if before is not None:
-                moved = at_least(before.seen_from(recorded.frame.ego.pose), recorded.info.consensus_score)
+                moved = at_least(before.expected_at(recorded.frame.ego.pose), recorded.info.consensus_score)
                 by_ego += [_refused(recorded, recorded.confident(), subset) for subset in subsets]
                 by_previous += [_refused(recorded, moved, subset) for subset in subsets]
             chosen = subsets[int(context.rng(11, number, index).integers(len(subsets)))]
-            before = PreviousAnswer(index, recorded.frame.ego.pose, recorded.detect(chosen))
+            before = PreviousAnswer.of(index, recorded.frame.ego.pose, recorded.detect(chosen), before)
     return float(np.mean(by_ego)), float(np.mean(by_previous))
 
 

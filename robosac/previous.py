@@ -1,0 +1,65 @@
+"""The previous answer as the reference of the next frame (temporal consistency)."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+
+import numpy as np
+from scipy.optimize import linear_sum_assignment
+from scipy.spatial.distance import cdist
+
+from robosac.boxes import FloatArray, from_world, to_world
+
+FOLLOWED_M = 3.0
+"""A vehicle is followed from one frame to the next if it moved less than this: 15 m/s at 5 Hz."""
+
+
+@dataclass(frozen=True)
+class PreviousAnswer:
+    """A collaborative answer, kept as the reference of the next frame.
+
+    Attributes
+    ----------
+    frame : int
+    boxes : (n, 6) float64 ndarray
+        x, y, length, width, yaw, score; world frame.
+    motion : (n, 2) float64 ndarray
+        How far each box moved since the frame before, metres; 0 where that is not known.
+    """
+
+    frame: int
+    boxes: FloatArray
+    motion: FloatArray
+
+    @classmethod
+    def of(
+        cls, frame: int, pose: FloatArray, boxes: FloatArray, before: PreviousAnswer | None = None
+    ) -> PreviousAnswer:
+        """Keep the answer to a frame; motion is known if the answer before it is of the frame before.
+
+        Boxes of the two answers are the same vehicle where they match one to one with the least total distance, up to
+        `FOLLOWED_M` each.
+
+        Parameters
+        ----------
+        frame : int
+        pose : (4, 4) ndarray
+            world_from_sensor of the ego.
+        boxes : (n, 6) ndarray
+            In the ego's frame.
+        before : PreviousAnswer, optional
+        """
+        placed = to_world(boxes, pose)
+        motion = np.zeros((len(placed), 2))
+        if before is not None and before.frame == frame - 1:
+            distance = cdist(placed[:, :2], before.boxes[:, :2])
+            now, then = linear_sum_assignment(np.minimum(distance, FOLLOWED_M))
+            same = distance[now, then] < FOLLOWED_M
+            motion[now[same]] = placed[now[same], :2] - before.boxes[then[same], :2]
+        return cls(frame, placed, motion)
+
+    def expected_at(self, pose: FloatArray) -> FloatArray:
+        """The boxes (n, 6) one frame later, in the frame of the ego at ``pose``: each moved as it moved before."""
+        moved = self.boxes.copy()
+        moved[:, :2] += self.motion
+        return from_world(moved, pose)
