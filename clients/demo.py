@@ -15,6 +15,7 @@ from clients.errors import GatewayError
 from clients.fleet import FleetOptions, close_run, run_fleet
 from clients.local_gateway import local_gateway
 from clients.summary import FleetSummary
+from robosac.detectors import DEFAULT_DETECTOR
 
 CLEAN_SHARE = 0.95
 
@@ -58,6 +59,7 @@ async def _run(report: Path, scenes: int, frames: int, console: Console) -> tupl
             egos=1,
             attackers=1,
             attack="pgd",
+            detector=DEFAULT_DETECTOR,
             defense={"kind": "sample_consensus", "attacker_ratio": 0.2, "sampling_budget": 7, "collaborators": 3},
             seed=0,
             real_time=False,

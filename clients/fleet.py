@@ -21,8 +21,9 @@ from clients.client import FrameAnswer, GatewayClient, OpenedSession
 from clients.errors import GatewayError
 from clients.simulation import EgoFrame, Fleet, make_folder
 from clients.summary import FleetSummary
+from robosac import attacks, detectors
 from robosac.attacks import ATTACKS
-from robosac.detectors import load
+from robosac.detectors import DEFAULT_DETECTOR
 from robosac.scenes import FRAME_PERIOD_S, IntersectionScene
 
 RECENT = 12
@@ -40,7 +41,8 @@ class FleetOptions:
     first_scene : int
         Seed of the first scene; the others follow.
     egos, attackers : int
-    attack : str
+    attack, detector : str
+        As `robosac.attacks.load` and `robosac.detectors.load` take them.
     defense : mapping
         The ``defense`` of the sessions.
     seed : int
@@ -58,6 +60,7 @@ class FleetOptions:
     egos: int
     attackers: int
     attack: str
+    detector: str
     defense: dict[str, Any]
     seed: int
     real_time: bool
@@ -144,14 +147,15 @@ async def run_fleet(options: FleetOptions, console: Console) -> FleetSummary:
     ------
     clients.errors.GatewayError
         If any message or frame is not accepted as it should be.
+    ValueError
+        If there is no such attack or detector, or the gateway's has other weights.
     """
-    detector = load()
+    detector, attack = detectors.load(options.detector), attacks.load(options.attack)
     summary = FleetSummary(detector)
     screen = _Screen(console, options.scenes * options.frames * options.egos)
     with screen.live:
         for seed in range(options.first_scene, options.first_scene + options.scenes):
             scene = IntersectionScene(seed)
-            attack = ATTACKS[options.attack]()
             fleet = Fleet(scene, detector, options.egos, options.attackers, attack, options.seed)
             await _run_scene(options, fleet, summary, screen)
     return summary
@@ -162,8 +166,10 @@ async def _run_scene(options: FleetOptions, fleet: Fleet, summary: FleetSummary,
     try:
         for ego_id in fleet.egos:
             session = await vehicles[ego_id].gateway.open_session(
-                ego_id, fleet.teammates(ego_id), defense=options.defense
+                ego_id, fleet.teammates(ego_id), detector=fleet.detector.info.name, defense=options.defense
             )
+            if session.detector["weights_digest"] != fleet.detector.info.weights_digest:
+                raise ValueError(f"the gateway's {fleet.detector.info.name} has other weights than the fleet's")
             for vehicle in vehicles.values():
                 vehicle.enrol(ego_id, session)
         start = time.monotonic()
@@ -195,7 +201,10 @@ def main(
     first_scene: Annotated[int, typer.Option(min=0, help="Seed of the first scene; 0 to 999 are test scenes.")] = 0,
     egos: Annotated[int, typer.Option(min=1, help="Vehicles that ask; the first cars.")] = 1,
     attackers: Annotated[int, typer.Option(min=0, help="Vehicles that attack.")] = 1,
-    attack: Annotated[str, typer.Option(help=f"One of {', '.join(ATTACKS)}.")] = "pgd",
+    attack: Annotated[str, typer.Option(help=f"One of {', '.join(ATTACKS)}, or module:callable.")] = "pgd",
+    detector: Annotated[
+        str, typer.Option(help="The vehicles' own copy: a name, a weights file, or module:callable.")
+    ] = DEFAULT_DETECTOR,
     defense: Annotated[str, typer.Option(help="Kind of defence.")] = "sample_consensus",
     attacker_ratio: Annotated[float | None, typer.Option(help="Ratio the defence assumes.")] = None,
     sampling_budget: Annotated[int | None, typer.Option(help="Most hypotheses a frame.")] = None,
@@ -209,8 +218,11 @@ def main(
     console = Console()
     if report is not None:
         make_folder(report, "--report")
-    if attack not in ATTACKS:
-        raise typer.BadParameter(f"unknown attack {attack!r}; known: {', '.join(ATTACKS)}", param_hint="--attack")
+    for option, load, value in (("--attack", attacks.load, attack), ("--detector", detectors.load, detector)):
+        try:
+            load(value)
+        except ValueError as error:
+            raise typer.BadParameter(str(error), param_hint=option) from error
     chosen = {"attacker_ratio": attacker_ratio, "sampling_budget": sampling_budget, "collaborators": collaborators}
     options = FleetOptions(
         url=url,
@@ -220,6 +232,7 @@ def main(
         egos=egos,
         attackers=attackers,
         attack=attack,
+        detector=detector,
         defense={"kind": defense, **{name: value for name, value in chosen.items() if value is not None}},
         seed=seed,
         real_time=real_time,

@@ -12,6 +12,7 @@ import typer
 from robosac.attacks import Attack
 from robosac.boxes import FloatArray
 from robosac.detectors import Detector, Message
+from robosac.evaluation.frames import encode_all, under_attack
 from robosac.scenes import IntersectionScene, SceneFrame
 
 
@@ -96,7 +97,7 @@ class Fleet:
             )
         self.scene = scene
         self.egos = scene.agents[:egos]
-        self._detector = detector
+        self.detector = detector
         self._attack = attack
         self._rng = np.random.default_rng([seed, scene.seed])
         chosen = self._rng.choice(len(others), attackers, replace=False)
@@ -109,18 +110,20 @@ class Fleet:
     def sense(self, index: int) -> list[EgoFrame]:
         """Frame ``index`` from the side of each ego."""
         frame = self.scene.frame(index)
-        messages = {name: self._detector.encode(view.points, view.pose) for name, view in frame.views.items()}
+        messages = encode_all(self.detector, frame)
         return [self._for_ego(ego_id, frame, messages) for ego_id in self.egos]
 
     def _for_ego(self, ego_id: str, frame: SceneFrame, messages: Mapping[str, Message]) -> EgoFrame:
-        benign = {name: messages[name] for name in self.teammates(ego_id)}
-        surface = self._detector.attack_surface(messages[ego_id], benign)
-        adversarial = self._attack.run(surface, self.attackers, self._rng)
-        sent = {
-            name: self._detector.perturbed(message, adversarial[name]) if name in adversarial else message
-            for name, message in benign.items()
-        }
-        view = frame.views[ego_id]
+        met = under_attack(
+            self.detector, messages, frame.truth(ego_id), ego_id, self.attackers, self._attack, self._rng
+        )
         return EgoFrame(
-            self.scene.seed, ego_id, self.attackers, benign, sent, messages[ego_id], frame.truth(ego_id), view.points
+            self.scene.seed,
+            ego_id,
+            self.attackers,
+            met.benign,
+            met.received,
+            met.ego,
+            met.truth,
+            frame.views[ego_id].points,
         )

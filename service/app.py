@@ -37,7 +37,7 @@ def create_app(settings: Settings | None = None, new_seed: Callable[[], int] | N
         knows the seed knows which subsets will be sampled.
     """
     settings = settings or Settings()
-    engine = Engine(settings.torch_threads)
+    engine = Engine(settings.torch_threads, settings.extra_detectors)
     metrics = Metrics()
     sessions = Sessions(settings, MemoryStore(), engine, metrics)
     seeding = {} if new_seed is None else {"new_seed": new_seed}

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import asyncio
 import time
-from collections.abc import Callable, Mapping
+from collections.abc import Callable, Mapping, Sequence
 from concurrent.futures import ThreadPoolExecutor
 from functools import partial
 from typing import TypeVar
@@ -28,9 +28,12 @@ class Engine:
     ----------
     threads : int
         Torch threads of one pass.
+    extra_detectors : sequence of str
+        Beside those that ship, or in the place of one of the same name: weights files or ``module:callable``.
     """
 
-    def __init__(self, threads: int) -> None:
+    def __init__(self, threads: int, extra_detectors: Sequence[str] = ()) -> None:
+        self._extra = extra_detectors
         self._executor = ThreadPoolExecutor(1, "fusion", initializer=torch.set_num_threads, initargs=(threads,))
         self._detectors: dict[str, Detector] = {}
         self.ready = False
@@ -41,8 +44,19 @@ class Engine:
         return self._detectors
 
     async def start(self) -> None:
-        """Load every detector and run one frame through each, so that the first answer is as fast as the next."""
-        self._detectors = await self._submit(lambda: {name: load(name) for name in available()})
+        """Load every detector and run one frame through each, so that the first answer is as fast as the next.
+
+        Raises
+        ------
+        ValueError
+            If a detector cannot be loaded, or two extra ones have the same name.
+        """
+        extra = [await self._submit(partial(load, detector)) for detector in self._extra]
+        own = {detector.info.name: detector for detector in extra}
+        if len(own) < len(extra):
+            raise ValueError(f"two of the extra detectors have the same name: {[d.info.name for d in extra]}")
+        shipped = {name: await self._submit(partial(load, name)) for name in available() if name not in own}
+        self._detectors = shipped | own
         for detector in self._detectors.values():
             await self._submit(partial(_warm_up, detector))
         self.ready = True

@@ -2,8 +2,10 @@
 
 from __future__ import annotations
 
-from pydantic import Field
-from pydantic_settings import BaseSettings, SettingsConfigDict
+from typing import Annotated
+
+from pydantic import Field, field_validator
+from pydantic_settings import BaseSettings, NoDecode, SettingsConfigDict
 
 from robosac.detectors import DEFAULT_DETECTOR
 
@@ -14,6 +16,9 @@ class Settings(BaseSettings):
     model_config = SettingsConfigDict(env_prefix="ROBOSAC_", frozen=True)
 
     detector: str = Field(DEFAULT_DETECTOR, description="Detector of sessions that name none.")
+    extra_detectors: Annotated[tuple[str, ...], NoDecode] = Field(
+        (), description="Detectors beside those that ship: weights files or module:callable, separated by commas."
+    )
     latency_budget_ms: float = Field(
         200.0, gt=0, le=60_000, description="Budget of sessions that name none: from a frame's last byte to its answer."
     )
@@ -31,3 +36,8 @@ class Settings(BaseSettings):
     )
     session_idle_s: float = Field(3600.0, gt=0, description="A session unused for longer is ended.")
     torch_threads: int = Field(1, ge=1, description="Threads of one detector pass; at this size one is fastest.")
+
+    @field_validator("extra_detectors", mode="before")
+    @classmethod
+    def _split(cls, value: object) -> object:
+        return tuple(part.strip() for part in value.split(",") if part.strip()) if isinstance(value, str) else value

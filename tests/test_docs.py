@@ -2,6 +2,14 @@ import json
 import re
 from pathlib import Path
 
+import numpy as np
+import pytest
+from typer.testing import CliRunner
+
+import robosac
+from clients.simulation import Fleet
+from robosac import attacks, detectors
+from robosac.cli import app
 from service.settings import Settings
 from tests.service.conftest import serve
 
@@ -14,7 +22,7 @@ def test_every_setting_is_documented_with_its_default():
     assert {name.lower() for name in rows} == set(Settings.model_fields)
     for name, shown in rows.items():
         default = getattr(Settings(), name.lower())
-        assert str(default).removesuffix(".0") == shown
+        assert str(default or "none").removesuffix(".0") == shown
 
 
 async def test_the_session_of_the_api_page_can_be_opened():
@@ -38,3 +46,37 @@ def test_every_problem_and_reason_is_documented():
     slugs = set(re.findall(r'(?:Problem\(\s*\d{3},\s*|WireError\(\s*)"([a-z-]+)"', code))
     assert len(slugs) > 15
     assert not {slug for slug in slugs if f"`{slug}`" not in text}
+
+
+@pytest.fixture
+def examples(tmp_path, monkeypatch):
+    """The whole examples of the pages on one's own detector and attack, importable."""
+    for name in ("detector", "attack"):
+        (block,) = re.findall(r"```python\n(.*?)```", (ROOT / "docs" / f"own-{name}.md").read_text(), re.DOTALL)
+        (tmp_path / f"my_{name}.py").write_text(block)
+    monkeypatch.syspath_prepend(tmp_path)
+
+
+@pytest.mark.usefixtures("examples")
+def test_the_examples_of_the_pages_can_be_evaluated():
+    common = ["evaluate", "--scenes", "1", "--frames", "1"]
+    for option in (["--detector", "my_detector:build"], ["--attack", "my_attack:Suppress"]):
+        result = CliRunner().invoke(app, [*common, *option])
+        assert result.exit_code == 0, result.output
+
+
+@pytest.mark.usefixtures("examples")
+async def test_the_gateway_serves_the_example_detector_and_fuses_as_the_library_does():
+    detector, attack = detectors.load("my_detector:build"), attacks.load("my_attack:Suppress")
+    scene = robosac.IntersectionScene(3)
+    (frame,) = Fleet(scene, detector, 1, 1, attack, seed=0).sense(0)
+    async with serve(lambda: 5, extra_detectors="my_detector:build") as served:
+        listed = (await served.http.get("/v1/detectors")).json()["detectors"]
+        assert [entry["name"] for entry in listed] == ["intersection-mean", "occupancy-max"]
+        session = await served.open(detector="occupancy-max")
+        answer = await served.ego(session).post_frame(0, frame.message, frame.sent)
+    rng = np.random.default_rng(5)
+    expected = robosac.fuse(detector, robosac.SampleConsensus(), frame.message, frame.sent, rng=rng)
+    assert answer.accepted == expected.accepted
+    np.testing.assert_allclose(answer.boxes, expected.boxes)
+    assert len(expected.boxes) > 5

@@ -3,64 +3,77 @@
 from __future__ import annotations
 
 import json
+from collections.abc import Iterator
+from contextlib import contextmanager
 from dataclasses import asdict
 from pathlib import Path
 from typing import Annotated
 
+import numpy as np
 import torch
 import typer
 from rich.console import Console
 from rich.progress import Progress
 from rich.table import Table
 
-from robosac.attacks import ATTACKS
-from robosac.detectors import EmbeddedDetector, WeightsError
-from robosac.detectors.embedded import SHIPPED_WEIGHTS
-from robosac.evaluation import BoundsReport, evaluate_bounds
+from robosac import attacks, detectors
+from robosac.attacks import ATTACKS, Attack
+from robosac.detectors import DEFAULT_DETECTOR, Detector, V2XSimDetector
+from robosac.evaluation import BoundsReport, NoFrames, evaluate_bounds
+from robosac.evaluation.bounds import TEAM_SIZE
+from robosac.evaluation.frames import EvaluationFrame, evaluation_frames, v2xsim_frames
+from robosac.scenes import FRAMES_PER_SECOND, v2xsim
 from robosac.scenes.splits import TEST_SEEDS
+from robosac.scenes.v2xsim import SampleError
 
 
 def run(
-    scenes: Annotated[int, typer.Option(min=1, max=len(TEST_SEEDS), help="Test scenes, from seed 0 on.")] = 40,
+    scenes: Annotated[int, typer.Option(min=1, help="Test scenes, the first so many.")] = 40,
     frames: Annotated[int, typer.Option(min=1, help="Frames of each, 1 s apart.")] = 5,
     attackers: Annotated[int, typer.Option(min=0, max=5, help="Attackers among the five teammates.")] = 1,
-    attack: Annotated[str, typer.Option(help=f"One of {', '.join(ATTACKS)}.")] = "pgd",
+    attack: Annotated[str, typer.Option(help=f"One of {', '.join(ATTACKS)}, or module:callable.")] = "pgd",
     collaborators: Annotated[int, typer.Option(min=1, max=5, help="Teammates in a hypothesis.")] = 3,
-    seed: Annotated[int, typer.Option(help="Of everything random.")] = 0,
-    weights: Annotated[Path, typer.Option(help="Weights of the embedded detector.")] = SHIPPED_WEIGHTS,
+    seed: Annotated[int, typer.Option(min=0, help="Of everything random.")] = 0,
+    detector: Annotated[
+        str,
+        typer.Option("--detector", "--weights", help="A detector's name, its weights file, or module:callable."),
+    ] = DEFAULT_DETECTOR,
+    data: Annotated[
+        Path | None, typer.Option(help="Folder of V2X-Sim samples (agent0, agent1, ...) instead of synthetic scenes.")
+    ] = None,
     out: Annotated[Path | None, typer.Option(help="Folder for bounds.json.")] = None,
 ) -> None:
     """Average precision of Algorithm 1 between its bounds, and the error rates of the consensus test."""
     torch.set_num_threads(1)
     console = Console()
-    if attack not in ATTACKS:
-        raise typer.BadParameter(f"unknown attack {attack!r}; known: {', '.join(ATTACKS)}", param_hint="--attack")
-    if attackers + collaborators > 5:
+    if attackers + collaborators > TEAM_SIZE:
         raise typer.BadParameter(
             f"no {collaborators} of five teammates can be free of {attackers} attackers", param_hint="--collaborators"
         )
-    try:
+    with _blaming("--out", OSError):
         if out is not None:
             out.mkdir(parents=True, exist_ok=True)
-    except OSError as error:
-        raise typer.BadParameter(str(error), param_hint="--out") from error
-    try:
-        detector = EmbeddedDetector(weights)
-    except WeightsError as error:
-        raise typer.BadParameter(str(error), param_hint="--weights") from error
-    with Progress(console=console) as progress:
-        task = progress.add_task("frames", total=scenes * frames)
+    with _blaming("--attack", ValueError):
+        chosen_attack = attacks.load(attack)
+    with _blaming("--weights", ValueError):
+        chosen = detectors.load(detector)
+    rng = np.random.default_rng([seed, 0])
+    if data is None:
+        total, source = _synthetic(chosen, scenes, frames, chosen_attack, attackers, rng)
+    else:
+        total, source = _v2xsim(chosen, data, scenes, frames, chosen_attack, attackers, collaborators, rng)
+    with _blaming("--data", SampleError, NoFrames), Progress(console=console) as progress:
+        task = progress.add_task("frames", total=total)
         report = evaluate_bounds(
-            detector,
-            ATTACKS[attack](),
-            seeds=TEST_SEEDS[:scenes],
-            frames_per_scene=frames,
+            chosen,
+            source,
+            chosen_attack,
             attackers=attackers,
             collaborators=collaborators,
             seed=seed,
             tick=lambda: progress.advance(task),
         )
-    _print(console, report, attack, attackers)
+    _print(console, report, chosen_attack, attackers)
     if out is not None:
         settings = {
             "scenes": scenes,
@@ -69,16 +82,62 @@ def run(
             "attack": attack,
             "collaborators": collaborators,
             "seed": seed,
-            "weights_digest": detector.info.weights_digest,
+            "detector": chosen.info.name,
+            "weights_digest": chosen.info.weights_digest,
+            "data": "synthetic" if data is None else "v2x-sim",
         }
         text = json.dumps({"settings": settings, **asdict(report)}, indent=2, allow_nan=False)
         (out / "bounds.json").write_text(text + "\n")
         console.print(f"Written: {out / 'bounds.json'}")
 
 
-def _print(console: Console, report: BoundsReport, attack: str, attackers: int) -> None:
+@contextmanager
+def _blaming(option: str, *errors: type[Exception]) -> Iterator[None]:
+    try:
+        yield
+    except errors as error:
+        raise typer.BadParameter(str(error), param_hint=option) from error
+
+
+_Source = tuple[int, Iterator[EvaluationFrame | None]]
+
+
+def _synthetic(
+    detector: Detector, scenes: int, frames: int, attack: Attack, attackers: int, rng: np.random.Generator
+) -> _Source:
+    """How many frames, and the frames."""
+    if scenes > len(TEST_SEEDS):
+        raise typer.BadParameter(f"there are {len(TEST_SEEDS)} test scenes", param_hint="--scenes")
+    return scenes * frames, evaluation_frames(detector, TEST_SEEDS[:scenes], frames, attack, attackers, rng)
+
+
+def _v2xsim(
+    detector: Detector,
+    root: Path,
+    scenes: int,
+    frames: int,
+    attack: Attack,
+    attackers: int,
+    collaborators: int,
+    rng: np.random.Generator,
+) -> _Source:
+    if not isinstance(detector, V2XSimDetector):
+        raise typer.BadParameter(
+            f"V2X-Sim samples need a V2X-Sim detector, not {detector.info.name}: give the weights that "
+            "robosac convert-checkpoint wrote",
+            param_hint="--weights",
+        )
+    listed = v2xsim.scenes(root)
+    if not listed:
+        raise typer.BadParameter(f"no folder agent*/<scene>_<frame> in {root}", param_hint="--data")
+    chosen = list(listed)[:scenes]
+    total = sum(len(listed[scene][::FRAMES_PER_SECOND][:frames]) for scene in chosen)
+    return total, v2xsim_frames(detector, root, chosen, frames, attack, attackers, collaborators, rng)
+
+
+def _print(console: Console, report: BoundsReport, attack: Attack, attackers: int) -> None:
     table = Table(
-        title=f"{report.frames} test frames, {attackers} {attack.upper()} attacker(s) of five teammates",
+        title=f"{report.frames} test frames, {attackers} {attack.name.upper()} attacker(s) of five teammates",
         title_justify="left",
     )
     for heading in ("perception", "AP50", "AP70", "steps", "success", "infiltrated"):
@@ -95,13 +154,16 @@ def _print(console: Console, report: BoundsReport, attack: str, attackers: int) 
             "" if row.infiltrated is None else f"{row.infiltrated:.3f}",
         )
     console.print(table)
+    if report.skipped:
+        console.print(f"Skipped {report.skipped} frames with too few teammates.")
     for rate, error, count, kind in (
         (report.false_alarm_rate, "false alarms", report.benign_hypotheses, "attacker-free"),
         (report.miss_rate, "misses", report.attacked_hypotheses, "attacked"),
     ):
         if rate is not None:
             console.print(f"Consensus test: {rate:.2%} {error} ({count} {kind} hypotheses).")
-    console.print(
-        f"The perturbation's bound is {report.perturbation_to_feature_ratio:.2f} times the 95th percentile of the "
-        "magnitude of benign messages; it is added to the message, before the ego warps it."
-    )
+    if report.perturbation_to_feature_ratio is not None:
+        console.print(
+            f"The perturbation's bound is {report.perturbation_to_feature_ratio:.2f} times the 95th percentile of the "
+            "magnitude of benign messages; it is added to the message, before the ego warps it."
+        )

@@ -5,6 +5,7 @@ from __future__ import annotations
 from collections.abc import Callable
 from pathlib import Path
 
+from robosac import references
 from robosac.detectors.base import (
     AttackSurface,
     Detector,
@@ -25,31 +26,42 @@ DEFAULT_DETECTOR = EMBEDDED
 
 
 def available() -> tuple[str, ...]:
-    """Names that `load` knows."""
+    """Names of the detectors whose weights ship."""
     return tuple(_REGISTRY)
 
 
-def load(name: str = DEFAULT_DETECTOR) -> Detector:
-    """Load a detector with its shipped weights.
+def load(detector: str = DEFAULT_DETECTOR) -> Detector:
+    """Load a detector.
 
-    Raises
-    ------
-    KeyError
-        If there is no detector of that name.
-    WeightsError
-        If its weights cannot be used.
-    """
-    return _REGISTRY[name]()
-
-
-def open_weights(path: Path) -> Detector:
-    """The detector that a weights file is for, with those weights.
+    Parameters
+    ----------
+    detector : str
+        A name of `available`, the path of a weights file, or ``module:callable``, where the callable takes no arguments
+        and returns a detector of the user's own.
 
     Raises
     ------
     WeightsError
-        If the file cannot be used, or is for a detector that is not known.
+        If the weights cannot be used.
+    ValueError
+        If there is no such detector.
     """
+    if detector in _REGISTRY:
+        return _REGISTRY[detector]()
+    if references.is_reference(detector):
+        made = references.make(detector)
+        if not isinstance(made, Detector):
+            raise ValueError(f"{detector} made no detector but {made!r:.200}")
+        return made
+    if not Path(detector).exists():
+        raise ValueError(
+            f"no detector {detector!r}: give one of {', '.join(available())}, a weights file, or module:callable"
+        )
+    return _open_weights(Path(detector))
+
+
+def _open_weights(path: Path) -> Detector:
+    """The detector that a weights file is for, with those weights."""
     _, recipe = read_weights(path)
     name = str(recipe.get("detector"))
     if name == EMBEDDED:
@@ -74,5 +86,4 @@ __all__ = [
     "WeightsError",
     "available",
     "load",
-    "open_weights",
 ]

@@ -9,7 +9,7 @@ from __future__ import annotations
 
 from collections.abc import Collection, Mapping
 from dataclasses import dataclass
-from typing import Any, Literal, Protocol
+from typing import Any, Literal, Protocol, runtime_checkable
 
 import numpy as np
 import torch
@@ -125,6 +125,7 @@ class Preparer(Protocol):
         ...
 
 
+@runtime_checkable
 class Detector(Preparer, Protocol):
     """A collaborative detector. Implementations hold no state but their weights, and may be used from one thread at
     a time.

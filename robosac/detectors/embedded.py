@@ -29,7 +29,7 @@ _TENSOR = "features"
 _SPEC = TensorSpec("float16", (FEATURES, MAP, MAP))
 
 
-class WeightsError(Exception):
+class WeightsError(ValueError):
     """A weights file is missing, damaged or not one of this detector."""
 
 

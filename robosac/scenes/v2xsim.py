@@ -24,6 +24,7 @@ from robosac.detectors.v2xsim.voxels import BoolArray, from_indices
 from robosac.scenes.plain_pickle import PlainArray, UnsafePickle, load_npy
 
 AGENTS = 6
+ROADSIDE_UNIT = "agent0"
 _VOXELS = "voxel_indices_0"
 _MAPS = (GRID, GRID, ANCHORS)
 _FOLDER = re.compile(r"(\d+)_(\d+)")
@@ -94,14 +95,34 @@ class V2XSimFrame:
         return self.samples[ego].truth
 
 
-def frames(root: Path, scene: int) -> Iterator[V2XSimFrame]:
-    """All frames of a scene, in order, that at least one agent is present in.
+def scenes(root: Path) -> dict[int, list[int]]:
+    """The scenes in a folder, and the indices of the frames of each, in order.
 
     Parameters
     ----------
     root : Path
         The folder that holds ``agent0`` to ``agent5``; not all need to exist.
+    """
+    found = [_FOLDER.fullmatch(folder.name) for folder in root.glob(f"agent[0-{AGENTS - 1}]/*_*")]
+    listed: dict[int, set[int]] = {}
+    for match in found:
+        if match:
+            listed.setdefault(int(match[1]), set()).add(int(match[2]))
+    return {scene: sorted(listed[scene]) for scene in sorted(listed)}
+
+
+def frames(root: Path, scene: int, count: int | None = None, stride: int = 1) -> Iterator[V2XSimFrame]:
+    """Frames of a scene, in order, that at least one agent is present in.
+
+    Parameters
+    ----------
+    root : Path
+        As for `scenes`.
     scene : int
+    count : int, optional
+        At most so many, by default all.
+    stride : int
+        Every so many of the frames listed.
 
     Raises
     ------
@@ -110,11 +131,10 @@ def frames(root: Path, scene: int) -> Iterator[V2XSimFrame]:
     FileNotFoundError
         If there is no frame of that scene.
     """
-    found = [_FOLDER.fullmatch(folder.name) for folder in root.glob(f"agent[0-{AGENTS - 1}]/{scene}_*")]
-    indices = sorted({int(match[2]) for match in found if match})
-    if not indices:
+    listed = scenes(root)
+    if scene not in listed:
         raise FileNotFoundError(f"no frame of scene {scene} in {root}")
-    for index in indices:
+    for index in listed[scene][::stride][:count]:
         samples = {}
         for agent in range(AGENTS):
             path = root / f"agent{agent}" / f"{scene}_{index}" / "0.npy"

@@ -15,7 +15,7 @@ from robosac.consensus import DEFAULT_THRESHOLD, at_least, compare
 from robosac.detectors import EmbeddedDetector
 from robosac.detectors.network import MeanFusionNetwork
 from robosac.evaluation.average_precision import AveragePrecision
-from robosac.evaluation.bounds import EvaluationFrame, evaluation_frames
+from robosac.evaluation.frames import EvaluationFrame, evaluation_frames
 from robosac.scenes.splits import VALIDATION_SEEDS
 
 GAINS = (1.0, 0.7, 0.5, 0.4, 0.35, 0.3, 0.25, 0.2)

@@ -13,12 +13,15 @@ from clients.fleet import FleetOptions, close_run, main, run_fleet
 from clients.local_gateway import local_gateway
 from clients.simulation import Fleet
 from robosac.attacks import PGD
+from robosac.detectors import DEFAULT_DETECTOR
+from robosac.detectors.embedded import ADVERSARIAL_WEIGHTS
 from robosac.scenes import IntersectionScene
 
 
 def options(url, **changes):
     values = {
-        "url": url, "scenes": 1, "frames": 3, "first_scene": 3, "egos": 1, "attackers": 1, "attack": "pgd", "seed": 0,
+        "url": url, "scenes": 1, "frames": 3, "first_scene": 3, "egos": 1, "attackers": 1, "attack": "pgd",
+        "detector": DEFAULT_DETECTOR, "seed": 0,
         "defense": {"kind": "sample_consensus", "sampling_budget": 7, "collaborators": 3},
         "real_time": False, "report": None,
     }  # fmt: skip
@@ -82,10 +85,17 @@ def test_a_fleet_without_a_gateway_says_so():
     assert "The fleet stopped" in result.output
 
 
-def test_an_unknown_attack_is_explained():
-    result = CliRunner().invoke(command(main), ["--attack", "nonesuch"])
+@pytest.mark.parametrize(("option", "complaint"), [("--attack", "known: pgd"), ("--detector", "give one of")])
+def test_an_unknown_attack_or_detector_is_explained(option, complaint):
+    result = CliRunner().invoke(command(main), [option, "nonesuch"])
     assert result.exit_code == 2
-    assert "known: pgd" in result.output
+    assert complaint in result.output
+
+
+async def test_a_fleet_with_other_weights_than_the_gateway_stops(tmp_path):
+    async with local_gateway(tmp_path / "gateway.log") as url:
+        with pytest.raises(ValueError, match="other weights"):
+            await run_fleet(options(url, detector=str(ADVERSARIAL_WEIGHTS)), Console(file=io.StringIO()))
 
 
 def test_the_demo_shows_a_summary(tmp_path):

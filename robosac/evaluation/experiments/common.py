@@ -16,7 +16,7 @@ from robosac.consensus import at_least
 from robosac.detectors import Detector, EmbeddedDetector
 from robosac.detectors.embedded import ADVERSARIAL_WEIGHTS
 from robosac.evaluation.average_precision import AveragePrecision
-from robosac.evaluation.bounds import DecodedOnce, EvaluationFrame, evaluation_frames, under_attack
+from robosac.evaluation.frames import DecodedOnce, EvaluationFrame, encode_all, evaluation_frames, under_attack
 from robosac.scenes import IntersectionScene
 from robosac.scenes.splits import TEST_SEEDS
 
@@ -147,7 +147,8 @@ class Context:
             tick = self.progress(f"sequence {number}, {attackers} x pgd", self.scale.sequence_frames)
             self._frames[key] = []
             for frame in scene.frames(self.scale.sequence_frames):
-                attacked = under_attack(self.detector, frame, "car-1", chosen, PGD(), rng)
+                messages = encode_all(self.detector, frame)
+                attacked = under_attack(self.detector, messages, frame.truth("car-1"), "car-1", chosen, PGD(), rng)
                 self._frames[key].append(Recorded(self.detector, attacked))
                 tick()
         return self._frames[key]

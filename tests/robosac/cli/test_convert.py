@@ -3,7 +3,7 @@ import torch
 from typer.testing import CliRunner
 
 from robosac.cli import app
-from robosac.detectors import open_weights
+from robosac.detectors import load
 from robosac.detectors.embedded import read_weights
 from robosac.detectors.v2xsim.network import published_shapes
 
@@ -38,7 +38,7 @@ def test_a_checkpoint_becomes_a_weights_file(fusion, tmp_path):
     result = runner.invoke(app, ["convert-checkpoint", str(path), str(out), "--fusion", fusion])
     assert result.exit_code == 0, result.output
     assert f"v2x-sim-{fusion}, 31" in result.output
-    assert open_weights(out).info.name == f"v2x-sim-{fusion}"
+    assert load(str(out)).info.name == f"v2x-sim-{fusion}"
     tensors, recipe = read_weights(out)
     assert recipe["detector"] == f"v2x-sim-{fusion}"
     assert tensors.keys() == published_shapes().keys()

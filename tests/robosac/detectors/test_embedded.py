@@ -27,7 +27,7 @@ def test_the_shipped_weights_are_small_and_say_how_they_were_made():
 def test_the_registry_loads_it(detector):
     assert available() == ("intersection-mean",)
     assert load().info == detector.info
-    with pytest.raises(KeyError):
+    with pytest.raises(ValueError, match="give one of intersection-mean"):
         load("nonesuch")
 
 

@@ -2,17 +2,21 @@ import numpy as np
 import pytest
 
 from robosac.attacks import PGD, Erase
-from robosac.evaluation import evaluate_bounds
-from robosac.evaluation.bounds import evaluation_frames
+from robosac.evaluation import BoundsReport, NoFrames, evaluate_bounds
+from robosac.evaluation.frames import evaluation_frames
+
+
+def evaluate(detector, attack, scenes, frames, attackers=1, **options) -> BoundsReport:
+    rng = np.random.default_rng([0, 0])
+    met = evaluation_frames(detector, range(scenes), frames, attack, attackers, rng)
+    return evaluate_bounds(detector, met, attack, attackers=attackers, **options)
 
 
 @pytest.fixture(scope="module")
 def report(request):
     detector = request.getfixturevalue("detector")
     ticks = []
-    report = evaluate_bounds(
-        detector, PGD(), seeds=range(6), frames_per_scene=2, repeats=4, tick=lambda: ticks.append(1)
-    )
+    report = evaluate(detector, PGD(), 6, 2, repeats=4, tick=lambda: ticks.append(1))
     assert len(ticks) == report.frames == 12
     return report
 
@@ -34,20 +38,19 @@ def test_steps_and_success_follow_the_exact_law(report):
 
 
 def test_rows_do_not_depend_on_what_else_is_evaluated(detector):
-    def evaluate(**options):
-        report = evaluate_bounds(detector, PGD(steps=3), seeds=range(1), frames_per_scene=2, **options)
-        return {row.name: row for row in report.rows}
+    def rows(**options):
+        return {row.name: row for row in evaluate(detector, PGD(steps=3), 1, 2, **options).rows}
 
-    few, many = evaluate(budgets=(1,), repeats=1), evaluate(budgets=(7, 1), repeats=3)
+    few, many = rows(budgets=(1,), repeats=1), rows(budgets=(7, 1), repeats=3)
     for name in ("all benign", "3 benign", "ego only", "no defence"):
         assert few[name] == many[name]
 
 
 def test_an_attack_that_passes_is_counted_as_infiltration(detector):
-    report = evaluate_bounds(detector, Erase(), seeds=range(2), frames_per_scene=1, repeats=5, budgets=(7,))
+    report = evaluate(detector, Erase(), 2, 1, repeats=5, budgets=(7,))
     assert report.miss_rate > 0.9
     assert report.rows[2].infiltrated > 0.3
-    honest = evaluate_bounds(detector, Erase(), seeds=range(1), frames_per_scene=1, attackers=0, budgets=(7,))
+    honest = evaluate(detector, Erase(), 1, 1, attackers=0, budgets=(7,))
     assert honest.rows[2].infiltrated == 0.0
     assert honest.miss_rate is None
 
@@ -61,7 +64,7 @@ def test_the_cars_take_turns_as_ego(detector):
 
 
 def test_the_attack_is_measured_against_the_features(detector):
-    report = evaluate_bounds(detector, PGD(steps=1, epsilon=0.25), seeds=range(1), frames_per_scene=1, budgets=(1,))
+    report = evaluate(detector, PGD(steps=1, epsilon=0.25), 1, 1, budgets=(1,))
     (frame,) = evaluation_frames(detector, range(1), 1, PGD(steps=1), 1, np.random.default_rng(0))
     magnitudes = np.concatenate([message.tensors["features"].ravel() for message in frame.benign.values()])
     assert report.perturbation_to_feature_ratio == pytest.approx(0.25 / np.percentile(np.abs(magnitudes), 95))
@@ -72,3 +75,11 @@ def test_the_consensus_test_is_counted_over_all_hypotheses(report):
     assert report.attacked_hypotheses == 12 * 6
     assert report.false_alarm_rate <= 0.1
     assert report.miss_rate <= 0.1
+
+
+def test_frames_without_enough_teammates_are_counted_apart(detector):
+    frames = list(evaluation_frames(detector, range(1), 2, PGD(steps=1), 1, np.random.default_rng(0)))
+    report = evaluate_bounds(detector, [None, frames[0], None], PGD(), budgets=(1,), repeats=1)
+    assert (report.frames, report.skipped) == (1, 2)
+    with pytest.raises(NoFrames):
+        evaluate_bounds(detector, [None], PGD())

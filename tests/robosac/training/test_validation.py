@@ -3,7 +3,7 @@ import pytest
 
 from robosac.boxes import pose_matrix
 from robosac.detectors import Message
-from robosac.evaluation.bounds import EvaluationFrame
+from robosac.evaluation.frames import EvaluationFrame
 from robosac.training import validation
 from robosac.training.validation import choose_operating_point
 

@@ -8,7 +8,7 @@ from safetensors.torch import load_file, save_file
 import robosac
 from robosac.attacks import PGD
 from robosac.boxes import from_world, pairwise_iou, pose_matrix
-from robosac.detectors import EmbeddedDetector, Message, V2XSimDetector, WeightsError, available, open_weights
+from robosac.detectors import EmbeddedDetector, Message, V2XSimDetector, WeightsError, available, load
 from robosac.detectors.base import for_role
 from robosac.detectors.embedded import SHIPPED_WEIGHTS, read_weights, tensors_digest
 from robosac.detectors.v2xsim import write_weights
@@ -163,7 +163,7 @@ def test_fusions(fusion, expected):
 
 def test_the_recipe_chooses_the_fusion(published_state, v2xsim, ego, others, tmp_path):
     write_weights(published_state, "max", tmp_path / "max.safetensors")
-    detector = open_weights(tmp_path / "max.safetensors")
+    detector = load(str(tmp_path / "max.safetensors"))
     assert detector.info.name == "v2x-sim-max"
     with torch.no_grad():
         surfaces = [d.attack_surface(ego, others) for d in (detector, v2xsim)]
@@ -172,18 +172,17 @@ def test_the_recipe_chooses_the_fusion(published_state, v2xsim, ego, others, tmp
 
 
 def test_weights_files_are_opened_by_what_they_are_for(weights, tmp_path):
-    detector = open_weights(weights)
+    detector = load(str(weights))
     assert isinstance(detector, V2XSimDetector)
     assert detector.info.name == "v2x-sim-mean"
-    other = open_weights(
-        rewritten(tmp_path, SHIPPED_WEIGHTS, lambda tensors, recipe: recipe.update(consensus_score=0.5))
-    )
+    changed = rewritten(tmp_path, SHIPPED_WEIGHTS, lambda tensors, recipe: recipe.update(consensus_score=0.5))
+    other = load(str(changed))
     assert isinstance(other, EmbeddedDetector)
     assert other.info.consensus_score == 0.5
     assert available() == ("intersection-mean",)  # no weights ship
     unknown = rewritten(tmp_path, weights, lambda tensors, recipe: recipe.update(detector="nonesuch"))
     with pytest.raises(WeightsError, match="unknown detector, 'nonesuch'"):
-        open_weights(unknown)
+        load(str(unknown))
 
 
 @pytest.mark.parametrize(
@@ -205,4 +204,4 @@ def test_a_damaged_file_is_refused(weights, tmp_path):
     path = tmp_path / "damaged.safetensors"
     path.write_bytes(data)
     with pytest.raises(WeightsError, match="is damaged"):
-        open_weights(path)
+        load(str(path))

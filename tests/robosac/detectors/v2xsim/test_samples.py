@@ -1,11 +1,14 @@
+import json
 import re
 import shutil
 from pathlib import Path
 
 import numpy as np
 import pytest
+from typer.testing import CliRunner
 
-from robosac.scenes.v2xsim import frames
+from robosac.cli import app
+from robosac.scenes.v2xsim import frames, scenes
 
 GUIDE = Path(__file__).parents[4] / "docs" / "v2x-sim.md"
 
@@ -43,3 +46,37 @@ def test_the_guides_example_runs(root, weights, tmp_path, monkeypatch, capsys):
     (example,) = re.findall(r"```python\n(.*?)```", GUIDE.read_text(), re.DOTALL)
     exec(compile(example, str(GUIDE), "exec"), {})
     assert re.fullmatch(r"0 (ego_only|consensus) \(.*\) \d+ boxes of 1\n", capsys.readouterr().out)
+
+
+def evaluate(root, weights, *options):
+    arguments = ["evaluate", "--data", root, "--weights", weights, "--attack", "noise", *options]
+    return CliRunner().invoke(app, [str(argument) for argument in arguments])
+
+
+def test_evaluate_runs_on_samples(root, weights, tmp_path):
+    lonely = root / "agent1" / "9_5"
+    shutil.copytree(root / "agent1" / "8_0", lonely)
+    assert scenes(root) == {8: [0], 9: [5]}
+    result = evaluate(root, weights, "--frames", 1, "--collaborators", 4, "--out", tmp_path)
+    assert result.exit_code == 0, result.output
+    assert "Skipped 1" in result.output
+    report = json.loads((tmp_path / "bounds.json").read_text())
+    assert (report["frames"], report["skipped"]) == (1, 1)
+    assert (report["benign_hypotheses"], report["attacked_hypotheses"]) == (1, 4)
+    assert report["settings"]["detector"] == "v2x-sim-mean"
+
+
+@pytest.mark.parametrize(
+    ("break_it", "complaint"),
+    [
+        (shutil.rmtree, "no folder agent*/<scene>_<frame>"),
+        (lambda root: [shutil.rmtree(root / f"agent{k}") for k in range(1, 6)], "no frame to evaluate"),
+        (lambda root: (root / "agent3" / "8_0" / "0.npy").write_bytes(b"cos\nsystem\n"), "agent3/8_0/0.npy"),
+    ],
+)
+def test_evaluate_explains_bad_samples(break_it, complaint, root, weights):
+    break_it(root)
+    result = evaluate(root, weights)
+    assert result.exit_code == 2
+    shown = "".join(result.output.replace("│", "").split())
+    assert complaint.replace(" ", "") in shown

@@ -1,0 +1,158 @@
+"""Test frames as their egos meet them: messages, some of them an attacker's, and true boxes."""
+
+from __future__ import annotations
+
+from collections.abc import Collection, Iterator, Mapping, Sequence
+from dataclasses import dataclass
+from pathlib import Path
+
+import numpy as np
+
+from robosac.attacks import Attack
+from robosac.boxes import FloatArray
+from robosac.detectors import Detector, Message, PreparedFrame, V2XSimDetector
+from robosac.detectors.base import for_role
+from robosac.scenes import FRAMES_PER_SECOND, IntersectionScene, SceneFrame, v2xsim
+
+
+@dataclass(frozen=True)
+class EvaluationFrame:
+    """One test frame as its ego meets it.
+
+    Attributes
+    ----------
+    ego : Message
+    benign : dict of teammate to Message
+    received : dict of teammate to Message
+        With the attackers' messages in place of their benign ones.
+    attackers : frozenset of str
+    truth : (G, 5) ndarray
+        Ego frame.
+    """
+
+    ego: Message
+    benign: dict[str, Message]
+    received: dict[str, Message]
+    attackers: frozenset[str]
+    truth: FloatArray
+
+
+def encode_all(detector: Detector, frame: SceneFrame) -> dict[str, Message]:
+    """Every agent's message, with all that it would send as an ego."""
+    return {name: detector.encode(view.points, view.pose) for name, view in frame.views.items()}
+
+
+def under_attack(
+    detector: Detector,
+    messages: Mapping[str, Message],
+    truth: FloatArray,
+    ego_id: str,
+    attackers: Collection[str],
+    attack: Attack,
+    rng: np.random.Generator,
+) -> EvaluationFrame:
+    """One instant as one ego meets it, with some teammates under the adversary's control.
+
+    Parameters
+    ----------
+    detector : Detector
+    messages : mapping of agent to Message
+        Everybody's, the ego's among them, each with all that it would send as an ego.
+    truth : (G, 5) ndarray
+        For that ego, in its frame.
+    ego_id : str
+    attackers : collection of str
+        Optimised jointly.
+    attack : Attack
+    rng : numpy.random.Generator
+        The attack's.
+    """
+    ego = messages[ego_id]
+    benign = {name: for_role(m, detector.info, "teammate") for name, m in messages.items() if name != ego_id}
+    adversarial = attack.run(detector.attack_surface(ego, benign), attackers, rng) if attackers else {}
+    received = {
+        name: detector.perturbed(message, adversarial[name]) if name in adversarial else message
+        for name, message in benign.items()
+    }
+    return EvaluationFrame(ego, benign, received, frozenset(adversarial), truth)
+
+
+def evaluation_frames(
+    detector: Detector,
+    seeds: Sequence[int],
+    frames_per_scene: int,
+    attack: Attack,
+    attackers: int,
+    rng: np.random.Generator,
+) -> Iterator[EvaluationFrame]:
+    """Frames 1 s apart of every scene, the cars taking turns as ego, random teammates attacking."""
+    turn = 0
+    for seed in seeds:
+        scene = IntersectionScene(seed)
+        for frame in scene.frames(frames_per_scene, stride=FRAMES_PER_SECOND):
+            ego_id = f"car-{turn % scene.car_agents + 1}"
+            turn += 1
+            chosen = _draw(set(scene.agents) - {ego_id}, attackers, rng)
+            yield under_attack(detector, encode_all(detector, frame), frame.truth(ego_id), ego_id, chosen, attack, rng)
+
+
+def v2xsim_frames(
+    detector: V2XSimDetector,
+    root: Path,
+    scenes: Sequence[int],
+    frames_per_scene: int,
+    attack: Attack,
+    attackers: int,
+    collaborators: int,
+    rng: np.random.Generator,
+) -> Iterator[EvaluationFrame | None]:
+    """The same of V2X-Sim samples: every fifth frame of each scene, its vehicles taking turns as ego.
+
+    Yields
+    ------
+    EvaluationFrame or None
+        None for a frame in which there is no vehicle, or fewer than ``attackers + collaborators`` teammates.
+
+    Raises
+    ------
+    robosac.scenes.v2xsim.SampleError
+        If a file is not a sample.
+    """
+    turn = 0
+    for scene in scenes:
+        for frame in v2xsim.frames(root, scene, frames_per_scene, stride=FRAMES_PER_SECOND):
+            vehicles = sorted(set(frame.samples) - {v2xsim.ROADSIDE_UNIT})
+            if not vehicles or len(frame.samples) - 1 < attackers + collaborators:
+                yield None
+                continue
+            ego_id = vehicles[turn % len(vehicles)]
+            turn += 1
+            messages = {
+                name: detector.encode_grid(sample.grid, frame.pose(name)) for name, sample in frame.samples.items()
+            }
+            chosen = _draw(set(messages) - {ego_id}, attackers, rng)
+            yield under_attack(detector, messages, frame.truth(ego_id), ego_id, chosen, attack, rng)
+
+
+def _draw(team: Collection[str], attackers: int, rng: np.random.Generator) -> list[str]:
+    return [str(name) for name in rng.choice(sorted(team), attackers, replace=False)]
+
+
+class DecodedOnce:
+    """A prepared frame that decodes each subset once, posing as the detector that prepared it."""
+
+    def __init__(self, detector: Detector, ego: Message, teammates: Mapping[str, Message]) -> None:
+        self.info = detector.info
+        self._prepared = detector.prepare(ego, teammates)
+        self._boxes: dict[frozenset[str], FloatArray] = {}
+
+    def prepare(self, ego: Message, teammates: Mapping[str, Message]) -> PreparedFrame:  # noqa: ARG002 (always the same)
+        """The frame itself."""
+        return self
+
+    def detect(self, teammates: Collection[str] = ()) -> FloatArray:
+        """Boxes of a subset, decoded at most once."""
+        key = frozenset(teammates)
+        if key not in self._boxes:
+            self._boxes[key] = self._prepared.detect(teammates)
+        return self._boxes[key]

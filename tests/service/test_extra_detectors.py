@@ -1,0 +1,74 @@
+import sys
+import types
+
+import pytest
+
+from clients.simulation import Fleet
+from robosac import attacks, detectors
+from robosac.attacks import GaussianNoise
+from robosac.detectors import EmbeddedDetector
+from robosac.detectors.embedded import ADVERSARIAL_WEIGHTS
+from robosac.detectors.v2xsim import write_weights
+from robosac.scenes import IntersectionScene
+from service.settings import Settings
+from tests.robosac.detectors.v2xsim.recipe import made_up, published_keys
+from tests.service.conftest import serve
+
+
+@pytest.fixture(scope="module")
+def weights(tmp_path_factory) -> str:
+    path = tmp_path_factory.mktemp("served") / "v2x-sim-max.safetensors"
+    write_weights({key: made_up(key, shape) for key, shape, _ in published_keys()}, "max", path)
+    return str(path)
+
+
+async def test_a_v2x_sim_detector_is_served(weights):
+    detector = detectors.load(weights)
+    (frame,) = Fleet(IntersectionScene(3), detector, 1, 1, GaussianNoise(), seed=0).sense(0)
+    assert set(frame.message.tensors) == {"features", "grid"}
+    assert set(frame.sent["rsu"].tensors) == {"features"}
+    async with serve(extra_detectors=(weights,)) as served:
+        defense = {"kind": "sample_consensus", "sampling_budget": 2, "collaborators": 3}
+        session = await served.open(detector="v2x-sim-max", latency_budget_ms=60_000, defense=defense)
+        assert session.detector["weights_digest"] == detector.info.weights_digest
+        answer = await served.ego(session).post_frame(0, frame.message, frame.sent)
+    assert answer.degraded_by is None
+    assert answer.sampling_steps >= 1
+
+
+async def test_other_weights_of_a_shipped_detector_take_its_place():
+    async with serve(extra_detectors=(str(ADVERSARIAL_WEIGHTS),)) as served:
+        (entry,) = await served.client.detectors()
+    assert entry["weights_digest"] == EmbeddedDetector(ADVERSARIAL_WEIGHTS).info.weights_digest
+
+
+@pytest.mark.parametrize(
+    ("extra", "complaint"),
+    [
+        ("/nowhere.safetensors", "no detector '/nowhere.safetensors'"),
+        (f"{ADVERSARIAL_WEIGHTS}, {ADVERSARIAL_WEIGHTS}", "same name"),
+        ("nonesuch:build", "No module named 'nonesuch'"),
+    ],
+)
+async def test_a_detector_that_cannot_be_loaded_keeps_the_gateway_from_starting(extra, complaint):
+    with pytest.raises(ValueError, match=complaint):
+        async with serve(extra_detectors=extra):
+            pytest.fail("it started")
+
+
+def test_several_extra_detectors_are_separated_by_commas(monkeypatch):
+    monkeypatch.setenv("ROBOSAC_EXTRA_DETECTORS", "a.safetensors, mine:build,")
+    assert Settings().extra_detectors == ("a.safetensors", "mine:build")
+
+
+@pytest.mark.parametrize("load", [attacks.load, detectors.load])
+@pytest.mark.parametrize(
+    ("attribute", "complaint"),
+    [("number", "not callable"), ("missing", "no attribute"), ("fails", "ZeroDivisionError"), ("other", "but 7")],
+)
+def test_what_a_reference_makes_is_checked(load, attribute, complaint, monkeypatch):
+    module = types.ModuleType("own")
+    module.number, module.fails, module.other = 1, lambda: 1 / 0, lambda: 7
+    monkeypatch.setitem(sys.modules, "own", module)
+    with pytest.raises(ValueError, match=complaint):
+        load(f"own:{attribute}")
