@@ -10,11 +10,13 @@ from typing import Any
 
 import httpx
 import numpy as np
+from cryptography.hazmat.primitives.asymmetric.ed25519 import Ed25519PrivateKey
 
 from clients.errors import GatewayError, GatewayUnreachable, ProtocolError, refusal
 from robosac import wire
 from robosac.boxes import FloatArray
 from robosac.detectors import Message
+from robosac.signatures import sign
 
 MSGPACK = "application/vnd.msgpack"
 DEFAULT_TIMEOUT_S = 30.0
@@ -159,9 +161,16 @@ class GatewayClient:
         defense: Mapping[str, Any] | None = None,
         latency_budget_ms: float | None = None,
         gather_ms: float | None = None,
+        frame_period_ms: float | None = None,
+        public_keys: Mapping[str, str] | None = None,
     ) -> OpenedSession:
-        """Open a session; what is None is left to the gateway."""
+        """Open a session; what is None is left to the gateway.
+
+        ``public_keys`` are those of the vehicles that sign (`robosac.signatures.show_public_key`).
+        """
         options = {
+            "frame_period_ms": frame_period_ms,
+            "public_keys": None if public_keys is None else dict(public_keys),
             "detector": detector,
             "defense": defense,
             "latency_budget_ms": latency_budget_ms,
@@ -181,9 +190,11 @@ class GatewayClient:
         except KeyError as error:
             raise ProtocolError(f"not a new session: {error!r} is missing") from error
 
-    def vehicle(self, session_id: str, vehicle_id: str, token: str) -> VehicleClient:
-        """The client of one vehicle in a session."""
-        return VehicleClient(self._request, session_id, vehicle_id, token)
+    def vehicle(
+        self, session_id: str, vehicle_id: str, token: str, key: Ed25519PrivateKey | None = None
+    ) -> VehicleClient:
+        """The client of one vehicle in a session, signing its messages where it has a key."""
+        return VehicleClient(self._request, session_id, vehicle_id, token, key)
 
     async def _request(self, method: str, path: str, **options: Any) -> httpx.Response:
         try:
@@ -215,7 +226,10 @@ class VehicleClient:
     Made by `GatewayClient.vehicle`. A teammate can only `send`; the ego may call everything.
     """
 
-    def __init__(self, request: Any, session_id: str, vehicle_id: str, token: str) -> None:
+    def __init__(
+        self, request: Any, session_id: str, vehicle_id: str, token: str, key: Ed25519PrivateKey | None = None
+    ) -> None:
+        self._key = key
         self.session_id = session_id
         self.vehicle_id = vehicle_id
         self._request = request
@@ -223,9 +237,15 @@ class VehicleClient:
         self._bearer = {"Authorization": f"Bearer {token}"}
         self._tensors = {**self._bearer, "Content-Type": MSGPACK, "Accept": MSGPACK}
 
+    def signature(self, frame: int, message: Message) -> bytes | None:
+        """The vehicle's signature over its message; None if it has no key."""
+        if self._key is None:
+            return None
+        return sign(self._key, self.session_id, wire.content_digest(frame, self.vehicle_id, message))
+
     async def send(self, frame: int, message: Message) -> None:
         """As a teammate: post the own message for a frame."""
-        await self.send_body(wire.pack_message(frame, self.vehicle_id, message))
+        await self.send_body(wire.pack_message(frame, self.vehicle_id, message, self.signature(frame, message)))
 
     async def send_body(self, body: bytes) -> None:
         """As `send`, with a body that is packed already."""
@@ -233,12 +253,19 @@ class VehicleClient:
 
     async def ask(self, frame: int, message: Message) -> FrameAnswer:
         """As the ego: post the own message and get the frame's answer, once the teammates' messages are in."""
-        body = wire.pack_message(frame, self.vehicle_id, message)
+        body = wire.pack_message(frame, self.vehicle_id, message, self.signature(frame, message))
         return _answer(await self._request("POST", f"{self._path}/messages", content=body, headers=self._tensors))
 
-    async def post_frame(self, frame: int, ego: Message, teammates: Mapping[str, Message]) -> FrameAnswer:
-        """As the ego: post a whole frame."""
-        return await self.post_frame_body(wire.pack_frame(frame, ego, teammates))
+    async def post_frame(
+        self,
+        frame: int,
+        ego: Message,
+        teammates: Mapping[str, Message],
+        signatures: Mapping[str, bytes] | None = None,
+    ) -> FrameAnswer:
+        """As the ego: post a whole frame, with the signatures that the teammates gave."""
+        body = wire.pack_frame(frame, ego, teammates, self.signature(frame, ego), signatures)
+        return await self.post_frame_body(body)
 
     async def post_frame_body(self, body: bytes) -> FrameAnswer:
         """As `post_frame`, with a body that is packed already."""
@@ -250,15 +277,26 @@ class VehicleClient:
 
     async def audit(self, after: int = 0) -> list[Mapping[str, Any]]:
         """As the ego: audit records with a number above ``after``."""
-        response = await self._request("GET", f"{self._path}/audit", params={"after": after}, headers=self._bearer)
         try:
-            return [json.loads(line) for line in response.text.splitlines()]
+            return [json.loads(line) for line in await self.audit_lines(after)]
         except ValueError as error:
             raise ProtocolError(f"not JSON Lines: {error}") from error
 
-    async def enrol(self, teammates: Sequence[str]) -> Mapping[str, str]:
+    async def audit_lines(self, after: int = 0) -> list[str]:
+        """As `audit`, the lines as they are chained."""
+        response = await self._request("GET", f"{self._path}/audit", params={"after": after}, headers=self._bearer)
+        text: str = response.text
+        return text.splitlines()
+
+    async def kept_messages(self, frame: int) -> bytes:
+        """As the ego: the messages of a decided frame as a whole frame, where the gateway keeps them."""
+        path = f"{self._path}/frames/{frame}/messages"
+        content: bytes = (await self._request("GET", path, headers=self._bearer)).content
+        return content
+
+    async def enrol(self, teammates: Sequence[str], public_keys: Mapping[str, str] | None = None) -> Mapping[str, str]:
         """As the ego: let teammates join; their tokens."""
-        body = {"teammates": list(teammates)}
+        body = {"teammates": list(teammates), "public_keys": dict(public_keys or {})}
         fields = _json(await self._request("POST", f"{self._path}/teammates", json=body, headers=self._bearer))
         try:
             return dict(fields["teammate_tokens"])

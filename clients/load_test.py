@@ -113,7 +113,8 @@ class _Bodies:
         if not all(body.startswith(prefix + wire.pack(0)) for body in frames):
             raise ValueError("a packed frame must begin with its number")
         self._prefix = prefix
-        self._tails = [body[len(prefix) + 1 :] for body in frames]
+        tails = [body[len(prefix) + 1 :] for body in frames]
+        self._tails = tails + tails[-2:0:-1]  # there and back, as no vehicle leaps from the end to the beginning
 
     @property
     def bytes_a_frame(self) -> int:

@@ -8,6 +8,7 @@ field it is about.
 
 from __future__ import annotations
 
+import hashlib
 import math
 from collections.abc import Mapping
 from dataclasses import dataclass
@@ -18,6 +19,7 @@ import numpy as np
 
 from robosac.boxes import FloatArray
 from robosac.detectors.base import DetectorInfo, Message, Role, TensorSpec
+from robosac.signatures import SIGNATURE_BYTES
 
 MAX_FRAME = 2**53 - 1
 """Largest frame number: what every JSON reader can hold exactly."""
@@ -76,15 +78,57 @@ class FrameEnvelope:
     teammates: Mapping[Any, Any]
 
 
-def pack_message(frame: int, vehicle_id: str, message: Message) -> bytes:
-    """The body of a vehicle's own message."""
-    return pack({"frame": frame, "vehicle_id": vehicle_id, **_message_fields(message)})
+def pack_message(frame: int, vehicle_id: str, message: Message, signature: bytes | None = None) -> bytes:
+    """The body of a vehicle's own message, with its signature where it has one (`robosac.signatures`)."""
+    return pack({"frame": frame, "vehicle_id": vehicle_id, **_message_fields(message, signature)})
 
 
-def pack_frame(frame: int, ego: Message, teammates: Mapping[str, Message]) -> bytes:
-    """The body of a whole frame."""
-    fields = {name: _message_fields(message) for name, message in teammates.items()}
-    return pack({"frame": frame, "ego": _message_fields(ego), "teammates": fields})
+def pack_frame(
+    frame: int,
+    ego: Message,
+    teammates: Mapping[str, Message],
+    ego_signature: bytes | None = None,
+    signatures: Mapping[str, bytes] | None = None,
+) -> bytes:
+    """The body of a whole frame, with the signatures of those teammates that sign."""
+    signed = signatures or {}
+    fields = {name: _message_fields(message, signed.get(name)) for name, message in teammates.items()}
+    return pack({"frame": frame, "ego": _message_fields(ego, ego_signature), "teammates": fields})
+
+
+def content_digest(frame: int, vehicle_id: str, message: Message) -> str:
+    """SHA-256 (hexadecimal) of what a message says: who, which frame, pose, and every tensor.
+
+    The same for a vehicle's own message and for its part of a whole frame. Hashed are, each behind its length as eight
+    bytes, big-endian: the frame in decimal, the sender, the pose as 16 float64, then name, dtype, shape in decimal and
+    data of every tensor by ascending name; numbers little-endian.
+    """
+    total = hashlib.sha256()
+    parts: list[bytes] = [
+        str(frame).encode(),
+        vehicle_id.encode(),
+        np.ascontiguousarray(message.pose, dtype="<f8").tobytes(),
+    ]
+    for name, array in sorted(message.tensors.items()):
+        data = np.ascontiguousarray(array, dtype=array.dtype.newbyteorder("<")).tobytes()
+        parts += [name.encode(), array.dtype.name.encode(), ",".join(map(str, array.shape)).encode(), data]
+    for part in parts:
+        total.update(len(part).to_bytes(8, "big"))
+        total.update(part)
+    return total.hexdigest()
+
+
+def read_signature(payload: Any, path: str = "") -> bytes | None:
+    """The signature that came with a message, if one did."""
+    value = _mapping(payload, path).get("signature")
+    if value is None:
+        return None
+    where = _join(path, "signature")
+    if not isinstance(value, bytes):
+        raise WireError("wrong-type", where, f"must be binary, got {_type(value)}")
+    if len(value) != SIGNATURE_BYTES:
+        raise WireError("wrong-length", where, f"must be {SIGNATURE_BYTES} bytes, got {len(value)}")
+    return value
 
 
 def pack(value: Any) -> bytes:
@@ -180,12 +224,13 @@ def check_message(payload: Any, info: DetectorInfo, role: Role, path: str = "") 
     return Message(pose, checked)
 
 
-def _message_fields(message: Message) -> dict[str, Any]:
+def _message_fields(message: Message, signature: bytes | None) -> dict[str, Any]:
     tensors = {}
     for name, array in message.tensors.items():
         little = np.ascontiguousarray(array, dtype=array.dtype.newbyteorder("<"))
         tensors[name] = {"dtype": array.dtype.name, "shape": list(array.shape), "data": little.tobytes()}
-    return {"pose": [float(value) for value in message.pose.reshape(-1)], "tensors": tensors}
+    fields: dict[str, Any] = {"pose": [float(value) for value in message.pose.reshape(-1)], "tensors": tensors}
+    return fields if signature is None else {**fields, "signature": signature}
 
 
 def _tensor(value: Any, spec: TensorSpec, path: str) -> np.ndarray[Any, np.dtype[Any]]:

@@ -22,26 +22,25 @@ from service.metrics import Metrics  # noqa: E402
 from service.routes import operations, v1  # noqa: E402
 from service.sessions import Sessions  # noqa: E402
 from service.settings import Settings  # noqa: E402
-from service.store import MemoryStore  # noqa: E402
+from service.store import MemoryStore, new_seed  # noqa: E402
 
 
-def create_app(settings: Settings | None = None, new_seed: Callable[[], int] | None = None) -> FastAPI:
+def create_app(settings: Settings | None = None, seeds: Callable[[], str] = new_seed) -> FastAPI:
     """A gateway.
 
     Parameters
     ----------
     settings : Settings, optional
         From the environment by default.
-    new_seed : callable, optional
-        Seed of each frame's draws; from the operating system by default. Set it only for replays and tests: whoever
+    seeds : callable
+        Seed of each frame's draws, hexadecimal; from the operating system by default. Set it only for tests: whoever
         knows the seed knows which subsets will be sampled.
     """
     settings = settings or Settings()
     engine = Engine(settings.torch_threads, settings.extra_detectors)
     metrics = Metrics()
-    sessions = Sessions(settings, MemoryStore(), engine, metrics)
-    seeding = {} if new_seed is None else {"new_seed": new_seed}
-    gateway = Gateway(engine, metrics, sessions, Frames(sessions, engine, metrics, **seeding))
+    sessions = Sessions(settings, MemoryStore(), engine, metrics, seeds)
+    gateway = Gateway(engine, metrics, sessions, Frames(settings, sessions, engine, metrics))
 
     @contextlib.asynccontextmanager
     async def lifespan(_: FastAPI) -> AsyncIterator[None]:

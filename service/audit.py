@@ -4,12 +4,15 @@ from __future__ import annotations
 
 from collections.abc import Mapping, Sequence
 from datetime import UTC, datetime
+from importlib.metadata import version
 from typing import Any
 
-from robosac.defenses import Reason
+from robosac.audit import commitment
+from robosac.boxes import FloatArray
+from robosac.defenses import Reason, State
 from robosac.detectors import DetectorInfo
 from robosac.fusion import FusionResult
-from service.store import AuditRecord, SessionRecord
+from service.store import AuditEvent, SessionRecord
 
 
 def now() -> str:
@@ -17,12 +20,12 @@ def now() -> str:
     return datetime.now(UTC).isoformat(timespec="milliseconds").replace("+00:00", "Z")
 
 
-def session_opened(record: SessionRecord, info: DetectorInfo) -> AuditRecord:
+def session_opened(record: SessionRecord, info: DetectorInfo) -> AuditEvent:
     """A session begins: with whom, which detector, which settings."""
     return {
         "event": "session_opened",
         "time": record.created_at,
-        "session_id": record.session_id,
+        "version": version("robosac"),
         "ego_id": record.ego_id,
         "teammates": list(record.teammates),
         "detector": record.detector,
@@ -30,10 +33,19 @@ def session_opened(record: SessionRecord, info: DetectorInfo) -> AuditRecord:
         "defense": dict(record.defense),
         "latency_budget_ms": record.latency_budget_ms,
         "gather_ms": record.gather_ms,
+        "frame_period_ms": record.frame_period_ms,
+        "public_keys": dict(record.public_keys),
+        "state": dict(record.state),
+        "next_seed_commitment": commitment(record.seed),
     }
 
 
-def team_changed(before: Sequence[str], after: Sequence[str]) -> AuditRecord:
+def session_ended(why: str) -> AuditEvent:
+    """A session was closed, or expired."""
+    return {"event": "session_ended", "time": now(), "why": why}
+
+
+def team_changed(before: Sequence[str], after: Sequence[str], keys: Mapping[str, str], state: State) -> AuditEvent:
     """Teammates joined or left."""
     return {
         "event": "team_changed",
@@ -41,32 +53,66 @@ def team_changed(before: Sequence[str], after: Sequence[str]) -> AuditRecord:
         "joined": [name for name in after if name not in before],
         "left": [name for name in before if name not in after],
         "teammates": list(after),
+        "public_keys": dict(keys),
+        "state": dict(state),
     }
 
 
 def frame_answered(
-    answer: Mapping[str, Any], result: FusionResult, seed: int, unlogged: Mapping[str, int]
-) -> AuditRecord:
-    """A frame is decided: everything of the answer but the boxes themselves, and the seed that replays it.
+    answer: Mapping[str, Any],
+    result: FusionResult,
+    *,
+    seed: str,
+    ego_pose: FloatArray,
+    messages: Mapping[str, Mapping[str, str]],
+    unlogged: Mapping[str, int],
+) -> AuditEvent:
+    """A frame is decided: the answer, and all that it takes to recompute it.
 
-    The seed is written as a string, since it exceeds what JSON readers hold exactly. ``unlogged`` counts the refused
-    messages of each vehicle since the last frame that were too many to be recorded one by one.
+    Parameters
+    ----------
+    answer : mapping
+        The frame result.
+    result : FusionResult
+    seed : str
+        Of the frame's draws, hexadecimal, committed to in an earlier record.
+    ego_pose : (4, 4) ndarray
+    messages : mapping of vehicle id to mapping
+        ``digest`` of each message in the frame (`robosac.wire.content_digest`), and its ``signature`` where it has one.
+    unlogged : mapping of vehicle id to int
+        Refused messages since the last frame that were too many to be recorded one by one.
     """
-    kept = {name: value for name, value in answer.items() if name != "boxes"}
     return {
         "event": "frame_answered",
         "time": now(),
-        **kept,
-        "boxes": len(result.boxes),
-        "seed": str(seed),
+        **answer,
+        "seed": seed,
+        "ego_pose": [float(value) for value in ego_pose.reshape(-1)],
+        "messages": {name: dict(proof) for name, proof in messages.items()},
+        "out_of_time": result.out_of_time,
         "fault": result.fault,
+        "state": dict(result.state),
         "unlogged_refusals": dict(unlogged),
+    }
+
+
+def equivocation(vehicle_id: str, frame: int, first: str, second: Mapping[str, str]) -> AuditEvent:
+    """A vehicle said two different things about one frame: the digest of the first, digest and signature of the
+    second.
+    """
+    return {
+        "event": "equivocation",
+        "time": now(),
+        "vehicle_id": vehicle_id,
+        "frame": frame,
+        "first": {"digest": first},
+        "second": dict(second),
     }
 
 
 def message_refused(
     vehicle_id: str, reason: Reason, detail: str, *, frame: int | None = None, field: str | None = None
-) -> AuditRecord:
+) -> AuditEvent:
     """A message was not accepted; ``vehicle_id`` is whose token sent it, whatever the message claims."""
     return {
         "event": "message_refused",

@@ -2,21 +2,24 @@
 
 from __future__ import annotations
 
-import secrets
 import time
-from collections.abc import Callable, Mapping
+from collections.abc import Mapping
 from typing import Any
+
+import numpy as np
 
 from robosac import wire
 from robosac.defenses import Reason, Rejection
-from robosac.detectors import Message
+from robosac.detectors import Role
 from robosac.fusion import FusionResult
+from robosac.signatures import is_valid, read_public_key
 from service import audit
 from service.engine import Engine
-from service.gathering import Refused
+from service.gathering import Equivocation, Received, Refused
 from service.metrics import Metrics
 from service.problems import Problem
 from service.sessions import Caller, Sessions
+from service.settings import Settings
 
 STRANGERS_NAMED = 8
 SLACK_BYTES = 64 * 1024
@@ -30,35 +33,37 @@ _REFUSALS = {
 }
 
 
+class _Forged(Exception):
+    """A message of a vehicle that signs, without its signature."""
+
+    def __init__(self, field: str, detail: str) -> None:
+        super().__init__(detail)
+        self.field = field
+        self.detail = detail
+
+
 class Frames:
     """Takes messages and whole frames, and answers them.
 
     Parameters
     ----------
+    settings : Settings
     sessions : Sessions
     engine : Engine
     metrics : Metrics
-    new_seed : callable
-        Seed of a frame's draws; from the operating system by default, so that nobody can foresee them.
     """
 
-    def __init__(
-        self,
-        sessions: Sessions,
-        engine: Engine,
-        metrics: Metrics,
-        new_seed: Callable[[], int] = lambda: secrets.randbits(128),
-    ) -> None:
+    def __init__(self, settings: Settings, sessions: Sessions, engine: Engine, metrics: Metrics) -> None:
+        self._settings = settings
         self._sessions = sessions
         self._engine = engine
         self._metrics = metrics
-        self._new_seed = new_seed
 
     async def post_message(self, caller: Caller, body: bytes) -> tuple[int, dict[str, Any]]:
         """A vehicle's own message: kept for a teammate (202 and a receipt), answered for the ego (200 and the
         result).
         """
-        received = time.perf_counter()
+        arrived = time.perf_counter()
         frame = None
         try:
             envelope = wire.read_message(body)
@@ -67,48 +72,48 @@ class Frames:
                 detail = f"the token of {caller.vehicle_id} cannot speak for another vehicle"
                 await self._refuse(caller, Reason.UNAUTHENTICATED, detail, frame, "vehicle_id")
                 raise Problem(403, "wrong-vehicle", detail, "vehicle_id")
-            message = wire.check_message(envelope.payload, caller.live.detector.info, caller.role)
-        except wire.WireError as error:
-            raise await self._malformed(caller, error, frame) from error
+            received = _check(caller, caller.vehicle_id, frame, envelope.payload, "")
+        except (wire.WireError, _Forged) as error:
+            raise await self._unusable(caller, error, frame) from error
         if not caller.is_ego:
-            await self._keep(caller, frame, message)
+            await self._keep(caller, frame, received)
             return 202, {"frame": frame, "vehicle_id": caller.vehicle_id, "status": "accepted"}
-        timings = {"receive": (time.perf_counter() - received) * 1e3}
+        timings = {"receive": (time.perf_counter() - arrived) * 1e3}
         async with caller.live.lock:
-            await self._check_order(caller, frame)
+            await self._check_ego(caller, frame, received)
             gathering = time.perf_counter()
-            messages = await caller.live.gathering.collect(frame, received + caller.record.gather_ms / 1e3)
+            messages = await caller.live.gathering.collect(frame, arrived + caller.record.gather_ms / 1e3)
             timings["gather"] = (time.perf_counter() - gathering) * 1e3
-            return 200, await self._answer(caller, frame, message, messages, {}, received, timings)
+            return 200, await self._answer(caller, frame, received, messages, {}, arrived, timings)
 
     async def post_frame(self, caller: Caller, body: bytes) -> dict[str, Any]:
         """A whole frame from the ego; a teammate whose part is malformed is left out, and the frame is answered."""
-        received = time.perf_counter()
-        info = caller.live.detector.info
+        arrived = time.perf_counter()
         frame = None
         try:
             envelope = wire.read_frame(body)
             frame = envelope.frame
-            ego = wire.check_message(envelope.ego, info, "ego", "ego")
-        except wire.WireError as error:
-            raise await self._malformed(caller, error, frame) from error
-        messages: dict[str, Message] = {}
+            ego = _check(caller, caller.vehicle_id, frame, envelope.ego, "ego")
+        except (wire.WireError, _Forged) as error:
+            raise await self._unusable(caller, error, frame) from error
+        messages: dict[str, Received] = {}
         unusable: dict[str, Rejection] = {}
         for name in caller.record.teammates:
             if name not in envelope.teammates:
                 continue
             try:
-                messages[name] = wire.check_message(envelope.teammates[name], info, "teammate", f"teammates.{name}")
-            except wire.WireError as error:
-                unusable[name] = Rejection(Reason.MALFORMED, {"field": error.field, "detail": error.detail})
-                self._metrics.refused(Reason.MALFORMED.value)
+                messages[name] = _check(caller, name, frame, envelope.teammates[name], f"teammates.{name}")
+            except (wire.WireError, _Forged) as error:
+                reason = Reason.UNAUTHENTICATED if isinstance(error, _Forged) else Reason.MALFORMED
+                unusable[name] = Rejection(reason, {"field": error.field, "detail": error.detail})
+                self._metrics.refused(reason.value)
         strangers = [name for name in envelope.teammates if name not in caller.record.teammates]
         for name in strangers[:STRANGERS_NAMED]:
             unusable[str(name)[:64]] = Rejection(Reason.UNAUTHENTICATED, {"detail": "not enrolled in this session"})
-        timings = {"receive": (time.perf_counter() - received) * 1e3}
+        timings = {"receive": (time.perf_counter() - arrived) * 1e3}
         async with caller.live.lock:
-            await self._check_order(caller, frame)
-            return await self._answer(caller, frame, ego, messages, unusable, received, timings)
+            await self._check_ego(caller, frame, ego)
+            return await self._answer(caller, frame, ego, messages, unusable, arrived, timings)
 
     def body_limit(self, caller: Caller, *, whole_frame: bool) -> int:
         """Bytes that a message, or a whole frame, of a session's detector may have."""
@@ -120,24 +125,51 @@ class Frames:
         """Record that a body was refused before it was read."""
         await self._refuse(caller, Reason.MALFORMED, problem.detail, None, problem.field or "")
 
-    async def _check_order(self, caller: Caller, frame: int) -> None:
+    async def kept_messages(self, caller: Caller, frame: int) -> bytes:
+        """The messages kept of a decided frame, as a whole frame (`robosac.wire.read_frame`)."""
+        kept = await self._sessions.messages(caller, frame)
+        if kept is None:
+            raise Problem(404, "messages-not-kept", "no messages of that frame are kept", "frame")
+        return kept
+
+    async def _check_ego(self, caller: Caller, frame: int, ego: Received) -> None:
+        """Refuse an ego's message that is not for a new frame, or from where the ego cannot be."""
         record = await self._sessions.current(caller)
         if record.last_frame is not None and frame <= record.last_frame:
             reason = Reason.REPLAYED if frame == record.last_frame else Reason.STALE
+            before = caller.live.ego_digest if reason is Reason.REPLAYED else None
+            if before not in (None, ego.digest):
+                await self._sessions.log_equivocation(caller, frame, str(before), ego)
             detail = f"frames must increase; the latest answered is {record.last_frame}"
             await self._refuse(caller, reason, detail, frame, "frame")
             raise Problem(409, "stale-frame", detail, "frame")
+        doubt = caller.live.motion.implausible(caller.vehicle_id, frame, ego.message.pose)
+        if doubt is not None:
+            field = "ego.pose"
+            await self._refuse(caller, Reason.MALFORMED, doubt, frame, field)
+            raise Problem(422, "implausible-pose", doubt, field)
 
-    async def _keep(self, caller: Caller, frame: int, message: Message) -> None:
+    async def _keep(self, caller: Caller, frame: int, received: Received) -> None:
         await self._sessions.current(caller)
+        if self._sessions.backlog.full:
+            raise Problem(
+                503, "overloaded", "too many messages are waiting for their egos", headers={"Retry-After": "1"}
+            )
         try:
-            caller.live.gathering.offer(frame, caller.vehicle_id, message)
+            caller.live.gathering.offer(frame, caller.vehicle_id, received)
+        except Equivocation as lie:
+            await self._sessions.log_equivocation(caller, frame, lie.first, received)
+            raise Problem(409, "equivocation", str(lie), "frame") from lie
         except Refused as refused:
             await self._sessions.log_refusal(caller, refused.reason, refused.detail, frame, "frame")
             status, slug = _REFUSALS[refused.reason]
             raise Problem(status, slug, refused.detail, "frame") from refused
 
-    async def _malformed(self, caller: Caller, error: wire.WireError, frame: int | None) -> Problem:
+    async def _unusable(self, caller: Caller, error: wire.WireError | _Forged, frame: int | None) -> Problem:
+        """Record a message that cannot be used; the problem to answer with."""
+        if isinstance(error, _Forged):
+            await self._refuse(caller, Reason.UNAUTHENTICATED, error.detail, frame, error.field)
+            return Problem(401, "bad-signature", error.detail, error.field)
         await self._refuse(caller, Reason.MALFORMED, error.detail, frame, error.field)
         return Problem.from_wire(error)
 
@@ -150,10 +182,10 @@ class Frames:
         self,
         caller: Caller,
         frame: int,
-        ego: Message,
-        messages: Mapping[str, Message],
+        ego: Received,
+        messages: Mapping[str, Received],
         unusable: Mapping[str, Rejection],
-        received: float,
+        arrived: float,
         timings: dict[str, float],
     ) -> dict[str, Any]:
         """Fuse, keep the decision, and build the frame result. The session's lock is held.
@@ -162,32 +194,79 @@ class Frames:
         body are not among the messages.
         """
         record = await self._sessions.current(caller)
-        gathering = caller.live.gathering
-        present = {name: messages[name] for name in record.teammates if name in messages}
-        unheard = {name: gathering.absence(name, frame) for name in record.teammates if name not in present}
-        gathering.close(frame)
-        seed = self._new_seed()
+        live = caller.live
+        left_out = dict(unusable)
+        present: dict[str, Received] = {}
+        for name in record.teammates:
+            if name not in messages:
+                left_out.setdefault(name, live.gathering.absence(name, frame))
+                continue
+            doubt = live.motion.implausible(name, frame, messages[name].message.pose, ego.message.pose)
+            if doubt is None:
+                present[name] = messages[name]
+            else:
+                left_out[name] = Rejection(Reason.MALFORMED, {"field": "pose", "detail": doubt})
+                self._metrics.refused(Reason.MALFORMED.value)
+        live.gathering.close(frame)
         result, timings["queue"] = await self._engine.fuse(
-            caller.live.detector,
-            caller.live.defense,
-            ego,
-            present,
-            seed=seed,
+            live.detector,
+            live.defense,
+            ego.message,
+            {name: received.message for name, received in present.items()},
+            seed=int(record.seed, 16),
             state=record.state,
             frame=frame,
-            previous=caller.live.previous,
-            deadline=received + record.latency_budget_ms / 1e3,
+            previous=live.previous,
+            deadline=arrived + record.latency_budget_ms / 1e3,
         )
         timings.update(result.timings_ms)
-        timings["total"] = (time.perf_counter() - received) * 1e3
-        answer = _frame_result(frame, result, {**unheard, **unusable, **result.rejected}, timings)
-        caller.live.previous = result.previous
-        await self._sessions.decide(
-            caller, frame, result.state, audit.frame_answered(answer, result, seed, caller.live.unlogged())
+        timings["total"] = (time.perf_counter() - arrived) * 1e3
+        answer = _frame_result(frame, result, {**left_out, **result.rejected}, timings)
+        event = audit.frame_answered(
+            answer,
+            result,
+            seed=record.seed,
+            ego_pose=ego.message.pose,
+            messages={name: received.proof for name, received in {record.ego_id: ego, **present}.items()},
+            unlogged=live.unlogged(),
         )
+        await self._sessions.decide(caller, frame, result.state, event, self._to_keep(frame, ego, present))
+        live.previous, live.ego_digest = result.previous, ego.digest
+        for name, received in {record.ego_id: ego, **present}.items():
+            live.motion.moved(name, frame, received.message.pose)
         reasons = [entry["reason"] for entry in answer["rejected"]]
         self._metrics.frame(result, reasons, answer["degraded_by"], timings)
         return answer
+
+    def _to_keep(self, frame: int, ego: Received, present: Mapping[str, Received]) -> bytes | None:
+        """The messages of a frame for a replay, if they are to be kept."""
+        if self._settings.keep_frames == 0:
+            return None
+        messages = {name: received.message for name, received in present.items()}
+        signatures = {name: r.signature for name, r in present.items() if r.signature is not None}
+        return wire.pack_frame(frame, ego.message, messages, ego.signature, signatures)
+
+
+def _check(caller: Caller, vehicle: str, frame: int, payload: Any, path: str) -> Received:
+    """A message that is well-formed and, where its sender signs, signed.
+
+    Raises
+    ------
+    WireError
+    _Forged
+    """
+    role: Role = "ego" if vehicle == caller.record.ego_id else "teammate"
+    message = wire.check_message(payload, caller.live.detector.info, role, path)
+    signature = wire.read_signature(payload, path)
+    received = Received(message, wire.content_digest(frame, vehicle, message), signature)
+    key = caller.record.public_keys.get(vehicle)
+    if key is not None:
+        field = f"{path}.signature" if path else "signature"
+        if signature is None:
+            raise _Forged(field, f"messages of {vehicle} must be signed")
+        if not is_valid(read_public_key(key), caller.record.session_id, received.digest, signature):
+            raise _Forged(field, f"not the signature of {vehicle} over this message for this session")
+    return received
 
 
 def _frame_result(
@@ -196,7 +275,7 @@ def _frame_result(
     degraded_by = "fault" if result.fault is not None else "deadline" if result.out_of_time else None
     return {
         "frame": frame,
-        "boxes": [[float(value) for value in box] for box in result.boxes],
+        "boxes": np.asarray(result.boxes, dtype=np.float64).tolist(),
         "source": result.source.value,
         "accepted": list(result.accepted),
         "rejected": [{"vehicle_id": name, "reason": r.reason.value, **r.evidence} for name, r in rejected.items()],

@@ -6,7 +6,7 @@ import json
 import re
 from typing import Annotated, Any
 
-from fastapi import APIRouter, Depends, Header, Query, Request, Response
+from fastapi import APIRouter, Depends, Header, Path, Query, Request, Response
 from fastapi.security import HTTPAuthorizationCredentials, HTTPBearer
 
 from robosac import wire
@@ -88,14 +88,14 @@ async def get_session(caller: Ego, gateway: GatewayDep) -> SessionState:
 
 @v1.delete("/sessions/{sid}", status_code=204, responses=_EGO_PROBLEMS)
 async def delete_session(caller: Ego, gateway: GatewayDep) -> None:
-    """End the session; its audit log goes with it, so fetch that first."""
+    """End the session; its audit log can be read until it is purged."""
     await gateway.sessions.close(caller)
 
 
 @v1.post("/sessions/{sid}/teammates", status_code=201, responses={**_EGO_PROBLEMS, **documented(400, 409)})
 async def enrol_teammates(request: EnrolmentRequest, caller: Ego, gateway: GatewayDep) -> TeamChanged:
     """Let teammates join from the next frame on. Their tokens are shown only in this answer."""
-    return await gateway.sessions.enrol(caller, request.teammates)
+    return await gateway.sessions.enrol(caller, request.teammates, request.public_keys)
 
 
 @v1.delete("/sessions/{sid}/teammates/{vehicle_id}", status_code=204, responses=_EGO_PROBLEMS)
@@ -109,11 +109,12 @@ async def dismiss_teammate(vehicle_id: str, caller: Ego, gateway: GatewayDep) ->
     response_class=Response,
     responses={**_EGO_PROBLEMS, 200: {"content": {"application/jsonl": {}}}},
 )
-async def get_audit(caller: Ego, gateway: GatewayDep, after: Annotated[int, Query(ge=0)] = 0) -> Response:
-    """The audit log as JSON Lines: records with a number above `after`."""
-    records = await gateway.sessions.audit_log(caller, after)
-    lines = "".join(json.dumps(record, allow_nan=False) + "\n" for record in records)
-    return Response(lines, media_type="application/jsonl")
+async def get_audit(
+    sid: str, gateway: GatewayDep, credentials: Credentials, after: Annotated[int, Query(ge=0, le=2**53)] = 0
+) -> Response:
+    """The audit log as JSON Lines: records with a number above `after`; of an ended session, too."""
+    lines = await gateway.sessions.audit_log(sid, credentials.credentials if credentials else None, after)
+    return Response("".join(line + "\n" for line in lines), media_type="application/jsonl")
 
 
 @v1.post(
@@ -141,6 +142,18 @@ async def post_frame(
     """A whole frame in one request by the ego."""
     body = await _read_body(request, caller, gateway, whole_frame=True)
     return _negotiated(await gateway.frames.post_frame(caller, body), accept)
+
+
+@v1.get(
+    "/sessions/{sid}/frames/{frame}/messages",
+    response_class=Response,
+    responses={**_EGO_PROBLEMS, 200: {"content": {MSGPACK: {"schema": _TENSOR_SCHEMA}}}},
+)
+async def get_messages(
+    caller: Ego, gateway: GatewayDep, frame: Annotated[int, Path(ge=0, le=wire.MAX_FRAME)]
+) -> Response:
+    """The messages of a decided frame as a whole frame, where the gateway keeps them, to replay the decision."""
+    return Response(await gateway.frames.kept_messages(caller, frame), media_type=MSGPACK)
 
 
 @operations.get("/healthz")

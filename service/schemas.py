@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from collections.abc import Collection
 from typing import Annotated, Any, Literal
 
 from pydantic import (
@@ -21,6 +22,7 @@ from robosac.defenses import A2CP, Defense, Reference, SampleConsensus, StaticTe
 from robosac.defenses.a2cp import DEFAULT_BUDGET as DEFAULT_A2CP_BUDGET
 from robosac.defenses.static_team import DEFAULT_RECHECK
 from robosac.detectors import DetectorInfo
+from robosac.signatures import read_public_key
 
 VehicleId = Annotated[str, StringConstraints(pattern=r"^[A-Za-z0-9][A-Za-z0-9._:-]{0,63}$")]
 
@@ -102,10 +104,34 @@ def _check_distinct(teammates: list[str]) -> list[str]:
     return teammates
 
 
+def _check_key(key: str) -> str:
+    read_public_key(key)
+    return key
+
+
+PublicKeys = Annotated[
+    dict[VehicleId, Annotated[str, AfterValidator(_check_key)]],
+    Field(max_length=1025, description="Ed25519 public keys, base64, of those vehicles that sign all their messages."),
+]
+
+
+def _check_signers(keys: dict[str, str], vehicles: Collection[str]) -> None:
+    strangers = sorted(set(keys) - set(vehicles))
+    if strangers:
+        raise ValueError(f"{strangers[0]} is not among the vehicles")
+
+
 class EnrolmentRequest(_Request):
     """Teammates that join a session."""
 
     teammates: Annotated[list[VehicleId], AfterValidator(_check_distinct)] = Field(min_length=1, max_length=1024)
+    public_keys: PublicKeys = {}
+
+    @field_validator("public_keys")
+    @classmethod
+    def _keys_of_newcomers(cls, keys: dict[str, str], others: ValidationInfo) -> dict[str, str]:
+        _check_signers(keys, others.data.get("teammates", keys))
+        return keys
 
 
 class SessionRequest(_Request):
@@ -117,6 +143,8 @@ class SessionRequest(_Request):
     defense: DefenseSettings = SampleConsensusSettings()
     latency_budget_ms: float | None = Field(None, gt=0, le=60_000)
     gather_ms: float | None = Field(None, ge=0, le=60_000, description="At most the latency budget.")
+    public_keys: PublicKeys = {}
+    frame_period_ms: float = Field(200.0, gt=0, le=60_000, description="Time between two frames, to judge motion by.")
 
     @field_validator("teammates")
     @classmethod
@@ -125,6 +153,13 @@ class SessionRequest(_Request):
         if others.data.get("ego_id") in teammates:
             raise ValueError("the ego cannot be its own teammate")
         return teammates
+
+    @field_validator("public_keys")
+    @classmethod
+    def _keys_of_vehicles(cls, keys: dict[str, str], others: ValidationInfo) -> dict[str, str]:
+        if {"ego_id", "teammates"} <= set(others.data):
+            _check_signers(keys, [others.data["ego_id"], *others.data["teammates"]])
+        return keys
 
 
 class TensorEntry(BaseModel):
@@ -176,6 +211,7 @@ class SessionCreated(BaseModel):
     defense: DefenseSettings
     latency_budget_ms: float
     gather_ms: float
+    frame_period_ms: float
 
 
 class TeamChanged(BaseModel):
@@ -195,11 +231,14 @@ class SessionState(BaseModel):
     defense: DefenseSettings
     latency_budget_ms: float
     gather_ms: float
+    frame_period_ms: float
     created_at: str
     last_frame: int | None
     frames_answered: int
     state: dict[str, Any] = Field(description="What the defence remembers between frames.")
     audit_seq: int = Field(description="Number of the latest audit record.")
+    audit_head: str = Field(description="SHA-256 of the latest audit record: with it a cut-off log is found out.")
+    next_seed_commitment: str = Field(description="SHA-256 of the seed of the next frame's draws.")
 
 
 class Receipt(BaseModel):

@@ -3,27 +3,30 @@
 from __future__ import annotations
 
 import asyncio
+import contextlib
 import hashlib
 import logging
 import secrets
 import time
 from collections import Counter
-from collections.abc import Mapping, Sequence
+from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass, field
 from typing import Any
 
+from robosac.audit import commitment
 from robosac.budget import DomainError
 from robosac.defenses import Defense, Reason
 from robosac.detectors import Detector, Role
 from robosac.previous import PreviousAnswer
 from service import audit
 from service.engine import Engine
-from service.gathering import Gathering
+from service.gathering import Backlog, Gathering, Received
 from service.metrics import Metrics
+from service.motion import Motion
 from service.problems import Problem
 from service.schemas import DetectorEntry, SessionCreated, SessionRequest, SessionState, TeamChanged, read_defense
 from service.settings import Settings
-from service.store import AuditRecord, SessionRecord, Store
+from service.store import AuditEvent, FrameDecided, SessionOver, SessionRecord, Store, new_seed
 
 logger = logging.getLogger(__name__)
 
@@ -39,7 +42,9 @@ class LiveSession:
     detector: Detector
     defense: Defense
     gathering: Gathering
+    motion: Motion
     previous: PreviousAnswer | None = None
+    ego_digest: str | None = None
     lock: asyncio.Lock = field(default_factory=asyncio.Lock)
     last_used: float = field(default_factory=time.monotonic)
     refusals: Counter[str] = field(default_factory=Counter)
@@ -70,14 +75,33 @@ class Caller:
 
 
 class Sessions:
-    """All sessions of this gateway."""
+    """All sessions of this gateway.
 
-    def __init__(self, settings: Settings, store: Store, engine: Engine, metrics: Metrics) -> None:
+    Parameters
+    ----------
+    settings : Settings
+    store : Store
+    engine : Engine
+    metrics : Metrics
+    seeds : callable
+        Seed of a frame's draws, hexadecimal; from the operating system by default, so that nobody can foresee them.
+    """
+
+    def __init__(
+        self,
+        settings: Settings,
+        store: Store,
+        engine: Engine,
+        metrics: Metrics,
+        seeds: Callable[[], str] = new_seed,
+    ) -> None:
+        self._seeds = seeds
         self._settings = settings
         self._store = store
         self._engine = engine
         self._metrics = metrics
         self._live: dict[str, LiveSession] = {}
+        self.backlog = Backlog(settings.max_pending_bytes)
 
     async def open(self, request: SessionRequest) -> SessionCreated:
         """Begin a session; the answer is the only place where its tokens are shown."""
@@ -107,8 +131,11 @@ class Sessions:
             defense=request.defense.model_dump(mode="json"),
             latency_budget_ms=budget_ms,
             gather_ms=gather_ms,
-            token_digests={_digest(token): vehicle for vehicle, token in tokens.items()},
+            frame_period_ms=request.frame_period_ms,
+            token_ids={vehicle: _digest(token) for vehicle, token in tokens.items()},
+            public_keys=dict(request.public_keys),
             created_at=audit.now(),
+            seed=self._seeds(),
             state=defense.initial_state(request.teammates),
         )
         await self._store.create(record, audit.session_opened(record, detector.info))
@@ -122,6 +149,7 @@ class Sessions:
             defense=request.defense,
             latency_budget_ms=record.latency_budget_ms,
             gather_ms=record.gather_ms,
+            frame_period_ms=record.frame_period_ms,
         )
 
     async def authenticate(self, session_id: str, token: str | None) -> Caller:
@@ -130,19 +158,12 @@ class Sessions:
         Raises
         ------
         Problem
-            404 for an unknown session, 401 without a token of it.
+            404 for an unknown or ended session, 401 without a token of it.
         """
         record = await self._store.get(session_id)
-        if record is None:
+        if record is None or record.ended_at is not None:
             raise Problem(404, "unknown-session", "there is no such session; it may have ended or expired")
-        vehicle = record.token_digests.get(_digest(token)) if token else None
-        if vehicle is None:
-            raise Problem(
-                401,
-                "unauthenticated",
-                "a bearer token of a vehicle of this session is needed",
-                headers={"WWW-Authenticate": "Bearer"},
-            )
+        vehicle = self._vehicle(record, token)
         live = self._live.get(session_id)
         if live is None:
             live = self._live[session_id] = self._revive(record)
@@ -152,11 +173,18 @@ class Sessions:
     async def authenticate_ego(self, session_id: str, token: str | None) -> Caller:
         """As `authenticate`, but 403 for anybody but the ego."""
         caller = await self.authenticate(session_id, token)
-        if not caller.is_ego:
-            raise Problem(403, "ego-only", f"only the ego of the session may do this, not {caller.vehicle_id}")
+        _only_ego(caller.record, caller.vehicle_id)
         return caller
 
-    async def enrol(self, caller: Caller, newcomers: Sequence[str]) -> TeamChanged:
+    async def audit_log(self, session_id: str, token: str | None, after: int) -> list[str]:
+        """Lines of the log with a number above ``after``, for the ego; of an ended session, too."""
+        record = await self._store.get(session_id)
+        if record is None:
+            raise Problem(404, "unknown-session", "there is no such session; its log may have been purged")
+        _only_ego(record, self._vehicle(record, token))
+        return await self._store.audit(session_id, after)
+
+    async def enrol(self, caller: Caller, newcomers: Sequence[str], public_keys: Mapping[str, str]) -> TeamChanged:
         """Let teammates join, from the next frame on; the answer is the only place where their tokens are shown."""
         async with caller.live.lock:
             record = await self.current(caller)
@@ -164,8 +192,9 @@ class Sessions:
                 if name == record.ego_id or name in record.teammates:
                     raise Problem(409, "already-enrolled", f"{name} is in the session already", "teammates")
             tokens = _new_tokens(newcomers)
-            digests = {**record.token_digests, **{_digest(token): name for name, token in tokens.items()}}
-            await self._change_team(caller, (*record.teammates, *newcomers), digests)
+            token_ids = {**record.token_ids, **{name: _digest(token) for name, token in tokens.items()}}
+            keys = {**record.public_keys, **public_keys}
+            await self._change_team(caller, (*record.teammates, *newcomers), token_ids, keys)
             return TeamChanged(teammates=[*record.teammates, *newcomers], teammate_tokens=tokens)
 
     async def dismiss(self, caller: Caller, leaver: str) -> None:
@@ -174,8 +203,10 @@ class Sessions:
             record = await self.current(caller)
             if leaver not in record.teammates:
                 raise Problem(404, "unknown-teammate", "there is no such teammate in the session")
-            digests = {digest: name for digest, name in record.token_digests.items() if name != leaver}
-            await self._change_team(caller, tuple(name for name in record.teammates if name != leaver), digests)
+            token_ids = {name: token_id for name, token_id in record.token_ids.items() if name != leaver}
+            keys = {name: key for name, key in record.public_keys.items() if name != leaver}
+            team = tuple(name for name in record.teammates if name != leaver)
+            await self._change_team(caller, team, token_ids, keys)
 
     async def describe(self, caller: Caller) -> SessionState:
         """The session's state."""
@@ -188,44 +219,63 @@ class Sessions:
             defense=read_defense(record.defense),
             latency_budget_ms=record.latency_budget_ms,
             gather_ms=record.gather_ms,
+            frame_period_ms=record.frame_period_ms,
             created_at=record.created_at,
             last_frame=record.last_frame,
             frames_answered=record.frames_answered,
             state=dict(record.state),
             audit_seq=record.audit_seq,
+            audit_head=record.audit_head,
+            next_seed_commitment=commitment(record.seed),
         )
-
-    async def audit_log(self, caller: Caller, after: int) -> list[AuditRecord]:
-        """The session's audit records with a number above ``after``."""
-        return await self._store.audit(caller.record.session_id, after)
 
     async def close(self, caller: Caller) -> None:
         """End a session, after the frame in hand."""
         async with caller.live.lock:
-            await self._forget(caller.record.session_id)
+            await self._end(caller.record.session_id, "closed")
 
     async def expire_idle(self) -> None:
-        """End, every so often and for ever, the sessions that nobody has used for too long."""
+        """End, every so often and for ever, the sessions that nobody has used for too long, and purge old logs."""
         while True:
             await asyncio.sleep(min(SWEEP_EVERY_S, self._settings.session_idle_s / 2))
-            oldest = time.monotonic() - self._settings.session_idle_s
-            idle = [s for s, live in self._live.items() if live.last_used < oldest and not live.lock.locked()]
-            for session_id in idle:
-                try:
-                    await self._forget(session_id)
-                except Exception:  # one session must not keep the others from expiring
-                    logger.exception("session %s could not be ended", session_id)
+            try:
+                for session_id in await self._store.unused_since(time.time() - self._settings.session_idle_s):
+                    if not self._in_use(session_id):
+                        await self._end(session_id, "expired")
+                await self._store.purge(time.time() - self._settings.audit_retention_s)
+            except Exception:  # a sweep that fails must not be the last one
+                logger.exception("idle sessions could not be ended")
 
     async def current(self, caller: Caller) -> SessionRecord:
         """The session as it is now; it may have moved on, or ended, since the caller was authenticated."""
         record = await self._store.get(caller.record.session_id)
-        if record is None:
-            raise Problem(404, "unknown-session", "the session has ended")
+        if record is None or record.ended_at is not None:
+            raise _over()
         return record
 
-    async def decide(self, caller: Caller, frame: int, state: Mapping[str, Any], event: AuditRecord) -> None:
-        """Keep a decision and its record."""
-        await self._store.decide(caller.record.session_id, frame, state, event)
+    async def decide(
+        self, caller: Caller, frame: int, state: Mapping[str, Any], event: AuditEvent, messages: bytes | None = None
+    ) -> None:
+        """Keep a decision, its record, and the commitment to the next frame's seed."""
+        next_seed = self._seeds()
+        event = {**event, "next_seed_commitment": commitment(next_seed)}
+        try:
+            await self._store.decide(caller.record.session_id, frame, state, next_seed, event, messages)
+        except SessionOver as error:
+            raise _over() from error
+        except FrameDecided as error:
+            raise Problem(409, "stale-frame", f"frame {frame} or a later one is answered already", "frame") from error
+        if messages is not None:
+            await self._store.forget_messages(caller.record.session_id, frame - self._settings.keep_frames + 1)
+
+    async def messages(self, caller: Caller, frame: int) -> bytes | None:
+        """The messages kept of a decided frame."""
+        return await self._store.messages(caller.record.session_id, frame)
+
+    async def log(self, caller: Caller, event: AuditEvent) -> None:
+        """Append to a session's log, unless it has ended meanwhile."""
+        with contextlib.suppress(SessionOver):
+            await self._store.log(caller.record.session_id, event)
 
     async def log_refusal(self, caller: Caller, reason: Reason, detail: str, frame: int | None, field: str) -> None:
         """Record that a vehicle's message was refused."""
@@ -233,10 +283,18 @@ class Sessions:
         caller.live.refusals[caller.vehicle_id] += 1
         if caller.live.refusals[caller.vehicle_id] > REFUSALS_LOGGED:
             return
-        event = audit.message_refused(caller.vehicle_id, reason, detail, frame=frame, field=field)
-        await self._store.log(caller.record.session_id, event)
+        await self.log(caller, audit.message_refused(caller.vehicle_id, reason, detail, frame=frame, field=field))
 
-    async def _change_team(self, caller: Caller, team: Sequence[str], digests: Mapping[str, str]) -> None:
+    async def log_equivocation(self, caller: Caller, frame: int, first: str, second: Received) -> None:
+        """Record that a vehicle said two different things about one frame."""
+        self._metrics.refused(Reason.REPLAYED.value)
+        caller.live.refusals[caller.vehicle_id] += 1
+        if caller.live.refusals[caller.vehicle_id] <= REFUSALS_LOGGED:
+            await self.log(caller, audit.equivocation(caller.vehicle_id, frame, first, second.proof))
+
+    async def _change_team(
+        self, caller: Caller, team: Sequence[str], token_ids: Mapping[str, str], keys: Mapping[str, str]
+    ) -> None:
         """Keep a new team. The session's lock is held."""
         self._check_size(team)
         record = await self.current(caller)
@@ -244,8 +302,8 @@ class Sessions:
             state = caller.live.defense.change_team(record.state, team)
         except DomainError as error:
             raise Problem(422, "impossible-defense", str(error), "teammates") from error
-        event = audit.team_changed(record.teammates, team)
-        await self._store.change_team(record.session_id, tuple(team), digests, state, event)
+        event = audit.team_changed(record.teammates, team, keys, state)
+        await self._store.change_team(record.session_id, tuple(team), token_ids, keys, state, event)
         caller.live.gathering.change_team(team)
 
     def _check_size(self, team: Sequence[str]) -> None:
@@ -263,13 +321,50 @@ class Sessions:
 
     def _revive(self, record: SessionRecord) -> LiveSession:
         closed = -1 if record.last_frame is None else record.last_frame
-        gathering = Gathering(record.teammates, self._settings.max_pending_frames, closed)
-        return LiveSession(self._detector(record.detector), read_defense(record.defense).build(), gathering)
+        settings = self._settings
+        return LiveSession(
+            self._detector(record.detector),
+            read_defense(record.defense).build(),
+            Gathering(record.teammates, settings.max_pending_frames, self.backlog, closed),
+            Motion(settings.max_speed_mps, record.frame_period_ms / 1e3, settings.max_range_m),
+        )
 
-    async def _forget(self, session_id: str) -> None:
-        self._live.pop(session_id, None)
-        await self._store.delete(session_id)
+    def _in_use(self, session_id: str) -> bool:
+        """Whether a frame is in hand, or somebody asked for something lately that left no trace in the store."""
+        live = self._live.get(session_id)
+        recently = time.monotonic() - self._settings.session_idle_s
+        return live is not None and (live.lock.locked() or live.last_used >= recently)
+
+    async def _end(self, session_id: str, why: str) -> None:
+        live = self._live.pop(session_id, None)
+        if live is not None:
+            live.gathering.clear()
+        with contextlib.suppress(SessionOver):
+            event = audit.session_ended(why)
+            await self._store.end(session_id, event["time"], event)
         self._metrics.sessions.set(await self._store.count())
+
+    def _vehicle(self, record: SessionRecord, token: str | None) -> str:
+        """The vehicle of the session that a token belongs to."""
+        wanted = _digest(token) if token else None
+        for vehicle, token_id in record.token_ids.items():
+            if token_id == wanted:
+                return vehicle
+        raise Problem(
+            401,
+            "unauthenticated",
+            "a bearer token of a vehicle of this session is needed",
+            headers={"WWW-Authenticate": "Bearer"},
+        )
+
+
+def _only_ego(record: SessionRecord, vehicle_id: str) -> None:
+    if vehicle_id != record.ego_id:
+        raise Problem(403, "ego-only", f"only the ego of the session may do this, not {vehicle_id}")
+
+
+def _over() -> Problem:
+    return Problem(404, "unknown-session", "the session has ended")
 
 
 def _new_tokens(vehicles: Sequence[str]) -> dict[str, str]:

@@ -34,7 +34,16 @@ class Settings(BaseSettings):
     max_pending_frames: int = Field(
         4, ge=1, description="Frames after the next for which a teammate's message is kept."
     )
+    max_pending_bytes: int = Field(
+        2**30, ge=2**20, description="Tensors of all teammates' messages that wait; beyond, more are refused."
+    )
+    max_speed_mps: float = Field(70.0, gt=0, description="A vehicle that moved faster from frame to frame is refused.")
+    max_range_m: float = Field(300.0, gt=0, description="A teammate farther from the ego is left out.")
+    keep_frames: int = Field(
+        0, ge=0, le=10_000, description="Latest frames of a session whose messages are kept, to replay decisions."
+    )
     session_idle_s: float = Field(3600.0, gt=0, description="A session unused for longer is ended.")
+    audit_retention_s: float = Field(7 * 86400.0, gt=0, description="How long the log of an ended session can be read.")
     torch_threads: int = Field(1, ge=1, description="Threads of one detector pass; at this size one is fastest.")
 
     @field_validator("extra_detectors", mode="before")

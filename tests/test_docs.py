@@ -1,3 +1,4 @@
+import itertools
 import json
 import re
 from pathlib import Path
@@ -22,7 +23,7 @@ def test_every_setting_is_documented_with_its_default():
     assert {name.lower() for name in rows} == set(Settings.model_fields)
     for name, shown in rows.items():
         default = getattr(Settings(), name.lower())
-        assert str(default or "none").removesuffix(".0") == shown
+        assert str("none" if default == () else default).removesuffix(".0") == shown
 
 
 async def test_the_session_of_the_api_page_can_be_opened():
@@ -70,7 +71,7 @@ async def test_the_gateway_serves_the_example_detector_and_fuses_as_the_library_
     detector, attack = detectors.load("my_detector:build"), attacks.load("my_attack:Suppress")
     scene = robosac.IntersectionScene(3)
     (frame,) = Fleet(scene, detector, 1, 1, attack, seed=0).sense(0)
-    async with serve(lambda: 5, extra_detectors="my_detector:build") as served:
+    async with serve(itertools.repeat(5), extra_detectors="my_detector:build") as served:
         listed = (await served.http.get("/v1/detectors")).json()["detectors"]
         assert [entry["name"] for entry in listed] == ["intersection-mean", "occupancy-max"]
         session = await served.open(detector="occupancy-max")

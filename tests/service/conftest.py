@@ -1,4 +1,4 @@
-from collections.abc import AsyncIterator, Callable
+from collections.abc import AsyncIterator, Callable, Iterable
 from contextlib import asynccontextmanager
 from dataclasses import dataclass
 from typing import Any
@@ -44,8 +44,11 @@ class Served:
 
 
 @asynccontextmanager
-async def serve(new_seed: Callable[[], int] | None = None, **settings: Any) -> AsyncIterator[Served]:
-    app = create_app(Settings(**settings), new_seed)
+async def serve(seeds: Iterable[int] | None = None, **settings: Any) -> AsyncIterator[Served]:
+    """A gateway; ``seeds`` are those of its frames, one after another, if it is to be foreseen."""
+    numbers = None if seeds is None else iter(seeds)
+    made = (Settings(**settings),) if numbers is None else (Settings(**settings), lambda: f"{next(numbers):064x}")
+    app = create_app(*made)
     transport = httpx.ASGITransport(app, raise_app_exceptions=False)
     async with (
         app.router.lifespan_context(app),

@@ -43,8 +43,7 @@ async def test_a_hijacked_teammate_is_found_at_the_next_recheck(served, ego_mess
 
 
 async def test_a2cp_estimates_the_ratio_in_the_session(ego_message, attacked):
-    seeds = iter(range(100))
-    async with serve(new_seed=lambda: next(seeds)) as served:
+    async with serve(range(100)) as served:
         session = await served.open(defense={"kind": "a2cp"})
         answers = await run(served, session, ego_message, attacked, 8)
         state = (await served.ego(session).state())["state"]

@@ -17,8 +17,7 @@ ACCEPT_JSON = {"Accept": "application/json"}
 
 async def test_over_http_and_through_the_library_the_answer_is_the_same(detector, ego_message, attacked):
     defense = {"kind": "sample_consensus", "attacker_ratio": 0.2, "sampling_budget": 7, "collaborators": 3}
-    seeds = iter(range(100))
-    async with serve(new_seed=lambda: next(seeds)) as served:
+    async with serve(range(100)) as served:
         session = await served.open(defense=defense)
         steps = []
         for frame in range(6):
@@ -49,7 +48,7 @@ async def test_the_audit_log_replays_a_decision(detector, served, ego_message, a
         SampleConsensus(sampling_budget=7, collaborators=3),
         ego_message,
         {name: attacked[name] for name in TEAM},
-        rng=np.random.default_rng(int(record["seed"])),
+        rng=np.random.default_rng(int(record["seed"], 16)),
     )
     assert again.accepted == answer.accepted
     np.testing.assert_array_equal(again.boxes, answer.boxes)
@@ -204,13 +203,15 @@ async def test_late_stale_and_second_messages_are_refused_and_named(served, mess
     await teammate.send(5, messages["car-2"])
     problem(await post(5), 409, "duplicate-message")
     assert (await ego.ask(5, messages[EGO])).accepted == ("car-2",)
-    problem(await post(5), 409, "stale-frame")
-    assert (await ego.ask(6, messages[EGO])).rejected["car-2"]["reason"] == "late"
+    problem(await post(5), 409, "duplicate-message")
+    assert (await ego.ask(6, messages[EGO])).rejected["car-2"]["reason"] == "replayed"
+    problem(await post(6), 409, "stale-frame")
+    assert (await ego.ask(7, messages[EGO])).rejected["car-2"]["reason"] == "late"
     problem(await post(3), 409, "stale-frame")
-    assert (await ego.ask(7, messages[EGO])).rejected["car-2"]["reason"] == "stale"
-    assert (await ego.ask(8, messages[EGO])).rejected["car-2"]["reason"] == "missing"
+    assert (await ego.ask(8, messages[EGO])).rejected["car-2"]["reason"] == "stale"
+    assert (await ego.ask(9, messages[EGO])).rejected["car-2"]["reason"] == "missing"
     refused = [r["reason"] for r in await ego.audit() if r["event"] == "message_refused"]
-    assert refused == ["replayed", "late", "stale"]
+    assert refused == ["replayed", "replayed", "late", "stale"]
 
 
 async def test_frames_of_the_ego_must_increase(served, good_frame):

@@ -1,0 +1,55 @@
+"""The hash chain of an audit log.
+
+A log is a sequence of lines. Each is one record as canonical JSON (RFC 8785) and holds its number ``seq``, from 1 on,
+and ``previous``, the SHA-256 of the line before it; the *head* is the SHA-256 of the last line. Nothing can be changed,
+taken out or moved without breaking the chain, and nothing cut off its end without missing the head.
+"""
+
+from __future__ import annotations
+
+import hashlib
+from collections.abc import Mapping
+from typing import Any
+
+import rfc8785
+
+GENESIS = "0" * 64
+"""``previous`` of a log's first record."""
+
+
+def seal(event: Mapping[str, Any], session_id: str, seq: int, previous: str) -> str:
+    """The line of a record.
+
+    Parameters
+    ----------
+    event : mapping
+        What the record says; JSON values, integers below 2**53.
+    session_id : str
+    seq : int
+        Number of the record.
+    previous : str
+        `digest` of the line before, or `GENESIS`.
+
+    Raises
+    ------
+    rfc8785.CanonicalizationError
+        If a value has no canonical form, such as NaN.
+    """
+    line: bytes = rfc8785.dumps({**event, "session_id": session_id, "seq": seq, "previous": previous})
+    return line.decode()
+
+
+def digest(line: str) -> str:
+    """SHA-256 of a line without its line break, hexadecimal."""
+    return hashlib.sha256(line.encode()).hexdigest()
+
+
+def commitment(seed: str) -> str:
+    """What is published of a seed before it is used: SHA-256 of its bytes.
+
+    Parameters
+    ----------
+    seed : str
+        Hexadecimal, at least 128 bits from a source that nobody can foresee, so that the commitment tells nothing.
+    """
+    return hashlib.sha256(bytes.fromhex(seed)).hexdigest()
