@@ -10,22 +10,34 @@ import asyncio  # noqa: E402
 import contextlib  # noqa: E402
 from collections.abc import AsyncIterator, Callable  # noqa: E402
 from importlib.metadata import version  # noqa: E402
+from typing import TYPE_CHECKING  # noqa: E402
 
+import structlog  # noqa: E402
 from fastapi import FastAPI  # noqa: E402
 
 from service import problems  # noqa: E402
+from service.admission import Admission, Gate  # noqa: E402
 from service.engine import Engine  # noqa: E402
 from service.frames import Frames  # noqa: E402
 from service.gateway import Gateway  # noqa: E402
 from service.limits import BodyLimit  # noqa: E402
+from service.logs import logging_to_stderr  # noqa: E402
 from service.metrics import Metrics  # noqa: E402
 from service.routes import operations, v1  # noqa: E402
 from service.sessions import Sessions  # noqa: E402
 from service.settings import Settings  # noqa: E402
 from service.store import MemoryStore, new_seed  # noqa: E402
+from service.tracing import Traced, Tracing, provider_from_environment  # noqa: E402
+
+if TYPE_CHECKING:
+    from opentelemetry.sdk.trace import TracerProvider
+
+logger = structlog.stdlib.get_logger(__name__)
 
 
-def create_app(settings: Settings | None = None, seeds: Callable[[], str] = new_seed) -> FastAPI:
+def create_app(
+    settings: Settings | None = None, seeds: Callable[[], str] = new_seed, spans: TracerProvider | None = None
+) -> FastAPI:
     """A gateway.
 
     Parameters
@@ -35,26 +47,35 @@ def create_app(settings: Settings | None = None, seeds: Callable[[], str] = new_
     seeds : callable
         Seed of each frame's draws, hexadecimal; from the operating system by default. Set it only for tests: whoever
         knows the seed knows which subsets will be sampled.
+    spans : TracerProvider, optional
+        Takes the traces; by default what the environment says, see `service.tracing`.
     """
     settings = settings or Settings()
     engine = Engine(settings.torch_threads, settings.extra_detectors)
     metrics = Metrics()
     sessions = Sessions(settings, MemoryStore(), engine, metrics, seeds)
-    gateway = Gateway(engine, metrics, sessions, Frames(settings, sessions, engine, metrics))
+    admission = Admission()
+    tracing = Tracing(provider_from_environment() if spans is None else spans)
+    frames = Frames(settings, sessions, engine, metrics, admission, tracing)
+    gateway = Gateway(admission, engine, metrics, sessions, frames)
 
     @contextlib.asynccontextmanager
     async def lifespan(_: FastAPI) -> AsyncIterator[None]:
-        await engine.start()
-        if settings.detector not in engine.detectors:
-            raise ValueError(
-                f"ROBOSAC_DETECTOR: unknown detector {settings.detector!r}; known: {list(engine.detectors)}"
-            )
-        sweeper = asyncio.create_task(sessions.expire_idle())
-        try:
-            yield
-        finally:
-            sweeper.cancel()
-            engine.stop()
+        with logging_to_stderr(settings):
+            await engine.start()
+            if settings.detector not in engine.detectors:
+                raise ValueError(
+                    f"ROBOSAC_DETECTOR: unknown detector {settings.detector!r}; known: {list(engine.detectors)}"
+                )
+            sweeper = asyncio.create_task(sessions.expire_idle())
+            logger.info("gateway ready", version=version("robosac"), detectors=list(engine.detectors))
+            try:
+                yield
+            finally:
+                sweeper.cancel()
+                engine.stop()
+                tracing.close()
+                logger.info("gateway stopped")
 
     app = FastAPI(
         title="Defense gateway for collaborative perception",
@@ -65,7 +86,9 @@ def create_app(settings: Settings | None = None, seeds: Callable[[], str] = new_
     )
     app.state.gateway = gateway
     problems.install(app)
-    app.add_middleware(BodyLimit, limit=settings.max_body_bytes)
+    app.add_middleware(BodyLimit, limit=settings.max_body_bytes, timeout_s=settings.body_timeout_s)
+    app.add_middleware(Gate, admission=admission, budget_s=sessions.budget_s)
+    app.add_middleware(Traced, tracing=tracing)
     app.include_router(v1)
     app.include_router(operations)
     return app

@@ -2,11 +2,13 @@
 
 from __future__ import annotations
 
+import logging
 import time
 from collections.abc import Mapping
 from typing import Any
 
 import numpy as np
+import structlog
 
 from robosac import wire
 from robosac.defenses import Reason, Rejection
@@ -14,12 +16,16 @@ from robosac.detectors import Role
 from robosac.fusion import FusionResult
 from robosac.signatures import is_valid, read_public_key
 from service import audit
+from service.admission import Admission
 from service.engine import Engine
 from service.gathering import Equivocation, Received, Refused
 from service.metrics import Metrics
 from service.problems import Problem
 from service.sessions import Caller, Sessions
 from service.settings import Settings
+from service.tracing import Tracing
+
+logger = structlog.stdlib.get_logger(__name__)
 
 STRANGERS_NAMED = 8
 SLACK_BYTES = 64 * 1024
@@ -31,6 +37,10 @@ _REFUSALS = {
     Reason.MALFORMED: (409, "too-far-ahead"),
     Reason.UNAUTHENTICATED: (403, "not-enrolled"),
 }
+
+
+_WORK = ("receive", "prepare", "ego_only", "hypotheses", "consensus", "store")
+"""Stages in which the gateway works on a frame, instead of waiting."""
 
 
 class _Forged(Exception):
@@ -51,9 +61,21 @@ class Frames:
     sessions : Sessions
     engine : Engine
     metrics : Metrics
+    admission : Admission
+    tracing : Tracing
     """
 
-    def __init__(self, settings: Settings, sessions: Sessions, engine: Engine, metrics: Metrics) -> None:
+    def __init__(
+        self,
+        settings: Settings,
+        sessions: Sessions,
+        engine: Engine,
+        metrics: Metrics,
+        admission: Admission,
+        tracing: Tracing,
+    ) -> None:
+        self._tracing = tracing
+        self._admission = admission
         self._settings = settings
         self._sessions = sessions
         self._engine = engine
@@ -79,12 +101,13 @@ class Frames:
             await self._keep(caller, frame, received)
             return 202, {"frame": frame, "vehicle_id": caller.vehicle_id, "status": "accepted"}
         timings = {"receive": (time.perf_counter() - arrived) * 1e3}
-        async with caller.live.lock:
-            await self._check_ego(caller, frame, received)
-            gathering = time.perf_counter()
-            messages = await caller.live.gathering.collect(frame, arrived + caller.record.gather_ms / 1e3)
-            timings["gather"] = (time.perf_counter() - gathering) * 1e3
-            return 200, await self._answer(caller, frame, received, messages, {}, arrived, timings)
+        with self._admission.frame(caller.record.session_id, caller.live.budget_s):
+            async with caller.live.lock:
+                await self._check_ego(caller, frame, received)
+                gathering = time.perf_counter()
+                messages = await caller.live.gathering.collect(frame, arrived + caller.record.gather_ms / 1e3)
+                timings["gather"] = (time.perf_counter() - gathering) * 1e3
+                return 200, await self._answer(caller, frame, received, messages, {}, arrived, timings)
 
     async def post_frame(self, caller: Caller, body: bytes) -> dict[str, Any]:
         """A whole frame from the ego; a teammate whose part is malformed is left out, and the frame is answered."""
@@ -111,9 +134,10 @@ class Frames:
         for name in strangers[:STRANGERS_NAMED]:
             unusable[str(name)[:64]] = Rejection(Reason.UNAUTHENTICATED, {"detail": "not enrolled in this session"})
         timings = {"receive": (time.perf_counter() - arrived) * 1e3}
-        async with caller.live.lock:
-            await self._check_ego(caller, frame, ego)
-            return await self._answer(caller, frame, ego, messages, unusable, arrived, timings)
+        with self._admission.frame(caller.record.session_id, caller.live.budget_s):
+            async with caller.live.lock:
+                await self._check_ego(caller, frame, ego)
+                return await self._answer(caller, frame, ego, messages, unusable, arrived, timings)
 
     def body_limit(self, caller: Caller, *, whole_frame: bool) -> int:
         """Bytes that a message, or a whole frame, of a session's detector may have."""
@@ -217,7 +241,7 @@ class Frames:
             state=record.state,
             frame=frame,
             previous=live.previous,
-            deadline=arrived + record.latency_budget_ms / 1e3,
+            deadline=arrived + record.latency_budget_ms / 1e3 - self._admission.store_s,
         )
         timings.update(result.timings_ms)
         timings["total"] = (time.perf_counter() - arrived) * 1e3
@@ -231,11 +255,26 @@ class Frames:
             unlogged=live.unlogged(),
         )
         await self._sessions.decide(caller, frame, result.state, event, self._to_keep(frame, ego, present))
+        timings["store"] = (time.perf_counter() - arrived) * 1e3 - timings["total"]
+        self._admission.learn(sum(timings[stage] for stage in _WORK) / 1e3, timings["store"] / 1e3)
         live.previous, live.ego_digest = result.previous, ego.digest
         for name, received in {record.ego_id: ego, **present}.items():
             live.motion.moved(name, frame, received.message.pose)
         reasons = [entry["reason"] for entry in answer["rejected"]]
         self._metrics.frame(result, reasons, answer["degraded_by"], timings)
+        self._tracing.frame(record.session_id, answer, timings)
+        logger.log(
+            logging.DEBUG if answer["degraded_by"] is None and answer["deadline_met"] else logging.WARNING,
+            "frame answered",
+            session_id=record.session_id,
+            frame=frame,
+            source=answer["source"],
+            accepted=answer["accepted"],
+            degraded_by=answer["degraded_by"],
+            fault=result.fault,
+            deadline_met=answer["deadline_met"],
+            total_ms=round(timings["total"], 1),
+        )
         return answer
 
     def _to_keep(self, frame: int, ego: Received, present: Mapping[str, Received]) -> bytes | None:

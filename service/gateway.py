@@ -4,6 +4,7 @@ from __future__ import annotations
 
 from dataclasses import dataclass
 
+from service.admission import Admission
 from service.engine import Engine
 from service.frames import Frames
 from service.metrics import Metrics
@@ -14,6 +15,7 @@ from service.sessions import Sessions
 class Gateway:
     """One gateway: the detectors and their thread, its sessions, and what answers their frames."""
 
+    admission: Admission
     engine: Engine
     metrics: Metrics
     sessions: Sessions

@@ -1,6 +1,8 @@
-"""Bounds on request bodies, kept while they are read."""
+"""Bounds on request bodies, in bytes and in time, kept while they are read."""
 
 from __future__ import annotations
+
+import asyncio
 
 from fastapi import Request
 from starlette.datastructures import Headers
@@ -44,11 +46,22 @@ async def read_bounded(request: Request, limit: int) -> bytes:
 
 
 class BodyLimit:
-    """Bounds every body, whatever route reads it: 413 by its announced length, else when it outgrows the limit."""
+    """Bounds every body, whatever route reads it: 413 by its announced length, else when it outgrows the limit; 408 if
+    it is not there in time.
 
-    def __init__(self, app: ASGIApp, limit: int) -> None:
+    Parameters
+    ----------
+    app : ASGI app
+    limit : int
+        Bytes.
+    timeout_s : float
+        From the first time that a route asks for it to its last byte.
+    """
+
+    def __init__(self, app: ASGIApp, limit: int, timeout_s: float) -> None:
         self._app = app
         self._limit = limit
+        self._timeout_s = timeout_s
 
     async def __call__(self, scope: Scope, receive: Receive, send: Send) -> None:
         if scope["type"] != "http":
@@ -58,10 +71,21 @@ class BodyLimit:
             await too_large(self._limit).response()(scope, receive, send)
             return
         taken = 0
+        complete = False
+        end: float | None = None
 
         async def bounded() -> Message:
-            nonlocal taken
-            message = await receive()
+            nonlocal taken, complete, end
+            if complete:
+                return await receive()
+            end = asyncio.get_running_loop().time() + self._timeout_s if end is None else end
+            try:
+                async with asyncio.timeout_at(end):
+                    message = await receive()
+            except TimeoutError as error:
+                # connection: close, as the rest of the body may still come, or never
+                raise HTTPException(408, "the body did not come in time", {"Connection": "close"}) from error
+            complete = not message.get("more_body", False)
             taken += len(message.get("body", b""))
             if taken > self._limit:
                 raise HTTPException(413, too_large(self._limit).detail)  # FastAPI lets no other pass here

@@ -6,11 +6,11 @@ path in ``field``.
 
 from __future__ import annotations
 
-import logging
 from collections.abc import Mapping
 from http import HTTPStatus
 from typing import Any
 
+import structlog
 from fastapi import FastAPI, Request
 from fastapi.exceptions import RequestValidationError
 from fastapi.responses import JSONResponse
@@ -19,7 +19,7 @@ from starlette.exceptions import HTTPException
 from robosac.wire import WireError
 from service.schemas import DEFENSE_KINDS
 
-logger = logging.getLogger(__name__)
+logger = structlog.stdlib.get_logger(__name__)
 
 MEDIA_TYPE = "application/problem+json"
 TYPE_PREFIX = "urn:robosac:problem:"
@@ -114,10 +114,10 @@ def install(app: FastAPI) -> None:
     async def _http(_: Request, error: HTTPException) -> JSONResponse:
         phrase = HTTPStatus(error.status_code).phrase.lower().replace(" ", "-")
         # 400 comes only from bodies that FastAPI cannot parse; Python 3.13 renamed the phrase of 413
-        slug = {400: "malformed-json", 413: "too-large"}.get(error.status_code, phrase)
+        slug = {400: "malformed-json", 408: "slow-body", 413: "too-large"}.get(error.status_code, phrase)
         return Problem(error.status_code, slug, str(error.detail), headers=error.headers).response()
 
     @app.exception_handler(Exception)
     async def _internal(request: Request, error: Exception) -> JSONResponse:
-        logger.error("unhandled error in %s %s", request.method, request.url.path, exc_info=error)
+        logger.error("unhandled error", method=request.method, path=request.url.path, exc_info=error)
         return Problem(500, "internal-error", "the gateway failed to handle this request").response()

@@ -8,6 +8,7 @@ from typing import Annotated, Any
 
 from fastapi import APIRouter, Depends, Header, Path, Query, Request, Response
 from fastapi.security import HTTPAuthorizationCredentials, HTTPBearer
+from starlette.exceptions import HTTPException
 
 from robosac import wire
 from service.gateway import Gateway
@@ -187,6 +188,10 @@ async def _read_body(request: Request, caller: Caller, gateway: Gateway, *, whol
         return await read_bounded(request, gateway.frames.body_limit(caller, whole_frame=whole_frame))
     except Problem as problem:
         await gateway.frames.note_unread(caller, problem)
+        raise
+    except HTTPException as error:
+        slug = "slow-body" if error.status_code == 408 else "too-large"
+        await gateway.frames.note_unread(caller, Problem(error.status_code, slug, str(error.detail)))
         raise
 
 

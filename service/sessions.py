@@ -5,13 +5,14 @@ from __future__ import annotations
 import asyncio
 import contextlib
 import hashlib
-import logging
 import secrets
 import time
 from collections import Counter
 from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass, field
 from typing import Any
+
+import structlog
 
 from robosac.audit import commitment
 from robosac.budget import DomainError
@@ -28,7 +29,7 @@ from service.schemas import DetectorEntry, SessionCreated, SessionRequest, Sessi
 from service.settings import Settings
 from service.store import AuditEvent, FrameDecided, SessionOver, SessionRecord, Store, new_seed
 
-logger = logging.getLogger(__name__)
+logger = structlog.stdlib.get_logger(__name__)
 
 SWEEP_EVERY_S = 30.0
 REFUSALS_LOGGED = 16
@@ -43,6 +44,7 @@ class LiveSession:
     defense: Defense
     gathering: Gathering
     motion: Motion
+    budget_s: float
     previous: PreviousAnswer | None = None
     ego_digest: str | None = None
     lock: asyncio.Lock = field(default_factory=asyncio.Lock)
@@ -141,6 +143,14 @@ class Sessions:
         await self._store.create(record, audit.session_opened(record, detector.info))
         self._live[record.session_id] = self._revive(record)
         self._metrics.sessions.set(await self._store.count())
+        logger.info(
+            "session opened",
+            session_id=record.session_id,
+            ego_id=record.ego_id,
+            teammates=len(record.teammates),
+            detector=record.detector,
+            defense=request.defense.kind,
+        )
         return SessionCreated(
             session_id=record.session_id,
             ego_token=tokens.pop(request.ego_id),
@@ -175,6 +185,11 @@ class Sessions:
         caller = await self.authenticate(session_id, token)
         _only_ego(caller.record, caller.vehicle_id)
         return caller
+
+    def budget_s(self, session_id: str) -> float | None:
+        """Latency budget of a session that is in use."""
+        live = self._live.get(session_id)
+        return None if live is None else live.budget_s
 
     async def audit_log(self, session_id: str, token: str | None, after: int) -> list[str]:
         """Lines of the log with a number above ``after``, for the ego; of an ended session, too."""
@@ -283,6 +298,14 @@ class Sessions:
         caller.live.refusals[caller.vehicle_id] += 1
         if caller.live.refusals[caller.vehicle_id] > REFUSALS_LOGGED:
             return
+        logger.info(
+            "message refused",
+            session_id=caller.record.session_id,
+            vehicle_id=caller.vehicle_id,
+            reason=reason.value,
+            detail=detail,
+            frame=frame,
+        )
         await self.log(caller, audit.message_refused(caller.vehicle_id, reason, detail, frame=frame, field=field))
 
     async def log_equivocation(self, caller: Caller, frame: int, first: str, second: Received) -> None:
@@ -290,6 +313,9 @@ class Sessions:
         self._metrics.refused(Reason.REPLAYED.value)
         caller.live.refusals[caller.vehicle_id] += 1
         if caller.live.refusals[caller.vehicle_id] <= REFUSALS_LOGGED:
+            logger.warning(
+                "equivocation", session_id=caller.record.session_id, vehicle_id=caller.vehicle_id, frame=frame
+            )
             await self.log(caller, audit.equivocation(caller.vehicle_id, frame, first, second.proof))
 
     async def _change_team(
@@ -327,6 +353,7 @@ class Sessions:
             read_defense(record.defense).build(),
             Gathering(record.teammates, settings.max_pending_frames, self.backlog, closed),
             Motion(settings.max_speed_mps, record.frame_period_ms / 1e3, settings.max_range_m),
+            record.latency_budget_ms / 1e3,
         )
 
     def _in_use(self, session_id: str) -> bool:
@@ -341,6 +368,7 @@ class Sessions:
             live.gathering.clear()
         with contextlib.suppress(SessionOver):
             event = audit.session_ended(why)
+            logger.info("session ended", session_id=session_id, why=why)
             await self._store.end(session_id, event["time"], event)
         self._metrics.sessions.set(await self._store.count())
 

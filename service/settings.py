@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from typing import Annotated
+from typing import Annotated, Literal
 
 from pydantic import Field, field_validator
 from pydantic_settings import BaseSettings, NoDecode, SettingsConfigDict
@@ -29,6 +29,7 @@ class Settings(BaseSettings):
         description="Longest wait for teammates once the ego's message is in; by default at most half the budget.",
     )
     max_body_bytes: int = Field(32 * 2**20, ge=1024, description="Largest request body.")
+    body_timeout_s: float = Field(10.0, gt=0, description="Time that a body may take from first to last byte.")
     max_sessions: int = Field(10_000, ge=1, description="Open sessions at a time.")
     max_teammates: int = Field(63, ge=1, le=1024, description="Teammates of one session.")
     max_pending_frames: int = Field(
@@ -44,6 +45,8 @@ class Settings(BaseSettings):
     )
     session_idle_s: float = Field(3600.0, gt=0, description="A session unused for longer is ended.")
     audit_retention_s: float = Field(7 * 86400.0, gt=0, description="How long the log of an ended session can be read.")
+    log_level: Literal["debug", "info", "warning", "error"] = Field("info", description="Least of what is logged.")
+    log_format: Literal["json", "console"] = Field("json", description="One JSON object a line, or for the eye.")
     torch_threads: int = Field(1, ge=1, description="Threads of one detector pass; at this size one is fastest.")
 
     @field_validator("extra_detectors", mode="before")

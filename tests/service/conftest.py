@@ -5,6 +5,7 @@ from typing import Any
 
 import httpx
 import pytest
+from opentelemetry.sdk.trace import TracerProvider
 
 from clients.client import GatewayClient, OpenedSession, VehicleClient
 from robosac import wire
@@ -44,11 +45,15 @@ class Served:
 
 
 @asynccontextmanager
-async def serve(seeds: Iterable[int] | None = None, **settings: Any) -> AsyncIterator[Served]:
+async def serve(
+    seeds: Iterable[int] | None = None, spans: TracerProvider | None = None, **settings: Any
+) -> AsyncIterator[Served]:
     """A gateway; ``seeds`` are those of its frames, one after another, if it is to be foreseen."""
-    numbers = None if seeds is None else iter(seeds)
-    made = (Settings(**settings),) if numbers is None else (Settings(**settings), lambda: f"{next(numbers):064x}")
-    app = create_app(*made)
+    options: dict[str, Any] = {"spans": spans}
+    if seeds is not None:
+        numbers = iter(seeds)
+        options["seeds"] = lambda: f"{next(numbers):064x}"
+    app = create_app(Settings(**settings), **options)
     transport = httpx.ASGITransport(app, raise_app_exceptions=False)
     async with (
         app.router.lifespan_context(app),

@@ -277,8 +277,8 @@ async def test_a_refusal_of_the_ego_blames_no_teammate(served, good_frame):
 
 async def test_the_same_frame_sent_twice_at_once_is_answered_once(served, good_frame):
     session = await served.open()
-    responses = await asyncio.gather(*(served.post(session, "frames", good_frame(0)) for _ in range(5)))
-    assert sorted(response.status_code for response in responses) == [200, 409, 409, 409, 409]
+    responses = await asyncio.gather(*(served.post(session, "frames", good_frame(0)) for _ in range(3)))
+    assert sorted(response.status_code for response in responses) == [200, 409, 409]
 
 
 async def test_a_session_that_ends_under_a_waiting_ego_says_so(served, messages):

@@ -1,0 +1,100 @@
+"""How many frames are taken on at a time: no more than can be answered within their budgets."""
+
+from __future__ import annotations
+
+import math
+import re
+from collections.abc import Callable, Iterator
+from contextlib import contextmanager
+
+from starlette.types import ASGIApp, Receive, Scope, Send
+
+from service.problems import Problem
+
+SHARE = 0.7
+"""Part of a frame's budget that the frames before it may take."""
+SESSION_FRAMES = 3
+"""Frames of one session in hand or waiting at a time, so that no ego takes the others' share."""
+FIRST_GUESS_S = 0.02
+SMOOTHING = 0.1
+_FRAMES_PATH = re.compile(r"/v1/sessions/([^/]+)/frames")
+
+
+class Admission:
+    """Counts the frames in hand and estimates from the latest what one costs.
+
+    A frame is admitted if the work before it and its own are expected to end within `SHARE` of its budget. Of frames
+    that wait for their teammates the wait is not work, but they count, since they may all wake at once.
+    """
+
+    def __init__(self) -> None:
+        self.store_s = 0.0
+        """What keeping a decision costs, by the latest; the time to leave for it."""
+        self._frames = 0
+        self._by_session: dict[str, int] = {}
+        self._cost_s = FIRST_GUESS_S
+
+    def check(self, session_id: str, budget_s: float) -> None:
+        """Refuse a frame that is not expected to be answered in time.
+
+        Raises
+        ------
+        Problem
+            503 with Retry-After.
+        """
+        busy_s = self._frames * self._cost_s
+        if self._frames and busy_s + self._cost_s > SHARE * budget_s:
+            raise _overloaded("the gateway has more frames in hand than it can answer in time", busy_s)
+        if self._by_session.get(session_id, 0) >= SESSION_FRAMES:
+            raise _overloaded(f"{SESSION_FRAMES} frames of this session are in hand", busy_s)
+
+    @contextmanager
+    def frame(self, session_id: str, budget_s: float) -> Iterator[None]:
+        """Take a frame on for the length of a block, or refuse it as `check` does."""
+        self.check(session_id, budget_s)
+        self._frames += 1
+        self._by_session[session_id] = self._by_session.get(session_id, 0) + 1
+        try:
+            yield
+        finally:
+            self._frames -= 1
+            self._by_session[session_id] -= 1
+            if not self._by_session[session_id]:
+                del self._by_session[session_id]
+
+    def learn(self, cost_s: float, store_s: float) -> None:
+        """Take into account what a frame has cost in all, waiting left out, and what keeping its decision has."""
+        self._cost_s += SMOOTHING * (cost_s - self._cost_s)
+        self.store_s += SMOOTHING * (store_s - self.store_s)
+
+
+class Gate:
+    """Refuses whole frames beyond capacity before anything of them is read, authenticated or looked up.
+
+    Parameters
+    ----------
+    app : ASGI app
+    admission : Admission
+    budget_s : callable
+        Latency budget of a session that is in use, by its id; None if it is not.
+    """
+
+    def __init__(self, app: ASGIApp, admission: Admission, budget_s: Callable[[str], float | None]) -> None:
+        self._app = app
+        self._admission = admission
+        self._budget_s = budget_s
+
+    async def __call__(self, scope: Scope, receive: Receive, send: Send) -> None:
+        if scope["type"] == "http" and scope["method"] == "POST" and (found := _FRAMES_PATH.fullmatch(scope["path"])):
+            budget_s = self._budget_s(found[1])
+            if budget_s is not None:
+                try:
+                    self._admission.check(found[1], budget_s)
+                except Problem as problem:
+                    await problem.response()(scope, receive, send)
+                    return
+        await self._app(scope, receive, send)
+
+
+def _overloaded(detail: str, busy_s: float) -> Problem:
+    return Problem(503, "overloaded", detail, headers={"Retry-After": str(max(1, math.ceil(busy_s)))})
