@@ -234,8 +234,8 @@ class VehicleClient:
         self.vehicle_id = vehicle_id
         self._request = request
         self._path = f"/v1/sessions/{session_id}"
-        self._bearer = {"Authorization": f"Bearer {token}"}
-        self._tensors = {**self._bearer, "Content-Type": MSGPACK, "Accept": MSGPACK}
+        self.bearer = {"Authorization": f"Bearer {token}"}
+        self._tensors = {**self.bearer, "Content-Type": MSGPACK, "Accept": MSGPACK}
 
     def signature(self, frame: int, message: Message) -> bytes | None:
         """The vehicle's signature over its message; None if it has no key."""
@@ -273,7 +273,7 @@ class VehicleClient:
 
     async def state(self) -> Mapping[str, Any]:
         """As the ego: the session's state."""
-        return _json(await self._request("GET", self._path, headers=self._bearer))
+        return _json(await self._request("GET", self._path, headers=self.bearer))
 
     async def audit(self, after: int = 0) -> list[Mapping[str, Any]]:
         """As the ego: audit records with a number above ``after``."""
@@ -284,20 +284,20 @@ class VehicleClient:
 
     async def audit_lines(self, after: int = 0) -> list[str]:
         """As `audit`, the lines as they are chained."""
-        response = await self._request("GET", f"{self._path}/audit", params={"after": after}, headers=self._bearer)
+        response = await self._request("GET", f"{self._path}/audit", params={"after": after}, headers=self.bearer)
         text: str = response.text
         return text.splitlines()
 
     async def kept_messages(self, frame: int) -> bytes:
         """As the ego: the messages of a decided frame as a whole frame, where the gateway keeps them."""
         path = f"{self._path}/frames/{frame}/messages"
-        content: bytes = (await self._request("GET", path, headers=self._bearer)).content
+        content: bytes = (await self._request("GET", path, headers=self.bearer)).content
         return content
 
     async def enrol(self, teammates: Sequence[str], public_keys: Mapping[str, str] | None = None) -> Mapping[str, str]:
         """As the ego: let teammates join; their tokens."""
         body = {"teammates": list(teammates), "public_keys": dict(public_keys or {})}
-        fields = _json(await self._request("POST", f"{self._path}/teammates", json=body, headers=self._bearer))
+        fields = _json(await self._request("POST", f"{self._path}/teammates", json=body, headers=self.bearer))
         try:
             return dict(fields["teammate_tokens"])
         except (KeyError, TypeError, ValueError) as error:
@@ -305,11 +305,11 @@ class VehicleClient:
 
     async def dismiss(self, teammate: str) -> None:
         """As the ego: let a teammate leave."""
-        await self._request("DELETE", f"{self._path}/teammates/{teammate}", headers=self._bearer)
+        await self._request("DELETE", f"{self._path}/teammates/{teammate}", headers=self.bearer)
 
     async def close(self) -> None:
         """As the ego: end the session."""
-        await self._request("DELETE", self._path, headers=self._bearer)
+        await self._request("DELETE", self._path, headers=self.bearer)
 
 
 def _answer(response: httpx.Response) -> FrameAnswer:

@@ -105,7 +105,7 @@ class Figures:
         }
 
 
-class _Bodies:
+class PreparedBodies:
     """Packed frames of one fleet, renumbered without packing them again."""
 
     def __init__(self, frames: Sequence[bytes]) -> None:
@@ -126,7 +126,7 @@ class _Bodies:
         return b"".join((self._prefix, wire.pack(index), self._tails[index % len(self._tails)]))
 
 
-def prepare(attacked: bool, scene_seed: int, console: Console) -> _Bodies:
+def prepare(attacked: bool, scene_seed: int, console: Console) -> PreparedBodies:
     """Sense, attack and pack the frames of one ego and its five teammates."""
     fleet = Fleet(IntersectionScene(scene_seed), load(), 1, int(attacked), PGD(), seed=0)
     bodies = []
@@ -134,10 +134,12 @@ def prepare(attacked: bool, scene_seed: int, console: Console) -> _Bodies:
     for index in track(range(PREPARED_FRAMES), label, console=console, transient=True):
         (frame,) = fleet.sense(index)
         bodies.append(wire.pack_frame(0, frame.message, frame.sent))
-    return _Bodies(bodies)
+    return PreparedBodies(bodies)
 
 
-async def run_load(gateway: GatewayClient, work: Load, bodies: _Bodies, seconds: float, budget_ms: float) -> Figures:
+async def run_load(
+    gateway: GatewayClient, work: Load, bodies: PreparedBodies, seconds: float, budget_ms: float
+) -> Figures:
     """Load the gateway for a time, after a few frames that do not count."""
     figures = Figures(work)
     agents = IntersectionScene(0).agents
@@ -149,7 +151,8 @@ async def run_load(gateway: GatewayClient, work: Load, bodies: _Bodies, seconds:
             stack.push_async_callback(ego.close)
             egos.append(ego)
         for index in range(WARM_UP_FRAMES):
-            await asyncio.gather(*(ego.post_frame_body(bodies.numbered(index)) for ego in egos))
+            for ego in egos:
+                await ego.post_frame_body(bodies.numbered(index))
         loop = _closed if work.loop == "closed" else _open
         started = time.perf_counter()
         await asyncio.gather(
@@ -160,7 +163,13 @@ async def run_load(gateway: GatewayClient, work: Load, bodies: _Bodies, seconds:
 
 
 async def _closed(
-    ego: VehicleClient, _: int, bodies: _Bodies, figures: Figures, started: float, seconds: float, budget_ms: float
+    ego: VehicleClient,
+    _: int,
+    bodies: PreparedBodies,
+    figures: Figures,
+    started: float,
+    seconds: float,
+    budget_ms: float,
 ) -> None:
     index = WARM_UP_FRAMES
     while time.perf_counter() - started < seconds:
@@ -169,7 +178,13 @@ async def _closed(
 
 
 async def _open(
-    ego: VehicleClient, number: int, bodies: _Bodies, figures: Figures, started: float, seconds: float, budget_ms: float
+    ego: VehicleClient,
+    number: int,
+    bodies: PreparedBodies,
+    figures: Figures,
+    started: float,
+    seconds: float,
+    budget_ms: float,
 ) -> None:
     rate = figures.load.rate_hz or 1 / FRAME_PERIOD_S
     offset = number / figures.load.egos / rate  # egos are not in step
@@ -281,7 +296,7 @@ def main(
 async def _run_all(
     url: str | None,
     loads: Sequence[Load],
-    bodies: dict[bool, _Bodies],
+    bodies: dict[bool, PreparedBodies],
     seconds: float,
     budget_ms: float,
     console: Console,
