@@ -183,7 +183,10 @@ class Sessions:
     async def authenticate_ego(self, session_id: str, token: str | None) -> Caller:
         """As `authenticate`, but 403 for anybody but the ego."""
         caller = await self.authenticate(session_id, token)
-        _only_ego(caller.record, caller.vehicle_id)
+        if not caller.is_ego:
+            problem = _ego_only(caller.vehicle_id)
+            await self.log_refusal(caller, Reason.UNAUTHENTICATED, problem.detail, None, "")
+            raise problem
         return caller
 
     def budget_s(self, session_id: str) -> float | None:
@@ -196,7 +199,10 @@ class Sessions:
         record = await self._store.get(session_id)
         if record is None:
             raise Problem(404, "unknown-session", "there is no such session; its log may have been purged")
-        _only_ego(record, self._vehicle(record, token))
+        if record.ended_at is None:
+            await self.authenticate_ego(session_id, token)
+        elif (vehicle := self._vehicle(record, token)) != record.ego_id:
+            raise _ego_only(vehicle)
         return await self._store.audit(session_id, after)
 
     async def enrol(self, caller: Caller, newcomers: Sequence[str], public_keys: Mapping[str, str]) -> TeamChanged:
@@ -386,9 +392,8 @@ class Sessions:
         )
 
 
-def _only_ego(record: SessionRecord, vehicle_id: str) -> None:
-    if vehicle_id != record.ego_id:
-        raise Problem(403, "ego-only", f"only the ego of the session may do this, not {vehicle_id}")
+def _ego_only(vehicle_id: str) -> Problem:
+    return Problem(403, "ego-only", f"only the ego of the session may do this, not {vehicle_id}")
 
 
 def _over() -> Problem:
