@@ -20,6 +20,8 @@ from robosac.signatures import sign
 
 MSGPACK = "application/vnd.msgpack"
 DEFAULT_TIMEOUT_S = 30.0
+API_KEY_VARIABLE = "ROBOSAC_API_KEY"
+"""Where the command lines look for an API key: better than an option, which every process of the machine can read."""
 
 
 @dataclass(frozen=True)
@@ -29,8 +31,17 @@ class OpenedSession:
     session_id: str
     ego_token: str
     teammate_tokens: Mapping[str, str]
+    tokens_expire_at: str
     detector: Mapping[str, Any]
     defense: Mapping[str, Any]
+
+
+@dataclass(frozen=True)
+class RenewedToken:
+    """A vehicle's fresh token, and when it expires (RFC 3339, UTC)."""
+
+    token: str
+    expires_at: str
 
 
 @dataclass(frozen=True)
@@ -102,6 +113,8 @@ class GatewayClient:
     Parameters
     ----------
     base_url : str
+    api_key : str, optional
+        To open sessions where the gateway asks for one; sent with nothing else.
     timeout_s : float
         For one request.
     transport : httpx.AsyncBaseTransport, optional
@@ -118,8 +131,13 @@ class GatewayClient:
     """
 
     def __init__(
-        self, base_url: str, timeout_s: float = DEFAULT_TIMEOUT_S, transport: httpx.AsyncBaseTransport | None = None
+        self,
+        base_url: str,
+        api_key: str | None = None,
+        timeout_s: float = DEFAULT_TIMEOUT_S,
+        transport: httpx.AsyncBaseTransport | None = None,
     ) -> None:
+        self._opener = {} if api_key is None else _bearer(api_key)
         limits = httpx.Limits(max_connections=None, max_keepalive_connections=256)
         self._http = httpx.AsyncClient(
             base_url=base_url, timeout=timeout_s, limits=limits, transport=transport, trust_env=False
@@ -178,12 +196,13 @@ class GatewayClient:
         }
         body: dict[str, Any] = {"ego_id": ego_id, "teammates": list(teammates)}
         body |= {name: value for name, value in options.items() if value is not None}
-        fields = _json(await self._request("POST", "/v1/sessions", json=body))
+        fields = _json(await self._request("POST", "/v1/sessions", json=body, headers=self._opener))
         try:
             return OpenedSession(
                 fields["session_id"],
                 fields["ego_token"],
                 fields["teammate_tokens"],
+                fields["tokens_expire_at"],
                 fields["detector"],
                 fields["defense"],
             )
@@ -223,7 +242,7 @@ class GatewayClient:
 class VehicleClient:
     """One vehicle in a session, speaking with its own token.
 
-    Made by `GatewayClient.vehicle`. A teammate can only `send`; the ego may call everything.
+    Made by `GatewayClient.vehicle`. A teammate can only `send` and `renew`; the ego may call everything.
     """
 
     def __init__(
@@ -234,8 +253,21 @@ class VehicleClient:
         self.vehicle_id = vehicle_id
         self._request = request
         self._path = f"/v1/sessions/{session_id}"
-        self.bearer = {"Authorization": f"Bearer {token}"}
+        self._speak_with(token)
+
+    def _speak_with(self, token: str) -> None:
+        self.bearer = _bearer(token)
         self._tensors = {**self.bearer, "Content-Type": MSGPACK, "Accept": MSGPACK}
+
+    async def renew(self) -> RenewedToken:
+        """Take a fresh token and speak with it from now on; the one before is worth nothing any more."""
+        fields = _json(await self._request("POST", f"{self._path}/token", headers=self.bearer))
+        try:
+            renewed = RenewedToken(fields["token"], fields["expires_at"])
+        except KeyError as error:
+            raise ProtocolError(f"not a fresh token: {error!r} is missing") from error
+        self._speak_with(renewed.token)
+        return renewed
 
     def signature(self, frame: int, message: Message) -> bytes | None:
         """The vehicle's signature over its message; None if it has no key."""
@@ -310,6 +342,10 @@ class VehicleClient:
     async def close(self) -> None:
         """As the ego: end the session."""
         await self._request("DELETE", self._path, headers=self.bearer)
+
+
+def _bearer(credential: str) -> dict[str, str]:
+    return {"Authorization": f"Bearer {credential}"}
 
 
 def _answer(response: httpx.Response) -> FrameAnswer:

@@ -6,7 +6,7 @@ import asyncio
 import sys
 import time
 from collections import deque
-from dataclasses import dataclass
+from dataclasses import dataclass, field
 from pathlib import Path
 from typing import Annotated, Any
 
@@ -17,7 +17,7 @@ from rich.live import Live
 from rich.progress import BarColumn, MofNCompleteColumn, Progress, TextColumn, TimeRemainingColumn
 from rich.table import Table
 
-from clients.client import FrameAnswer, GatewayClient, OpenedSession
+from clients.client import API_KEY_VARIABLE, FrameAnswer, GatewayClient, OpenedSession
 from clients.errors import GatewayError
 from clients.simulation import EgoFrame, Fleet, make_folder
 from clients.summary import FleetSummary
@@ -51,6 +51,8 @@ class FleetOptions:
         Hold the frames to 5 Hz of the clock, where the machine can keep up.
     report : Path or None
         Folder for the summary and the picture.
+    api_key : str or None
+        To open sessions, where the gateway asks for one.
     """
 
     url: str
@@ -65,6 +67,7 @@ class FleetOptions:
     seed: int
     real_time: bool
     report: Path | None
+    api_key: str | None = field(default=None, repr=False)
 
 
 class _Screen:
@@ -116,9 +119,9 @@ class _Screen:
 class _Vehicle:
     """One vehicle: its own connection to the gateway, and its tokens in the egos' sessions."""
 
-    def __init__(self, vehicle_id: str, url: str) -> None:
+    def __init__(self, vehicle_id: str, url: str, api_key: str | None) -> None:
         self.vehicle_id = vehicle_id
-        self.gateway = GatewayClient(url)
+        self.gateway = GatewayClient(url, api_key)
         self._tokens: dict[str, tuple[str, str]] = {}
 
     def enrol(self, ego_id: str, session: OpenedSession) -> None:
@@ -162,7 +165,7 @@ async def run_fleet(options: FleetOptions, console: Console) -> FleetSummary:
 
 
 async def _run_scene(options: FleetOptions, fleet: Fleet, summary: FleetSummary, screen: _Screen) -> None:
-    vehicles = {agent: _Vehicle(agent, options.url) for agent in fleet.scene.agents}
+    vehicles = {agent: _Vehicle(agent, options.url, options.api_key) for agent in fleet.scene.agents}
     try:
         for ego_id in fleet.egos:
             session = await vehicles[ego_id].gateway.open_session(
@@ -212,6 +215,9 @@ def main(
     seed: Annotated[int, typer.Option(help="Of the attackers' choice and starts.")] = 0,
     real_time: Annotated[bool, typer.Option(help="Hold frames to 5 Hz of the clock.")] = False,
     report: Annotated[Path | None, typer.Option(help="Folder for summary.json and example.png.")] = None,
+    api_key: Annotated[
+        str | None, typer.Option(envvar=API_KEY_VARIABLE, help="Opens sessions, where the gateway asks for one.")
+    ] = None,
 ) -> None:
     """Drive a simulated fleet, some of it hostile, through a running gateway."""
     torch.set_num_threads(1)
@@ -237,6 +243,7 @@ def main(
         seed=seed,
         real_time=real_time,
         report=report,
+        api_key=api_key,
     )
     try:
         summary = asyncio.run(run_fleet(options, console))
@@ -250,7 +257,7 @@ def close_run(options: FleetOptions, summary: FleetSummary, console: Console) ->
     """Print the summary and write the report where one is wanted."""
     summary.print(console)
     if options.report is not None:
-        settings = {name: value for name, value in vars(options).items() if name not in ("report", "url")}
+        settings = {name: value for name, value in vars(options).items() if name not in ("report", "url", "api_key")}
         picture = summary.write(options.report, settings)
         console.print(f"Report: {options.report / 'summary.json'} and {picture}")
 

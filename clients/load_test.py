@@ -29,7 +29,7 @@ from rich.console import Console
 from rich.progress import track
 from rich.table import Table
 
-from clients.client import FrameAnswer, GatewayClient, VehicleClient
+from clients.client import API_KEY_VARIABLE, FrameAnswer, GatewayClient, VehicleClient
 from clients.errors import GatewayError
 from clients.local_gateway import local_gateway
 from clients.simulation import Fleet, make_folder
@@ -252,6 +252,9 @@ def main(
     budget_ms: Annotated[float, typer.Option(min=1, help="Latency budget.")] = 200.0,
     scene: Annotated[int, typer.Option(min=0, help="Seed of the scene whose frames are sent.")] = 3,
     out: Annotated[Path | None, typer.Option(help="Folder for load_test.json.")] = None,
+    api_key: Annotated[
+        str | None, typer.Option(envvar=API_KEY_VARIABLE, help="Opens sessions, where the gateway asks for one.")
+    ] = None,
 ) -> None:
     """Measure a gateway's capacity and latency, with and without attackers, for one ego and for several."""
     torch.set_num_threads(1)
@@ -266,7 +269,7 @@ def main(
         for attacked in (False, True)
     ]
     try:
-        results = asyncio.run(_run_all(url, loads, bodies, seconds, budget_ms, console))
+        results = asyncio.run(_run_all(url, api_key, loads, bodies, seconds, budget_ms, console))
     except asyncio.CancelledError:
         sys.exit(143)
     except (GatewayError, OSError) as error:
@@ -295,6 +298,7 @@ def main(
 
 async def _run_all(
     url: str | None,
+    api_key: str | None,
     loads: Sequence[Load],
     bodies: dict[bool, PreparedBodies],
     seconds: float,
@@ -305,7 +309,7 @@ async def _run_all(
         if url is None:
             folder = Path(stack.enter_context(tempfile.TemporaryDirectory()))
             url = await stack.enter_async_context(local_gateway(folder / "gateway.log"))
-        gateway = await stack.enter_async_context(GatewayClient(url))
+        gateway = await stack.enter_async_context(GatewayClient(url, api_key))
         results = []
         for work in track(loads, "loads", console=console, transient=True):
             results.append(await run_load(gateway, work, bodies[work.attacked], seconds, budget_ms))

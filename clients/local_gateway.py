@@ -18,11 +18,14 @@ from clients.errors import GatewayUnreachable
 
 START_TIMEOUT_S = 120.0
 STOP_TIMEOUT_S = 20.0
+KEY_SETTINGS = ("ROBOSAC_API_KEYS", "ROBOSAC_API_KEYS_FILE")
 
 
 @contextlib.asynccontextmanager
 async def local_gateway(log: Path) -> AsyncIterator[str]:
     """Start ``uvicorn service.app:app``, wait until it is ready, yield its URL, and stop it.
+
+    It asks for no API key, whatever the environment says: it serves loopback only.
 
     Parameters
     ----------
@@ -45,7 +48,7 @@ async def local_gateway(log: Path) -> AsyncIterator[str]:
             [*command, "--log-level", "warning", "--timeout-graceful-shutdown", "5"],
             stdout=output,
             stderr=subprocess.STDOUT,
-            env=dict(os.environ),
+            env={name: value for name, value in os.environ.items() if name not in KEY_SETTINGS},
         )
         try:
             with _cancelled_by_sigterm():

@@ -20,13 +20,14 @@ from service.admission import Admission, Gate  # noqa: E402
 from service.engine import Engine  # noqa: E402
 from service.frames import Frames  # noqa: E402
 from service.gateway import Gateway  # noqa: E402
+from service.identity import ApiKeys, LoopbackOnly, Tokens  # noqa: E402
 from service.limits import BodyLimit  # noqa: E402
 from service.logs import logging_to_stderr  # noqa: E402
 from service.metrics import Metrics  # noqa: E402
-from service.routes import operations, v1  # noqa: E402
+from service.routes import keyed, operations, v1  # noqa: E402
 from service.sessions import Sessions  # noqa: E402
 from service.settings import Settings  # noqa: E402
-from service.store import MemoryStore, new_seed  # noqa: E402
+from service.store import MemoryStore, Store, new_seed  # noqa: E402
 from service.tracing import Traced, Tracing, provider_from_environment  # noqa: E402
 
 if TYPE_CHECKING:
@@ -36,7 +37,10 @@ logger = structlog.stdlib.get_logger(__name__)
 
 
 def create_app(
-    settings: Settings | None = None, seeds: Callable[[], str] = new_seed, spans: TracerProvider | None = None
+    settings: Settings | None = None,
+    seeds: Callable[[], str] = new_seed,
+    spans: TracerProvider | None = None,
+    store: Store | None = None,
 ) -> FastAPI:
     """A gateway.
 
@@ -49,19 +53,26 @@ def create_app(
         knows the seed knows which subsets will be sampled.
     spans : TracerProvider, optional
         Takes the traces; by default what the environment says, see `service.tracing`.
+    store : Store, optional
+        Where sessions are kept; by default in memory.
     """
     settings = settings or Settings()
     engine = Engine(settings.torch_threads, settings.extra_detectors)
     metrics = Metrics()
-    sessions = Sessions(settings, MemoryStore(), engine, metrics, seeds)
+    store = store or MemoryStore()
+    api_keys, tokens = ApiKeys.configured(settings), Tokens.configured(settings)
+    sessions = Sessions(settings, store, engine, metrics, tokens, seeds)
     admission = Admission()
     tracing = Tracing(provider_from_environment() if spans is None else spans)
     frames = Frames(settings, sessions, engine, metrics, admission, tracing)
-    gateway = Gateway(admission, engine, metrics, sessions, frames)
+    gateway = Gateway(admission, engine, metrics, sessions, frames, api_keys)
 
     @contextlib.asynccontextmanager
     async def lifespan(_: FastAPI) -> AsyncIterator[None]:
         with logging_to_stderr(settings):
+            if not api_keys:
+                logger.warning("no API key is set (ROBOSAC_API_KEYS): only requests from this machine are served")
+            await tokens.start(store)
             await engine.start()
             if settings.detector not in engine.detectors:
                 raise ValueError(
@@ -88,7 +99,10 @@ def create_app(
     problems.install(app)
     app.add_middleware(BodyLimit, limit=settings.max_body_bytes, timeout_s=settings.body_timeout_s)
     app.add_middleware(Gate, admission=admission, budget_s=sessions.budget_s)
+    if not api_keys:
+        app.add_middleware(LoopbackOnly)
     app.add_middleware(Traced, tracing=tracing)
+    app.include_router(keyed)
     app.include_router(v1)
     app.include_router(operations)
     return app

@@ -80,7 +80,8 @@ def frame_answered(
     messages : mapping of vehicle id to mapping
         ``digest`` of each message in the frame (`robosac.wire.content_digest`), and its ``signature`` where it has one.
     unlogged : mapping of vehicle id to int
-        Refused messages since the last frame that were too many to be recorded one by one.
+        Refusals since the last frame that were too many to be recorded one by one; under ``?`` those of callers
+        without a token that counts.
     """
     return {
         "event": "frame_answered",
@@ -107,6 +108,22 @@ def equivocation(vehicle_id: str, frame: int, first: str, second: Mapping[str, s
         "frame": frame,
         "first": {"digest": first},
         "second": dict(second),
+    }
+
+
+def token_renewed(vehicle_id: str, expires_at: str) -> AuditEvent:
+    """A vehicle took a fresh token; the one before is worth nothing any more."""
+    return {"event": "token_renewed", "time": now(), "vehicle_id": vehicle_id, "expires_at": expires_at}
+
+
+def access_refused(vehicle_id: str | None, detail: str) -> AuditEvent:
+    """Somebody came without a token that counts; ``vehicle_id`` is whose token it was, None if it is none of ours."""
+    return {
+        "event": "access_refused",
+        "time": now(),
+        "vehicle_id": vehicle_id,
+        "reason": Reason.UNAUTHENTICATED.value,
+        "detail": detail,
     }
 
 

@@ -12,6 +12,7 @@ from starlette.exceptions import HTTPException
 
 from robosac import wire
 from service.gateway import Gateway
+from service.identity import KeyedRoute
 from service.limits import read_bounded
 from service.problems import Problem, documented
 from service.schemas import (
@@ -24,6 +25,7 @@ from service.schemas import (
     SessionRequest,
     SessionState,
     TeamChanged,
+    TokenRenewed,
 )
 from service.sessions import Caller
 
@@ -31,8 +33,10 @@ MSGPACK = "application/vnd.msgpack"
 MSGPACK_TYPES = (MSGPACK, "application/msgpack", "application/x-msgpack")
 
 v1 = APIRouter(prefix="/v1", responses=documented(422))
+keyed = APIRouter(prefix="/v1", responses=documented(422), route_class=KeyedRoute)
 operations = APIRouter()
-_bearer = HTTPBearer(auto_error=False)
+_bearer = HTTPBearer(auto_error=False, scheme_name="Token", description="A vehicle's token.")
+_api_key = HTTPBearer(auto_error=False, scheme_name="ApiKey", description="An API key, where the gateway has any.")
 
 
 def _gateway(request: Request) -> Gateway:
@@ -75,7 +79,7 @@ async def list_detectors(gateway: GatewayDep) -> DetectorList:
     return DetectorList(detectors=[DetectorEntry.of(detector.info) for detector in gateway.engine.detectors.values()])
 
 
-@v1.post("/sessions", status_code=201, responses=documented(400, 413, 503))
+@keyed.post("/sessions", status_code=201, responses=documented(400, 401, 413, 503), dependencies=[Depends(_api_key)])
 async def open_session(request: SessionRequest, gateway: GatewayDep) -> SessionCreated:
     """Open a session of one ego with its teammates. The tokens are shown only in this answer."""
     return await gateway.sessions.open(request)
@@ -91,6 +95,12 @@ async def get_session(caller: Ego, gateway: GatewayDep) -> SessionState:
 async def delete_session(caller: Ego, gateway: GatewayDep) -> None:
     """End the session; its audit log can be read until it is purged."""
     await gateway.sessions.close(caller)
+
+
+@v1.post("/sessions/{sid}/token", status_code=201, responses=documented(401, 404, 429))
+async def renew_token(caller: Vehicle, gateway: GatewayDep) -> TokenRenewed:
+    """A fresh token for the vehicle that asks; the one it asks with is worth nothing any more."""
+    return await gateway.sessions.renew(caller)
 
 
 @v1.post("/sessions/{sid}/teammates", status_code=201, responses={**_EGO_PROBLEMS, **documented(400, 409)})

@@ -207,6 +207,7 @@ class SessionCreated(BaseModel):
     session_id: str
     ego_token: str
     teammate_tokens: dict[str, str]
+    tokens_expire_at: str
     detector: DetectorEntry
     defense: DefenseSettings
     latency_budget_ms: float
@@ -219,6 +220,14 @@ class TeamChanged(BaseModel):
 
     teammates: list[str]
     teammate_tokens: dict[str, str]
+    tokens_expire_at: str
+
+
+class TokenRenewed(BaseModel):
+    """A vehicle's fresh token; it is shown only here."""
+
+    token: str
+    expires_at: str
 
 
 class SessionState(BaseModel):

@@ -4,7 +4,6 @@ from __future__ import annotations
 
 import asyncio
 import contextlib
-import hashlib
 import secrets
 import time
 from collections import Counter
@@ -22,10 +21,19 @@ from robosac.previous import PreviousAnswer
 from service import audit
 from service.engine import Engine
 from service.gathering import Backlog, Gathering, Received
+from service.identity import TokenRefused, Tokens, unauthenticated
 from service.metrics import Metrics
 from service.motion import Motion
 from service.problems import Problem
-from service.schemas import DetectorEntry, SessionCreated, SessionRequest, SessionState, TeamChanged, read_defense
+from service.schemas import (
+    DetectorEntry,
+    SessionCreated,
+    SessionRequest,
+    SessionState,
+    TeamChanged,
+    TokenRenewed,
+    read_defense,
+)
 from service.settings import Settings
 from service.store import AuditEvent, FrameDecided, SessionOver, SessionRecord, Store, new_seed
 
@@ -34,6 +42,10 @@ logger = structlog.stdlib.get_logger(__name__)
 SWEEP_EVERY_S = 30.0
 REFUSALS_LOGGED = 16
 """Refused messages of one vehicle between two frames that get a record each; the others are counted."""
+STRANGERS = "?"
+"""Under which the refusals of all callers without a token that counts are counted: no vehicle is called so."""
+MAX_RENEWALS = 16
+"""Tokens that a vehicle may take between two frames: each leaves a record."""
 
 
 @dataclass
@@ -50,9 +62,11 @@ class LiveSession:
     lock: asyncio.Lock = field(default_factory=asyncio.Lock)
     last_used: float = field(default_factory=time.monotonic)
     refusals: Counter[str] = field(default_factory=Counter)
+    renewals: Counter[str] = field(default_factory=Counter)
 
     def unlogged(self) -> dict[str, int]:
-        """Refused messages by vehicle that got no record since the last call; the count begins again."""
+        """Refusals by vehicle that got no record since the last call; all counts begin again."""
+        self.renewals.clear()
         counted, self.refusals = self.refusals, Counter()
         return {name: n - REFUSALS_LOGGED for name, n in counted.items() if n > REFUSALS_LOGGED}
 
@@ -85,6 +99,7 @@ class Sessions:
     store : Store
     engine : Engine
     metrics : Metrics
+    tokens : Tokens
     seeds : callable
         Seed of a frame's draws, hexadecimal; from the operating system by default, so that nobody can foresee them.
     """
@@ -95,6 +110,7 @@ class Sessions:
         store: Store,
         engine: Engine,
         metrics: Metrics,
+        tokens: Tokens,
         seeds: Callable[[], str] = new_seed,
     ) -> None:
         self._seeds = seeds
@@ -102,6 +118,7 @@ class Sessions:
         self._store = store
         self._engine = engine
         self._metrics = metrics
+        self._tokens = tokens
         self._live: dict[str, LiveSession] = {}
         self.backlog = Backlog(settings.max_pending_bytes)
 
@@ -124,9 +141,11 @@ class Sessions:
             raise Problem(
                 503, "too-many-sessions", "the gateway holds as many sessions as it may", headers={"Retry-After": "30"}
             )
-        tokens = _new_tokens((request.ego_id, *request.teammates))
+        session_id = secrets.token_hex(16)
+        own = self._tokens.issue(session_id, request.ego_id, is_ego=True)
+        others = {name: self._tokens.issue(session_id, name, is_ego=False) for name in request.teammates}
         record = SessionRecord(
-            session_id=secrets.token_hex(16),
+            session_id=session_id,
             ego_id=request.ego_id,
             teammates=tuple(request.teammates),
             detector=detector.info.name,
@@ -134,7 +153,7 @@ class Sessions:
             latency_budget_ms=budget_ms,
             gather_ms=gather_ms,
             frame_period_ms=request.frame_period_ms,
-            token_ids={vehicle: _digest(token) for vehicle, token in tokens.items()},
+            token_ids={name: token.token_id for name, token in {request.ego_id: own, **others}.items()},
             public_keys=dict(request.public_keys),
             created_at=audit.now(),
             seed=self._seeds(),
@@ -153,8 +172,9 @@ class Sessions:
         )
         return SessionCreated(
             session_id=record.session_id,
-            ego_token=tokens.pop(request.ego_id),
-            teammate_tokens=tokens,
+            ego_token=own.text,
+            teammate_tokens={name: token.text for name, token in others.items()},
+            tokens_expire_at=own.expires_at,
             detector=DetectorEntry.of(detector.info),
             defense=request.defense,
             latency_budget_ms=record.latency_budget_ms,
@@ -173,10 +193,8 @@ class Sessions:
         record = await self._store.get(session_id)
         if record is None or record.ended_at is not None:
             raise Problem(404, "unknown-session", "there is no such session; it may have ended or expired")
-        vehicle = self._vehicle(record, token)
-        live = self._live.get(session_id)
-        if live is None:
-            live = self._live[session_id] = self._revive(record)
+        live = self._live_session(record)
+        vehicle = await self._holder(record, token)
         live.last_used = time.monotonic()
         return Caller(record, live, vehicle)
 
@@ -201,7 +219,7 @@ class Sessions:
             raise Problem(404, "unknown-session", "there is no such session; its log may have been purged")
         if record.ended_at is None:
             await self.authenticate_ego(session_id, token)
-        elif (vehicle := self._vehicle(record, token)) != record.ego_id:
+        elif (vehicle := await self._holder(record, token)) != record.ego_id:
             raise _ego_only(vehicle)
         return await self._store.audit(session_id, after)
 
@@ -212,11 +230,15 @@ class Sessions:
             for name in newcomers:
                 if name == record.ego_id or name in record.teammates:
                     raise Problem(409, "already-enrolled", f"{name} is in the session already", "teammates")
-            tokens = _new_tokens(newcomers)
-            token_ids = {**record.token_ids, **{name: _digest(token) for name, token in tokens.items()}}
+            tokens = {name: self._tokens.issue(record.session_id, name, is_ego=False) for name in newcomers}
+            token_ids = {**record.token_ids, **{name: token.token_id for name, token in tokens.items()}}
             keys = {**record.public_keys, **public_keys}
             await self._change_team(caller, (*record.teammates, *newcomers), token_ids, keys)
-            return TeamChanged(teammates=[*record.teammates, *newcomers], teammate_tokens=tokens)
+            return TeamChanged(
+                teammates=[*record.teammates, *newcomers],
+                teammate_tokens={name: token.text for name, token in tokens.items()},
+                tokens_expire_at=min(token.expires_at for token in tokens.values()),
+            )
 
     async def dismiss(self, caller: Caller, leaver: str) -> None:
         """Let a teammate leave, from the next frame on; its token is worth nothing any more."""
@@ -228,6 +250,25 @@ class Sessions:
             keys = {name: key for name, key in record.public_keys.items() if name != leaver}
             team = tuple(name for name in record.teammates if name != leaver)
             await self._change_team(caller, team, token_ids, keys)
+
+    async def renew(self, caller: Caller) -> TokenRenewed:
+        """A fresh token of the caller; the one it came with is worth nothing any more."""
+        vehicle = caller.vehicle_id
+        async with caller.live.lock:  # else a team that changes meanwhile would bring the old token back
+            record = await self.current(caller)
+            if record.token_ids.get(vehicle) != caller.record.token_ids[vehicle]:
+                raise unauthenticated("the token was renewed, or its vehicle has left")
+            if caller.live.renewals[vehicle] >= MAX_RENEWALS:
+                detail = f"a vehicle may have {MAX_RENEWALS} tokens between two frames"
+                raise Problem(429, "too-many-renewals", detail, headers={"Retry-After": "1"})
+            caller.live.renewals[vehicle] += 1
+            token = self._tokens.issue(record.session_id, vehicle, is_ego=caller.is_ego)
+            event = audit.token_renewed(vehicle, token.expires_at)
+            try:
+                await self._store.renew_token(record.session_id, vehicle, token.token_id, event)
+            except SessionOver as error:
+                raise _over() from error
+            return TokenRenewed(token=token.text, expires_at=token.expires_at)
 
     async def describe(self, caller: Caller) -> SessionState:
         """The session's state."""
@@ -378,18 +419,26 @@ class Sessions:
             await self._store.end(session_id, event["time"], event)
         self._metrics.sessions.set(await self._store.count())
 
-    def _vehicle(self, record: SessionRecord, token: str | None) -> str:
-        """The vehicle of the session that a token belongs to."""
-        wanted = _digest(token) if token else None
-        for vehicle, token_id in record.token_ids.items():
-            if token_id == wanted:
-                return vehicle
-        raise Problem(
-            401,
-            "unauthenticated",
-            "a bearer token of a vehicle of this session is needed",
-            headers={"WWW-Authenticate": "Bearer"},
-        )
+    def _live_session(self, record: SessionRecord) -> LiveSession:
+        live = self._live.get(record.session_id)
+        if live is None:
+            live = self._live[record.session_id] = self._revive(record)
+        return live
+
+    async def _holder(self, record: SessionRecord, token: str | None) -> str:
+        """The vehicle of the session that a token belongs to; a refusal goes on record, but only so many of them."""
+        try:
+            return self._tokens.holder(record, token)
+        except TokenRefused as refused:
+            self._metrics.refused(Reason.UNAUTHENTICATED.value)
+            if record.ended_at is None:
+                refusals = self._live_session(record).refusals
+                refusals[STRANGERS] += 1
+                if refusals[STRANGERS] <= REFUSALS_LOGGED:
+                    with contextlib.suppress(SessionOver):
+                        event = audit.access_refused(refused.vehicle_id, refused.problem.detail)
+                        await self._store.log(record.session_id, event)
+            raise refused.problem from refused
 
 
 def _ego_only(vehicle_id: str) -> Problem:
@@ -398,11 +447,3 @@ def _ego_only(vehicle_id: str) -> Problem:
 
 def _over() -> Problem:
     return Problem(404, "unknown-session", "the session has ended")
-
-
-def _new_tokens(vehicles: Sequence[str]) -> dict[str, str]:
-    return {vehicle: secrets.token_urlsafe(32) for vehicle in vehicles}
-
-
-def _digest(token: str) -> str:
-    return hashlib.sha256(token.encode()).hexdigest()

@@ -2,9 +2,10 @@
 
 from __future__ import annotations
 
+from pathlib import Path
 from typing import Annotated, Literal
 
-from pydantic import Field, field_validator
+from pydantic import Field, SecretStr, field_validator
 from pydantic_settings import BaseSettings, NoDecode, SettingsConfigDict
 
 from robosac.detectors import DEFAULT_DETECTOR
@@ -13,12 +14,20 @@ from robosac.detectors import DEFAULT_DETECTOR
 class Settings(BaseSettings):
     """What an operator can set."""
 
-    model_config = SettingsConfigDict(env_prefix="ROBOSAC_", frozen=True)
+    model_config = SettingsConfigDict(env_prefix="ROBOSAC_", frozen=True, hide_input_in_errors=True)
 
     detector: str = Field(DEFAULT_DETECTOR, description="Detector of sessions that name none.")
     extra_detectors: Annotated[tuple[str, ...], NoDecode] = Field(
         (), description="Detectors beside those that ship: weights files or module:callable, separated by commas."
     )
+    api_keys: Annotated[tuple[SecretStr, ...], NoDecode] = Field(
+        (), description="Keys that open sessions, separated by commas; without any, only loopback is served."
+    )
+    api_keys_file: Path | None = Field(None, description="File of further such keys, one a line.")
+    token_secrets: Annotated[tuple[SecretStr, ...], NoDecode] = Field(
+        (), description="Secrets of tokens, separated by commas: the first signs, all verify; else the store keeps one."
+    )
+    token_ttl_s: float = Field(86_400.0, ge=1, description="How long a vehicle's token lives.")
     latency_budget_ms: float = Field(
         200.0, gt=0, le=60_000, description="Budget of sessions that name none: from a frame's last byte to its answer."
     )
@@ -49,7 +58,7 @@ class Settings(BaseSettings):
     log_format: Literal["json", "console"] = Field("json", description="One JSON object a line, or for the eye.")
     torch_threads: int = Field(1, ge=1, description="Threads of one detector pass; at this size one is fastest.")
 
-    @field_validator("extra_detectors", mode="before")
+    @field_validator("extra_detectors", "api_keys", "token_secrets", mode="before")
     @classmethod
     def _split(cls, value: object) -> object:
         return tuple(part.strip() for part in value.split(",") if part.strip()) if isinstance(value, str) else value

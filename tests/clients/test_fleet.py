@@ -98,7 +98,8 @@ async def test_a_fleet_with_other_weights_than_the_gateway_stops(tmp_path):
             await run_fleet(options(url, detector=str(ADVERSARIAL_WEIGHTS)), Console(file=io.StringIO()))
 
 
-def test_the_demo_shows_a_summary(tmp_path):
+def test_the_demo_shows_a_summary(tmp_path, monkeypatch):
+    monkeypatch.setenv("ROBOSAC_API_KEYS", "not-for-the-gateway-of-the-demo")
     result = CliRunner().invoke(command(demo_main), ["--report", str(tmp_path), "--scenes", "1", "--frames", "2"])
     assert result.exit_code == 0, result.output
     assert "No attacker accepted in" in result.output

@@ -12,6 +12,7 @@ from robosac import wire
 from service.app import create_app
 from service.gateway import Gateway
 from service.settings import Settings
+from service.store import Store
 
 EGO = "car-1"
 TEAM = ("car-2", "car-3", "car-4", "car-5", "rsu")
@@ -46,10 +47,15 @@ class Served:
 
 @asynccontextmanager
 async def serve(
-    seeds: Iterable[int] | None = None, spans: TracerProvider | None = None, **settings: Any
+    seeds: Iterable[int] | None = None,
+    *,
+    spans: TracerProvider | None = None,
+    store: Store | None = None,
+    api_key: str | None = None,
+    **settings: Any,
 ) -> AsyncIterator[Served]:
     """A gateway; ``seeds`` are those of its frames, one after another, if it is to be foreseen."""
-    options: dict[str, Any] = {"spans": spans}
+    options: dict[str, Any] = {"spans": spans, "store": store}
     if seeds is not None:
         numbers = iter(seeds)
         options["seeds"] = lambda: f"{next(numbers):064x}"
@@ -57,7 +63,7 @@ async def serve(
     transport = httpx.ASGITransport(app, raise_app_exceptions=False)
     async with (
         app.router.lifespan_context(app),
-        GatewayClient("http://gateway", transport=transport) as client,
+        GatewayClient("http://gateway", api_key, transport=transport) as client,
         httpx.AsyncClient(base_url="http://gateway", transport=transport) as http,
     ):
         yield Served(app.state.gateway, client, http)

@@ -22,6 +22,7 @@ async def test_events_are_logged_as_json_without_secrets(capsys, messages, benig
         await served.ego(session).close()
     text = capsys.readouterr().err
     events = [json.loads(line) for line in text.splitlines()]
+    assert events.pop(0)["event"].startswith("no API key is set")
     assert [event["event"] for event in events] == [
         "gateway ready", "session opened", "frame answered", "message refused", "session ended", "gateway stopped",
     ]  # fmt: skip
