@@ -18,7 +18,7 @@ from pydantic import (
 
 from robosac.budget import DEFAULT_CONFIDENCE
 from robosac.consensus import DEFAULT_THRESHOLD
-from robosac.defenses import A2CP, Defense, Reference, SampleConsensus, StaticTeam, Undefended
+from robosac.defenses import Defense, Reference, build
 from robosac.defenses.a2cp import DEFAULT_BUDGET as DEFAULT_A2CP_BUDGET
 from robosac.defenses.static_team import DEFAULT_RECHECK
 from robosac.detectors import DetectorInfo
@@ -31,7 +31,13 @@ class _Request(BaseModel):
     model_config = ConfigDict(extra="forbid", frozen=True, allow_inf_nan=False)
 
 
-class _SamplingSettings(_Request):
+class _DefenseSettings(_Request):
+    def build(self) -> Defense:
+        """The defence itself."""
+        return build(self.model_dump(mode="json"))
+
+
+class _SamplingSettings(_DefenseSettings):
     attacker_ratio: float = Field(0.2, gt=0, lt=1, description="Assumed share of attackers among the teammates.")
     sampling_budget: int | None = Field(None, ge=1, le=10_000, description="Most hypotheses tested in a frame.")
     collaborators: int | None = Field(None, ge=1, le=1024, description="Teammates in a hypothesis.")
@@ -45,10 +51,6 @@ class SampleConsensusSettings(_SamplingSettings):
 
     kind: Literal["sample_consensus"] = "sample_consensus"
 
-    def build(self) -> Defense:
-        """The defence itself."""
-        return SampleConsensus(**self.model_dump(exclude={"kind"}))
-
 
 class StaticTeamSettings(_SamplingSettings):
     """Find trustworthy teammates once, rely on them, and look again now and then."""
@@ -58,12 +60,8 @@ class StaticTeamSettings(_SamplingSettings):
         DEFAULT_RECHECK, ge=1, description="Frames between two re-checks of the trusted; null never looks again."
     )
 
-    def build(self) -> Defense:
-        """The defence itself."""
-        return StaticTeam(**self.model_dump(exclude={"kind"}))
 
-
-class A2CPSettings(_Request):
+class A2CPSettings(_DefenseSettings):
     """Aggressive-to-conservative probing: estimate the attacker ratio while answering."""
 
     kind: Literal["a2cp"]
@@ -75,19 +73,11 @@ class A2CPSettings(_Request):
     consensus_threshold: float = Field(DEFAULT_THRESHOLD, gt=0, le=1, description="Jaccard index of a consensus.")
     reference: Reference = Field(Reference.EGO, description="What a hypothesis is compared with.")
 
-    def build(self) -> Defense:
-        """The defence itself."""
-        return A2CP(**self.model_dump(exclude={"kind"}))
 
-
-class UndefendedSettings(_Request):
+class UndefendedSettings(_DefenseSettings):
     """No defence: everybody is fused and nothing is tested. A baseline."""
 
     kind: Literal["none"]
-
-    def build(self) -> Defense:
-        """The defence itself."""
-        return Undefended()
 
 
 DefenseSettings = Annotated[

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from robosac.defenses.a2cp import A2CP
+from robosac.defenses.building import build
 from robosac.defenses.protocol import (
     Conversation,
     Decision,
@@ -34,4 +35,5 @@ __all__ = [
     "State",
     "StaticTeam",
     "Undefended",
+    "build",
 ]
