@@ -65,6 +65,7 @@ def frame_answered(
     seed: str,
     ego_pose: FloatArray,
     messages: Mapping[str, Mapping[str, str]],
+    previous_frame: int | None,
     unlogged: Mapping[str, int],
 ) -> AuditEvent:
     """A frame is decided: the answer, and all that it takes to recompute it.
@@ -79,6 +80,8 @@ def frame_answered(
     ego_pose : (4, 4) ndarray
     messages : mapping of vehicle id to mapping
         ``digest`` of each message in the frame (`robosac.wire.content_digest`), and its ``signature`` where it has one.
+    previous_frame : int or None
+        Frame of the previous answer that the fusion was given.
     unlogged : mapping of vehicle id to int
         Refusals since the last frame that were too many to be recorded one by one; under ``?`` those of callers
         without a token that counts.
@@ -90,6 +93,7 @@ def frame_answered(
         "seed": seed,
         "ego_pose": [float(value) for value in ego_pose.reshape(-1)],
         "messages": {name: dict(proof) for name, proof in messages.items()},
+        "previous_frame": previous_frame,
         "out_of_time": result.out_of_time,
         "fault": result.fault,
         "state": dict(result.state),

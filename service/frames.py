@@ -252,6 +252,7 @@ class Frames:
             seed=record.seed,
             ego_pose=ego.message.pose,
             messages={name: received.proof for name, received in {record.ego_id: ego, **present}.items()},
+            previous_frame=None if live.previous is None else live.previous.frame,
             unlogged=live.unlogged(),
         )
         await self._sessions.decide(caller, frame, result.state, event, self._to_keep(frame, ego, present))

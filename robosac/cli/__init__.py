@@ -7,7 +7,7 @@ from typing import Annotated
 
 import typer
 
-from robosac.cli import convert, evaluate, reproduce, scene, train
+from robosac.cli import audit, convert, evaluate, reproduce, scene, train
 
 
 def _show_version(wanted: bool) -> None:
@@ -33,5 +33,6 @@ app.command("train")(train.run)
 app.command("evaluate")(evaluate.run)
 app.command("reproduce")(reproduce.run)
 app.command("convert-checkpoint")(convert.run)
+app.add_typer(audit.app, name="audit")
 
 __all__ = ["app"]

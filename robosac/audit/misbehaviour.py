@@ -1,0 +1,210 @@
+"""What a log says against one vehicle, in the terms of ETSI TS 103 759 (misbehaviour reporting).
+
+A mapping onto the field names of the report's TemplateAsr, as JSON: not a conforming PDU, since the standard has no
+report about shared feature maps. docs/audit.md has the table, and what of it is an assumption.
+"""
+
+from __future__ import annotations
+
+import base64
+from collections.abc import Iterable, Mapping
+from dataclasses import dataclass, field
+from datetime import UTC, datetime, timedelta
+from typing import Any
+
+from robosac.audit.chain import GENESIS, digest
+from robosac.audit.records import Equivocation, FrameAnswered, Proof, RecordError, SessionOpened, TeamChanged, read
+from robosac.consensus import Verdict
+from robosac.defenses import Outcome, Reference
+
+VERSION = 2
+"""Of the report's format, in V2.1.1."""
+AID_APP_AGNOSTIC = 270549119
+"""Application identifier of reports that belong to no application of their own."""
+SAME_STATION, OWN_PERCEPTION, OTHER_STATIONS = 2, 4, 5
+"""Classes of detectors: against what an observation is a contradiction."""
+_EPOCH = datetime(2004, 1, 1, tzinfo=UTC)
+_LEAP_SECONDS = 5
+"""Since the epoch of Time64; none was added since 2017."""
+
+
+class NothingToReport(ValueError):
+    """A log that says nothing against a vehicle."""
+
+
+def report(lines: Iterable[bytes], vehicle: str, now: datetime) -> dict[str, Any]:
+    """A misbehaviour report on one vehicle.
+
+    Reported are the frames in which it was rejected for a dissensus, and its equivocations. A dissensus speaks against
+    all members of a hypothesis together; the report names them, and every other hypothesis of the frame.
+
+    Parameters
+    ----------
+    lines : iterable of bytes
+        Of a log that `robosac.audit.verify` finds nothing wrong with.
+    vehicle : str
+    now : datetime
+        When the report is made, with a time zone.
+
+    Returns
+    -------
+    dict
+        JSON values.
+
+    Raises
+    ------
+    NothingToReport
+    RecordError
+        If a record is not what its event has to be.
+    """
+    case = _Case(vehicle)
+    for line in lines:
+        case.take(line.removesuffix(b"\n"))
+    if not case.observations:
+        raise NothingToReport(f"the log holds neither a dissensus nor an equivocation of {vehicle}")
+    targets = {target: [o for t, o in case.observations if t == target] for target, _ in case.observations}
+    return {
+        "version": VERSION,
+        "generationTime": _time64(now),
+        "observationLocation": case.location,
+        "report": {
+            "aid": AID_APP_AGNOSTIC,
+            "content": {
+                "observations": [{"tgtId": target, "observations": found} for target, found in targets.items()],
+                "v2xPduEvidence": case.pdus,
+                "nonV2xPduEvidence": [
+                    *case.decisions,
+                    {
+                        "id": "auditLog",
+                        "evidence": {
+                            "sessionId": case.session_id,
+                            "egoId": case.session.ego_id if case.session else None,
+                            "head": case.head,
+                            "lastSeq": case.last_seq,
+                            "seq": case.seqs,
+                        },
+                    },
+                ],
+            },
+        },
+    }
+
+
+@dataclass
+class _Case:
+    """What was read so far."""
+
+    vehicle: str
+    session: SessionOpened | None = None
+    session_id: str = ""
+    last_seq: int = 0
+    head: str = GENESIS
+    key: str | None = None
+    location: dict[str, Any] | None = None
+    proofs: dict[str, Proof] = field(default_factory=dict)
+    observations: list[tuple[str, dict[str, Any]]] = field(default_factory=list)
+    pdus: list[dict[str, Any]] = field(default_factory=list)
+    decisions: list[dict[str, Any]] = field(default_factory=list)
+    seqs: list[int] = field(default_factory=list)
+
+    def take(self, line: bytes) -> None:
+        record = read(line)
+        self.head = digest(line.decode())
+        self.last_seq, self.session_id = int(record["seq"]), str(record["session_id"])
+        match record.get("event"):
+            case "session_opened":
+                self.session = SessionOpened.of(record)
+                self.key = self.session.public_keys.get(self.vehicle)
+            case "team_changed":
+                self.key = TeamChanged.of(record).public_keys.get(self.vehicle)
+            case "frame_answered":
+                self._take_answer(FrameAnswered.of(record), record)
+            case "equivocation":
+                self._take_equivocation(Equivocation.of(record), record)
+
+    def _take_answer(self, answer: FrameAnswered, record: Mapping[str, Any]) -> None:
+        proof = answer.messages.get(self.vehicle)
+        if proof is None:
+            return
+        self.proofs[proof.digest] = proof
+        if answer.rejected.get(self.vehicle) != "dissensus":
+            return
+        against = [i for i, o in enumerate(answer.hypotheses) if self._contradicted(o)]
+        self._observe(
+            "perception",
+            "dissensus",
+            OTHER_STATIONS if self._followed_previous(answer) else OWN_PERCEPTION,
+            {
+                "frame": answer.frame,
+                "hypotheses": against,
+                "lowestJaccardIndex": min((answer.hypotheses[i].jaccard_index for i in against), default=None),
+                "consensusThreshold": self.session.defense.get("consensus_threshold") if self.session else None,
+            },
+            answer.frame,
+            [proof],
+        )
+        self.decisions.append(
+            {
+                "id": "decision",
+                "evidence": {
+                    "seq": self.last_seq,
+                    "time": record.get("time"),
+                    "frame": answer.frame,
+                    "source": answer.source.value,
+                    "accepted": list(answer.accepted),
+                    "rejected": dict(answer.rejected),
+                    "hypotheses": [
+                        {"teammates": list(o.teammates), "jaccardIndex": o.jaccard_index, "verdict": o.verdict.value}
+                        for o in answer.hypotheses
+                    ],
+                    "messages": {name: _shown(other) for name, other in answer.messages.items()},
+                },
+            }
+        )
+        self.location = {"frame": answer.frame, "worldFromSensor": answer.ego_pose.reshape(-1).tolist()}
+
+    def _take_equivocation(self, lie: Equivocation, record: Mapping[str, Any]) -> None:
+        if lie.vehicle_id == self.vehicle:
+            first = self.proofs.get(lie.first.digest, lie.first)
+            obs = {"frame": lie.frame, "time": record.get("time")}
+            self._observe("message", "equivocation", SAME_STATION, obs, lie.frame, [first, lie.second])
+
+    def _observe(
+        self, target: str, kind: str, detector_class: int, obs: dict[str, Any], frame: int, proofs: list[Proof]
+    ) -> None:
+        """Keep an observation; the n-th is about the n-th stream of messages."""
+        index = len(self.pdus)
+        self.observations.append(
+            (target, {"obsId": kind, "class": detector_class, "v2xPduEvidenceIndex": index, "obs": obs})
+        )
+        self.pdus.append(
+            {
+                "type": "robosac-message",
+                "v2xPdus": [{"frame": frame, **_shown(proof)} for proof in proofs],
+                "certificate": None if self.key is None else {"vehicleId": self.vehicle, "ed25519PublicKey": self.key},
+                "subjectPduIndex": len(proofs) - 1,
+            }
+        )
+        self.seqs.append(self.last_seq)
+
+    def _contradicted(self, outcome: Outcome) -> bool:
+        return self.vehicle in outcome.teammates and outcome.verdict is Verdict.DISSENSUS
+
+    def _followed_previous(self, answer: FrameAnswered) -> bool:
+        """Whether the hypotheses were compared with what stations had said before, not with the ego's perception."""
+        if self.session is None or self.session.defense.get("reference") != Reference.PREVIOUS:
+            return False
+        return answer.previous_frame is not None and answer.previous_frame == answer.frame - 1
+
+
+def _shown(proof: Proof) -> dict[str, str | None]:
+    signature = None if proof.signature is None else base64.b64encode(proof.signature).decode()
+    return {"digest": proof.digest, "signature": signature}
+
+
+def _time64(moment: datetime) -> int:
+    """Microseconds since 2004, leap seconds among them (IEEE 1609.2)."""
+    return (moment - _EPOCH + timedelta(seconds=_LEAP_SECONDS)) // timedelta(microseconds=1)
+
+
+__all__ = ["NothingToReport", "RecordError", "report"]

@@ -1,0 +1,290 @@
+"""A decision made again from its record and the messages that were kept of it."""
+
+from __future__ import annotations
+
+import json
+import math
+from collections import deque
+from collections.abc import Iterable, Mapping
+from dataclasses import dataclass
+from typing import Any, cast
+
+import numpy as np
+
+from robosac import wire
+from robosac.audit.records import FrameAnswered, RecordError, SessionOpened, TeamChanged, read
+from robosac.defenses import Conversation, Decision, Defense, Outcome, State, build
+from robosac.detectors import Message, Preparer
+from robosac.fusion import FusionResult, fuse
+from robosac.previous import PreviousAnswer
+
+JACCARD_TOLERANCE = 1e-9
+STATE_TOLERANCE = 1e-9
+BOX_TOLERANCE = 1e-6
+"""Metres, radians and score: what another order of summation may change."""
+
+
+class ReplayError(ValueError):
+    """A log or messages from which the decision cannot be made again."""
+
+
+@dataclass(frozen=True)
+class LoggedDecision:
+    """A decision, and what the log says it was made from.
+
+    Attributes
+    ----------
+    line : int
+        Of the log, from 1 on.
+    session : SessionOpened
+    state : mapping
+        The defence's, before the frame.
+    previous : PreviousAnswer or None
+    answer : FrameAnswered
+    """
+
+    line: int
+    session: SessionOpened
+    state: State
+    previous: PreviousAnswer | None
+    answer: FrameAnswered
+
+
+@dataclass(frozen=True)
+class Difference:
+    """What came out otherwise.
+
+    Attributes
+    ----------
+    what : str
+        ``detector`` or ``messages``: other inputs, and nothing was recomputed; else the field of the answer.
+    detail : str
+        For a human.
+    """
+
+    what: str
+    detail: str
+
+    def __str__(self) -> str:
+        return f"{self.what}: {self.detail}"
+
+
+def find(lines: Iterable[bytes], frame: int) -> LoggedDecision:
+    """The decision about a frame, and all it was made from but the messages.
+
+    Parameters
+    ----------
+    lines : iterable of bytes
+        Of the log. Whether it can be relied on is for `robosac.audit.verify` to say.
+    frame : int
+
+    Raises
+    ------
+    ReplayError
+        If the log does not hold the decision, or not what came before it.
+    """
+    session: SessionOpened | None = None
+    state: State = {}
+    recent: deque[FrameAnswered] = deque(maxlen=2)
+    for number, line in enumerate(lines, 1):
+        try:
+            record = read(line.removesuffix(b"\n"))
+            event = record.get("event")
+            if event == "session_opened":
+                session = SessionOpened.of(record)
+                state = session.state
+            elif event == "team_changed":
+                state = TeamChanged.of(record).state
+            if event != "frame_answered":
+                continue
+            answer = FrameAnswered.of(record)
+        except RecordError as error:
+            raise ReplayError(f"line {number}: {error}") from error
+        if session is None:
+            raise ReplayError("the log does not begin with the session's opening")
+        if answer.frame == frame:
+            return LoggedDecision(number, session, state, _before(answer, recent), answer)
+        recent.append(answer)
+        state = answer.state
+    raise ReplayError(f"the log holds no answer to frame {frame}")
+
+
+def replay(decision: LoggedDecision, body: bytes, detector: Preparer) -> list[Difference]:
+    """Make a decision again and compare.
+
+    Jaccard indices are compared to `JACCARD_TOLERANCE`, boxes to `BOX_TOLERANCE`, the defence's state to
+    `STATE_TOLERANCE`; times are not. A decision that the
+    deadline cut short is made again with a clock that runs out after as many hypotheses.
+
+    Parameters
+    ----------
+    decision : LoggedDecision
+    body : bytes
+        The messages, as a whole frame (`robosac.wire.read_frame`).
+    detector : Preparer
+        The one that the session had.
+
+    Returns
+    -------
+    list of Difference
+        Empty if the decision comes out the same. Other inputs are reported without a replay.
+
+    Raises
+    ------
+    ReplayError
+        If the messages cannot be read, or the log's settings make no defence.
+    """
+    logged = decision.answer
+    if detector.info.weights_digest != decision.session.weights_digest:
+        detail = f"the weights' digest is {detector.info.weights_digest}, logged {decision.session.weights_digest}"
+        return [Difference("detector", detail)]
+    messages = _read_messages(decision, body, detector)
+    wrong = _compare_digests(logged, messages)
+    if wrong:
+        return wrong
+    return _compare(logged, _fuse(decision, messages, detector))
+
+
+def _before(answer: FrameAnswered, recent: Iterable[FrameAnswered]) -> PreviousAnswer | None:
+    """The previous answer that a decision was given, with its motion since the answer before it."""
+    if answer.previous_frame is None:
+        return None
+    by_frame = {earlier.frame: earlier for earlier in recent}
+    last = by_frame.get(answer.previous_frame)
+    if last is None:
+        raise ReplayError(f"the log lacks frame {answer.previous_frame}, the previous answer of frame {answer.frame}")
+    older = None if last.previous_frame is None else by_frame.get(last.previous_frame)
+    then = None if older is None else PreviousAnswer.of(older.frame, older.ego_pose, older.boxes)
+    return PreviousAnswer.of(last.frame, last.ego_pose, last.boxes, then)
+
+
+def _read_messages(decision: LoggedDecision, body: bytes, detector: Preparer) -> dict[str, Message]:
+    ego_id = decision.session.ego_id
+    try:
+        envelope = wire.read_frame(body)
+        if envelope.frame != decision.answer.frame:
+            raise ReplayError(f"the messages are of frame {envelope.frame}, not {decision.answer.frame}")
+        messages = {ego_id: wire.check_message(envelope.ego, detector.info, "ego", "ego")}
+        for name, payload in envelope.teammates.items():
+            messages[str(name)] = wire.check_message(payload, detector.info, "teammate", f"teammates.{name}")
+    except wire.WireError as error:
+        raise ReplayError(f"not the messages of a frame: {error}") from error
+    return messages
+
+
+def _compare_digests(logged: FrameAnswered, messages: dict[str, Message]) -> list[Difference]:
+    wrong = []
+    for name in sorted(logged.messages.keys() | messages.keys()):
+        if name not in messages:
+            wrong.append(Difference("messages", f"that of {name} is missing"))
+        elif name not in logged.messages:
+            wrong.append(Difference("messages", f"that of {name} is not in the log"))
+        elif wire.content_digest(logged.frame, name, messages[name]) != logged.messages[name].digest:
+            wrong.append(Difference("messages", f"that of {name} is not the one in the log"))
+    return wrong
+
+
+def _fuse(decision: LoggedDecision, messages: dict[str, Message], detector: Preparer) -> FusionResult:
+    try:
+        defense = _Counted(build(decision.session.defense))
+    except ValueError as error:
+        raise ReplayError(f"the log's settings make no defence: {error}") from error
+    logged, ego_id = decision.answer, decision.session.ego_id
+    most = len(logged.hypotheses) if logged.out_of_time else math.inf
+    return fuse(
+        detector,
+        cast(Defense, defense),
+        messages[ego_id],
+        {name: message for name, message in messages.items() if name != ego_id},
+        rng=np.random.default_rng(int(logged.seed, 16)),
+        state=decision.state,
+        frame=logged.frame,
+        previous=decision.previous,
+        deadline=0.5,
+        clock=lambda: 0.0 if defense.tested < most else 1.0,
+    )
+
+
+class _Counted:
+    """A defence of which is known how many of its hypotheses were tested."""
+
+    def __init__(self, defense: Defense) -> None:
+        self._defense = defense
+        self.tested = 0
+
+    def __getattr__(self, name: str) -> Any:
+        return getattr(self._defense, name)
+
+    def converse(self, team: list[str], state: State, rng: np.random.Generator) -> Conversation:
+        conversation = self._defense.converse(team, state, rng)
+        try:
+            batch = next(conversation)
+            while True:
+                outcomes: list[Outcome] = []
+                for hypothesis in batch:
+                    tested = yield [hypothesis]
+                    if not tested:
+                        break
+                    self.tested += 1
+                    outcomes.extend(tested)
+                batch = conversation.send(outcomes)
+        except StopIteration as stop:
+            decision: Decision = stop.value
+            return decision
+
+
+def _compare(logged: FrameAnswered, made: FusionResult) -> list[Difference]:
+    differences = [
+        Difference(what, f"{_shown(now)}, logged {_shown(then)}")
+        for what, now, then in (
+            ("fault", made.fault, logged.fault),
+            ("out_of_time", made.out_of_time, logged.out_of_time),
+            ("source", made.source.value, logged.source.value),
+            ("accepted", list(made.accepted), list(logged.accepted)),
+            *(
+                ("rejected", f"{name} {now.reason.value}", f"{name} {logged.rejected.get(name)}")
+                for name, now in made.rejected.items()
+            ),
+            ("state", dict(made.state), dict(logged.state)),
+        )
+        if not _agree(now, then)
+    ]
+    return [*differences, *_compare_hypotheses(logged, made), *_compare_boxes(logged, made)]
+
+
+def _compare_hypotheses(logged: FrameAnswered, made: FusionResult) -> list[Difference]:
+    if len(made.hypotheses) != len(logged.hypotheses):
+        return [Difference("hypotheses", f"{len(made.hypotheses)} of them, logged {len(logged.hypotheses)}")]
+    return [
+        Difference(
+            "hypotheses",
+            f"{i}: {', '.join(now.teammates)}: {now.jaccard_index:.9g} ({now.verdict}), "
+            f"logged {', '.join(then.teammates)}: {then.jaccard_index:.9g} ({then.verdict})",
+        )
+        for i, (now, then) in enumerate(zip(made.hypotheses, logged.hypotheses, strict=True))
+        if (now.teammates, now.verdict) != (then.teammates, then.verdict)
+        or abs(now.jaccard_index - then.jaccard_index) > JACCARD_TOLERANCE
+    ]
+
+
+def _compare_boxes(logged: FrameAnswered, made: FusionResult) -> list[Difference]:
+    if made.boxes.shape != logged.boxes.shape:
+        return [Difference("boxes", f"{len(made.boxes)} of them, logged {len(logged.boxes)}")]
+    farthest = float(np.abs(made.boxes - logged.boxes).max(initial=0.0))
+    return [] if farthest <= BOX_TOLERANCE else [Difference("boxes", f"up to {farthest:.3g} from those logged")]
+
+
+def _agree(now: Any, then: Any) -> bool:
+    """Whether two JSON values are the same but for the rounding of their numbers."""
+    if isinstance(now, Mapping) and isinstance(then, Mapping):
+        return now.keys() == then.keys() and all(_agree(now[key], then[key]) for key in now)
+    if isinstance(now, list | tuple) and isinstance(then, list | tuple):
+        return len(now) == len(then) and all(_agree(a, b) for a, b in zip(now, then, strict=True))
+    if isinstance(now, float) and isinstance(then, int | float):
+        return math.isclose(now, then, rel_tol=STATE_TOLERANCE, abs_tol=STATE_TOLERANCE)
+    return bool(now == then)
+
+
+def _shown(value: Any) -> str:
+    text = json.dumps(value)
+    return text if len(text) <= 200 else f"{text[:200]}..."

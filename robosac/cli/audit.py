@@ -1,0 +1,132 @@
+"""``robosac audit``: what the gateway decided, and whether its log can be believed."""
+
+from __future__ import annotations
+
+import json
+import re
+from collections.abc import Iterator
+from contextlib import contextmanager
+from datetime import UTC, datetime
+from pathlib import Path
+from typing import Annotated, BinaryIO
+
+import typer
+
+from robosac import detectors, wire
+from robosac.audit import digest, misbehaviour, replay, verification
+
+app = typer.Typer(no_args_is_help=True, help="Prove what the gateway decided, from its audit log.")
+
+Log = Annotated[Path, typer.Argument(help="The audit log (JSON Lines).", metavar="FILE")]
+
+
+@app.command()
+def verify(
+    file: Log,
+    head: Annotated[
+        str | None, typer.Option(help="SHA-256 of the last line, from elsewhere: the session's 'audit_head'.")
+    ] = None,
+) -> None:
+    """Check that nothing in a log was changed, and that it does not contradict itself; 1 if something is wrong."""
+    if head is not None and re.fullmatch("[0-9a-f]{64}", head) is None:
+        raise typer.BadParameter("must be 64 hexadecimal digits, lower case", param_hint="--head")
+    with _opened(file) as lines:
+        findings = verification.verify(lines, head)
+    for finding in findings:
+        typer.echo(str(finding))
+    if findings:
+        typer.echo(f"{file}: {len(findings)} findings")
+        raise typer.Exit(1)
+    count, last = _end(file)
+    proved = "which is the head given" if head else "to be compared with a head from elsewhere"
+    typer.echo(f"{file}: {count} records, nothing wrong; head {last}, {proved}")
+
+
+@app.command("replay")
+def replay_decision(
+    file: Log,
+    messages: Annotated[Path, typer.Option(help="The frame's messages, as the gateway kept them (msgpack).")],
+    frame: Annotated[int | None, typer.Option(min=0, help="The frame; by default that of the messages.")] = None,
+    detector: Annotated[
+        str | None,
+        typer.Option(help="A detector's name, weights file or module:callable; by default the name in the log."),
+    ] = None,
+) -> None:
+    """Make a decision again from the log and the messages, and compare; 1 if it comes out otherwise."""
+    try:
+        body = messages.read_bytes()
+        number = wire.read_frame(body).frame if frame is None else frame
+    except (OSError, wire.WireError) as error:
+        raise typer.BadParameter(str(error), param_hint="--messages") from error
+    try:
+        with _opened(file) as lines:
+            decision = replay.find(lines, number)
+    except replay.ReplayError as error:
+        raise typer.BadParameter(str(error), param_hint="FILE") from error
+    try:
+        loaded = detectors.load(detector or decision.session.detector)
+    except (ValueError, OSError) as error:
+        raise typer.BadParameter(str(error), param_hint="--detector") from error
+    try:
+        differences = replay.replay(decision, body, loaded)
+    except replay.ReplayError as error:
+        raise typer.BadParameter(str(error), param_hint="--messages") from error
+    answer = decision.answer
+    what = f"frame {answer.frame} (line {decision.line})"
+    if differences:
+        for difference in differences:
+            typer.echo(str(difference))
+        typer.echo(f"{what}: not the decision in the log")
+        raise typer.Exit(1)
+    accepted = ", ".join(answer.accepted) or "nobody"
+    typer.echo(
+        f"{what}: the same decision: {answer.source}, {accepted}; "
+        f"{len(answer.hypotheses)} hypotheses, {len(answer.boxes)} boxes"
+    )
+
+
+@app.command()
+def report(
+    file: Log,
+    vehicle: Annotated[str, typer.Option(help="Whom to report.")],
+    out: Annotated[Path | None, typer.Option(help="Where to write it; by default to standard output.")] = None,
+) -> None:
+    """Write what a log says against a vehicle, in the terms of ETSI TS 103 759; 1 if it says nothing or is broken."""
+    with _opened(file) as lines:
+        findings = verification.verify(lines)
+    if findings:
+        typer.echo(f"{file}: {findings[0]}; see robosac audit verify", err=True)
+        raise typer.Exit(1)
+    try:
+        with _opened(file) as lines:
+            fields = misbehaviour.report(lines, vehicle, datetime.now(UTC))
+    except misbehaviour.NothingToReport as nothing:
+        typer.echo(f"{file}: {nothing}", err=True)
+        raise typer.Exit(1) from nothing
+    text = json.dumps(fields, indent=2) + "\n"
+    if out is None:
+        typer.echo(text, nl=False)
+        return
+    try:
+        out.write_text(text)
+    except OSError as error:
+        raise typer.BadParameter(str(error), param_hint="--out") from error
+    typer.echo(f"{out}: {len(fields['report']['content']['v2xPduEvidence'])} observations of {vehicle}")
+
+
+@contextmanager
+def _opened(path: Path) -> Iterator[BinaryIO]:
+    try:
+        with path.open("rb") as file:
+            yield file
+    except OSError as error:
+        raise typer.BadParameter(str(error), param_hint="FILE") from error
+
+
+def _end(path: Path) -> tuple[int, str]:
+    """Number of lines, and the digest of the last."""
+    count, last = 0, b""
+    with path.open("rb") as lines:
+        for count, last in enumerate(lines, 1):  # noqa: B007
+            pass
+    return count, digest(last.decode().removesuffix("\n"))

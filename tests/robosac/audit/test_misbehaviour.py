@@ -1,0 +1,112 @@
+import json
+from datetime import UTC, datetime
+
+import pytest
+from typer.testing import CliRunner
+
+from robosac.audit import misbehaviour
+from robosac.cli import app
+from robosac.signatures import read_public_key
+from tests.robosac.audit.conftest import KEY, SESSION, head, proof, seal_all
+
+NOW = datetime(2025, 1, 1, tzinfo=UTC)
+
+
+def observations(made):
+    return [
+        (target["tgtId"], found["obsId"], found["class"], found["obs"]["frame"])
+        for target in made["report"]["content"]["observations"]
+        for found in target["observations"]
+    ]
+
+
+def test_a_rejected_vehicle_is_reported_with_its_evidence(lines, events):
+    made = misbehaviour.report(lines, "car-2", NOW)
+    assert (made["version"], made["report"]["aid"]) == (2, 270549119)
+    assert observations(made) == [("perception", "dissensus", 4, 0), ("perception", "dissensus", 4, 5)]
+    content = made["report"]["content"]
+    (first, _) = content["observations"][0]["observations"]
+    assert first["obs"] == {
+        "frame": 0, "hypotheses": [0], "lowestJaccardIndex": 0.125, "consensusThreshold": 0.3
+    }  # fmt: skip
+    assert content["v2xPduEvidence"][0] == {
+        "type": "robosac-message",
+        "v2xPdus": [{"frame": 0, "digest": proof("car-2", 0)["digest"], "signature": None}],
+        "certificate": None,
+        "subjectPduIndex": 0,
+    }
+    *decisions, log = content["nonV2xPduEvidence"]
+    assert [decision["evidence"]["seq"] for decision in decisions] == [2, 7]
+    evidence = decisions[0]["evidence"]
+    assert evidence["hypotheses"] == [
+        {"teammates": ["car-2", "rsu"], "jaccardIndex": 0.125, "verdict": "dissensus"},
+        {"teammates": ["rsu", "car-3"], "jaccardIndex": 0.75, "verdict": "consensus"},
+    ]
+    assert evidence["messages"]["rsu"] == proof("rsu", 0)
+    assert evidence["messages"].keys() == events[1]["messages"].keys()
+    assert log["evidence"] == {
+        "sessionId": SESSION, "egoId": "car-1", "head": head(lines), "lastSeq": 8, "seq": [2, 7]
+    }  # fmt: skip
+    assert made["observationLocation"]["frame"] == 5
+
+
+def test_an_equivocation_is_reported_with_both_signatures(lines):
+    made = misbehaviour.report(lines, "rsu", NOW)
+    assert observations(made) == [("message", "equivocation", 2, 1)]
+    (stream,) = made["report"]["content"]["v2xPduEvidence"]
+    assert [pdu["digest"] for pdu in stream["v2xPdus"]] == [proof("rsu", f)["digest"] for f in (1, 99)]
+    assert [pdu["signature"] for pdu in stream["v2xPdus"]] == [proof("rsu", f)["signature"] for f in (1, 99)]
+    assert stream["certificate"]["vehicleId"] == "rsu"
+    assert read_public_key(stream["certificate"]["ed25519PublicKey"]) == KEY.public_key()
+
+
+def test_a_dissensus_with_the_previous_answer_is_a_conflict_with_other_stations(events):
+    events[0] = {**events[0], "defense": {**events[0]["defense"], "reference": "previous"}}
+    events[6] = {**events[6], "previous_frame": 4}
+    made = misbehaviour.report(seal_all(events), "car-2", NOW)
+    assert [found[2] for found in observations(made)] == [4, 5]
+    events[6] = {**events[6], "previous_frame": 1}
+    made = misbehaviour.report(seal_all(events), "car-2", NOW)
+    assert [found[2] for found in observations(made)] == [4, 4]
+
+
+def test_the_key_reported_is_that_of_the_time(events):
+    events[5] = {**events[5], "public_keys": {}}
+    late = {**events[4], "frame": 5}
+    made = misbehaviour.report(seal_all([*events[:7], late]), "rsu", NOW)
+    assert [bool(s["certificate"]) for s in made["report"]["content"]["v2xPduEvidence"]] == [True, False]
+
+
+def test_the_time_counts_leap_seconds(lines):
+    days = 7671  # from 2004 to 2025
+    assert misbehaviour.report(lines, "car-2", NOW)["generationTime"] == (days * 86400 + 5) * 1_000_000
+
+
+@pytest.mark.parametrize("vehicle", ["car-1", "car-3", "nobody"])
+def test_of_whom_the_log_says_nothing_nothing_is_reported(lines, vehicle):
+    with pytest.raises(misbehaviour.NothingToReport, match=vehicle):
+        misbehaviour.report(lines, vehicle, NOW)
+
+
+def run(*arguments):
+    result = CliRunner().invoke(app, ["audit", "report", *map(str, arguments)])
+    return result.exit_code, result.output
+
+
+def test_the_command_writes_a_report_from_a_sound_log_only(lines, tmp_path):
+    log, out = tmp_path / "log.jsonl", tmp_path / "report.json"
+    log.write_bytes(b"".join(lines))
+    assert run(log, "--vehicle", "car-2", "--out", out) == (0, f"{out}: 2 observations of car-2\n")
+    code, said = run(log, "--vehicle", "car-2")
+    fields, printed = json.loads(out.read_text()), json.loads(said)
+    assert code == 0
+    assert printed.pop("generationTime") >= fields.pop("generationTime") > 0
+    assert printed == fields
+    code, said = run(log, "--vehicle", "car-3")
+    assert code == 1
+    assert "neither a dissensus nor an equivocation of car-3" in said
+    assert run(log, "--vehicle", "car-2", "--out", tmp_path)[0] == 2
+    log.write_bytes(b"".join(lines[1:]))
+    code, said = run(log, "--vehicle", "car-2")
+    assert code == 1
+    assert "line 1 (seq 2): wrong-seq" in said

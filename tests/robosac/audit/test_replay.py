@@ -1,0 +1,222 @@
+"""Decisions of the gateway itself, downloaded, verified and made again."""
+
+import asyncio
+import dataclasses
+import itertools
+import json
+import time
+from pathlib import Path
+
+import numpy as np
+import pytest
+from typer.testing import CliRunner
+
+from robosac import consensus, fusion, wire
+from robosac.audit import replay, verify
+from robosac.cli import app
+from robosac.detectors import Message
+from tests.robosac.audit.conftest import seal_all
+from tests.service.conftest import serve
+
+SAMPLING = {"sampling_budget": 7, "collaborators": 3}
+
+
+class Downloaded:
+    """What an auditor has of a session: its log, its head, and the messages of its frames."""
+
+    def __init__(self, lines, head, bodies):
+        self.lines, self.head, self.bodies = lines, head, bodies
+
+    def differences(self, frame, detector, lines=None):
+        return replay.replay(replay.find(lines or self.lines, frame), self.bodies[frame], detector)
+
+
+async def drive(frames, change=None, **options):
+    """Post frames (number, ego's message, teammates' messages) to a gateway of its own."""
+    async with serve(itertools.count(40), keep_frames=100) as served:
+        session = await served.open(**options)
+        ego = served.ego(session)
+        for number, own, others in frames:
+            if change is not None and change[0] == number:
+                await ego.dismiss(change[1])
+            await ego.post_frame(number, own, others)
+        bodies = {number: await ego.kept_messages(number) for number, *_ in frames}
+        lines = [line.encode() for line in await ego.audit_lines()]
+        return Downloaded(lines, (await ego.state())["audit_head"], bodies)
+
+
+def moved(message, metres):
+    pose = np.array(message.pose)
+    pose[0, 3] += metres
+    return Message(pose, message.tensors)
+
+
+DEFENSES = {
+    "sample_consensus": {"kind": "sample_consensus", **SAMPLING},
+    "static_team": {"kind": "static_team", "recheck_every": 2, **SAMPLING},
+    "a2cp": {"kind": "a2cp"},
+    "previous": {"kind": "sample_consensus", "reference": "previous", **SAMPLING},
+    "none": {"kind": "none"},
+}
+
+
+@pytest.mark.parametrize("name", DEFENSES)
+async def test_every_decision_comes_out_the_same(name, detector, ego_message, attacked):
+    poses = [moved(ego_message, 0.3 * i) for i in range(4)]
+    frames = [(number, own, attacked) for number, own in zip((0, 1, 2, 4), poses, strict=True)]
+    got = await drive(frames, change=(2, "car-3"), defense=DEFENSES[name])
+    assert verify(got.lines, got.head) == []
+    for number, *_ in frames:
+        assert got.differences(number, detector) == []
+    previous = [replay.find(got.lines, number).previous for number, *_ in frames]
+    assert [p and p.frame for p in previous] == [None, 0, 1, 2]
+    assert [bool(p.motion.any()) for p in previous[1:]] == [False, True, True]
+
+
+@pytest.mark.parametrize("after", [0, 2])
+async def test_a_decision_cut_short_comes_out_the_same(after, detector, ego_message, attacked, monkeypatch):
+    tested = []
+
+    def compare(*args):
+        tested.append(args)
+        return consensus.compare(*args)
+
+    def fuse_until_late(*args, **options):
+        return fusion.fuse(*args, **options, clock=lambda: time.perf_counter() + (60 if len(tested) == after else 0))
+
+    monkeypatch.setattr(fusion, "compare", compare)
+    monkeypatch.setattr("service.engine.fuse", fuse_until_late)
+    got = await drive([(0, ego_message, attacked)], defense={"kind": "a2cp", "consensus_threshold": 1.0})
+    monkeypatch.undo()
+    answer = replay.find(got.lines, 0).answer
+    assert (answer.out_of_time, len(answer.hypotheses)) == (True, after)
+    assert got.differences(0, detector) == []
+    assert "hypotheses" in told(got, detector, out_of_time=False)
+
+
+@pytest.fixture(scope="module")
+def got(detector, ego_message, attacked):
+    frames = [(number, moved(ego_message, 0.3 * number), attacked) for number in range(3)]
+    return asyncio.run(drive(frames, defense=DEFENSES["previous"]))
+
+
+def changed(got, index=-1, **fields):
+    """The log of a gateway that lied about a record, and chained it properly."""
+    records = [json.loads(line) for line in got.lines]
+    records[index].update(fields)
+    return seal_all(records, records[0]["session_id"])
+
+
+def told(got, detector, frame=0, **fields):
+    return {difference.what for difference in got.differences(frame, detector, changed(got, **fields))}
+
+
+def test_what_a_gateway_lies_about_comes_out_otherwise(got, detector):
+    logged = json.loads(got.lines[-1])
+    boxes = [[x + 1e-5, *rest] for x, *rest in logged["boxes"]]
+    (first, *rest) = logged["hypotheses"]
+    lies = [
+        ({"seed": "0" * 63 + "1"}, {"hypotheses"}),
+        ({"boxes": boxes}, {"boxes"}),
+        ({"boxes": boxes[1:]}, {"boxes"}),
+        ({"source": "ego_only"}, {"source"}),
+        ({"accepted": ["rsu"]}, {"accepted"}),
+        ({"fault": "MemoryError: "}, {"fault"}),
+        ({"state": {"trusted": ["rsu"]}}, {"state"}),
+        ({"rejected": []}, {"rejected"}),
+        ({"hypotheses": [{**first, "jaccard_index": first["jaccard_index"] + 1e-8}, *rest]}, {"hypotheses"}),
+        ({"previous_frame": None}, {"hypotheses"}),
+        ({"out_of_time": True}, {"out_of_time"}),
+    ]
+    for fields, expected in lies:
+        assert told(got, detector, 2, **fields) >= expected, fields
+    within = [[x + 1e-7, *rest] for x, *rest in logged["boxes"]]
+    assert told(got, detector, 2, boxes=within) == set()
+
+
+def test_other_inputs_are_told_and_nothing_is_recomputed(got, detector, ego_message, benign):
+    decision = replay.find(got.lines, 2)
+    others = {**benign, "car-9": benign["rsu"]}
+    del others["car-3"]
+    body = wire.pack_frame(2, moved(ego_message, 0.6), others)
+    assert [str(difference) for difference in replay.replay(decision, body, detector)] == [
+        "messages: that of car-2 is not the one in the log",
+        "messages: that of car-3 is missing",
+        "messages: that of car-9 is not in the log",
+    ]
+    other = dataclasses.replace(decision.session, weights_digest="0" * 64)
+    (difference,) = replay.replay(dataclasses.replace(decision, session=other), got.bodies[2], detector)
+    assert difference.what == "detector"
+
+
+def test_what_cannot_be_replayed_is_explained(got, detector):
+    decision = replay.find(got.lines, 2)
+    body = wire.unpack(got.bodies[2])
+    wrong = wire.pack({**body, "teammates": {"rsu": {}}})
+    for body, complaint in (
+        (b"?", "must be a map"),
+        (got.bodies[1], "of frame 1, not 2"),
+        (wrong, "rsu.pose"),
+    ):
+        with pytest.raises(replay.ReplayError, match=complaint):
+            replay.replay(decision, body, detector)
+    for lines, complaint in (
+        (got.lines[:3], "no answer to frame 2"),
+        ([got.lines[0], got.lines[3]], "lacks frame 1"),
+        (got.lines[3:], "does not begin"),
+        ([b"{"], "line 1: not JSON"),
+    ):
+        with pytest.raises(replay.ReplayError, match=complaint):
+            replay.find(lines, 2)
+    session = dataclasses.replace(decision.session, defense={"kind": "nonesuch"})
+    with pytest.raises(replay.ReplayError, match="no defence of kind 'nonesuch'"):
+        replay.replay(dataclasses.replace(decision, session=session), got.bodies[2], detector)
+
+
+def test_the_commands_prove_a_decision(got, tmp_path):
+    log, messages = tmp_path / "log.jsonl", tmp_path / "frame.msgpack"
+    log.write_bytes(b"\n".join(got.lines) + b"\n")
+    messages.write_bytes(got.bodies[2])
+    assert run("verify", log, "--head", got.head) == (
+        0,
+        f"{log}: 4 records, nothing wrong; head {got.head}, which is the head given",
+    )
+    code, said = run("replay", log, "--messages", messages)
+    assert code == 0
+    assert said.startswith("frame 2 (line 4): the same decision: consensus, ")
+    assert run("replay", log, "--messages", messages, "--frame", 2, "--detector", "intersection-mean") == (0, said)
+    log.write_bytes(b"".join(changed(got, source="ego_only")))
+    code, said = run("replay", log, "--messages", messages)
+    assert code == 1
+    assert 'source: "consensus", logged "ego_only"' in said
+    code, said = run("verify", log, "--head", got.head)
+    assert code == 1
+    assert "line 4 (seq 4): contradiction: frame 2: an ego-only answer with" in said
+    assert "line 4 (seq 4): wrong-head" in said
+
+
+@pytest.mark.parametrize(
+    ("arguments", "complaint"),
+    [
+        (["verify", "nonesuch"], "No such file"),
+        (["verify", "log", "--head", "12"], "64 hexadecimal digits"),
+        (["replay", "log", "--messages", "nonesuch"], "No such file"),
+        (["replay", "log", "--messages", "log"], "not a msgpack value"),
+        (["replay", "log", "--messages", "body", "--frame", "7"], "no answer to frame 7"),
+        (["replay", "log", "--messages", "body", "--frame", "1"], "of frame 2, not 1"),
+        (["replay", "log", "--messages", "body", "--detector", "nonesuch"], "no detector 'nonesuch'"),
+        (["report", "nonesuch", "--vehicle", "rsu"], "No such file"),
+    ],
+)
+def test_bad_arguments_are_explained(got, arguments, complaint, tmp_path, monkeypatch):
+    monkeypatch.chdir(tmp_path)
+    Path("log").write_bytes(b"\n".join(got.lines))
+    Path("body").write_bytes(got.bodies[2])
+    code, said = run(*arguments)
+    assert code == 2
+    assert complaint in said
+
+
+def run(*arguments):
+    result = CliRunner().invoke(app, ["audit", *map(str, arguments)])
+    return result.exit_code, " ".join(result.output.replace("│", "").split())
