@@ -101,16 +101,17 @@ def frame_answered(
     }
 
 
-def equivocation(vehicle_id: str, frame: int, first: str, second: Mapping[str, str]) -> AuditEvent:
-    """A vehicle said two different things about one frame: the digest of the first, digest and signature of the
-    second.
+def equivocation(vehicle_id: str, frame: int, first: Mapping[str, str], second: Mapping[str, str]) -> AuditEvent:
+    """A vehicle said two different things about one frame: digest and, where there is one, signature of each.
+
+    What the ego said first is signed in its frame's record.
     """
     return {
         "event": "equivocation",
         "time": now(),
         "vehicle_id": vehicle_id,
         "frame": frame,
-        "first": {"digest": first},
+        "first": dict(first),
         "second": dict(second),
     }
 

@@ -163,7 +163,7 @@ class Frames:
             reason = Reason.REPLAYED if frame == record.last_frame else Reason.STALE
             before = caller.live.ego_digest if reason is Reason.REPLAYED else None
             if before not in (None, ego.digest):
-                await self._sessions.log_equivocation(caller, frame, str(before), ego)
+                await self._sessions.log_equivocation(caller, frame, {"digest": str(before)}, ego)
             detail = f"frames must increase; the latest answered is {record.last_frame}"
             await self._refuse(caller, reason, detail, frame, "frame")
             raise Problem(409, "stale-frame", detail, "frame")

@@ -5,7 +5,7 @@ from __future__ import annotations
 import asyncio
 import base64
 import time
-from collections.abc import Sequence
+from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
 
 from robosac.defenses import Reason, Rejection
@@ -58,11 +58,11 @@ class Equivocation(Exception):
 
     Attributes
     ----------
-    first : str
-        Digest of what it said before.
+    first : mapping
+        Proof of what it said before.
     """
 
-    def __init__(self, first: str) -> None:
+    def __init__(self, first: Mapping[str, str]) -> None:
         super().__init__("another message with other content came for this frame; neither is used")
         self.first = first
 
@@ -101,7 +101,7 @@ class Gathering:
 
     def __init__(self, team: Sequence[str], max_ahead: int, backlog: Backlog, closed: int = -1) -> None:
         self._pending: dict[str, dict[int, Received | None]] = {name: {} for name in team}
-        self._said: dict[str, dict[int, str]] = {name: {} for name in team}
+        self._said: dict[str, dict[int, Mapping[str, str]]] = {name: {} for name in team}
         self._refusals: dict[str, tuple[int | None, Rejection]] = {}
         self._max_ahead = max_ahead
         self._backlog = backlog
@@ -125,7 +125,7 @@ class Gathering:
             raise Refused(Reason.UNAUTHENTICATED, f"{sender} has left the session")
         said = self._said[sender].get(frame)
         if said is not None:
-            if said == received.digest:
+            if said["digest"] == received.digest:
                 detail = f"this message of {sender} for frame {frame} is in already"
                 if frame <= self._closed:
                     self.refuse(sender, frame, Reason.REPLAYED, detail)
@@ -138,7 +138,7 @@ class Gathering:
             self.refuse(sender, frame, reason, detail)
             raise Refused(reason, detail)
         self._put(mine, frame, received)
-        self._said[sender][frame] = received.digest
+        self._said[sender][frame] = received.proof
         if len(mine) > self._max_ahead + 1:
             farthest = max(mine)
             self._drop(sender, farthest)

@@ -355,7 +355,7 @@ class Sessions:
         )
         await self.log(caller, audit.message_refused(caller.vehicle_id, reason, detail, frame=frame, field=field))
 
-    async def log_equivocation(self, caller: Caller, frame: int, first: str, second: Received) -> None:
+    async def log_equivocation(self, caller: Caller, frame: int, first: Mapping[str, str], second: Received) -> None:
         """Record that a vehicle said two different things about one frame."""
         self._metrics.refused(Reason.REPLAYED.value)
         caller.live.refusals[caller.vehicle_id] += 1

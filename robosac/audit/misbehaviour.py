@@ -165,7 +165,7 @@ class _Case:
 
     def _take_equivocation(self, lie: Equivocation, record: Mapping[str, Any]) -> None:
         if lie.vehicle_id == self.vehicle:
-            first = self.proofs.get(lie.first.digest, lie.first)
+            first = lie.first if lie.first.signature else self.proofs.get(lie.first.digest, lie.first)
             obs = {"frame": lie.frame, "time": record.get("time")}
             self._observe("message", "equivocation", SAME_STATION, obs, lie.frame, [first, lie.second])
 

@@ -219,6 +219,8 @@ class _Verification:
                 lie = Equivocation.of(record)
                 if lie.first.digest == lie.second.digest:
                     self._find(Fault.CONTRADICTION, "an equivocation of one message with itself")
+                if lie.first.signature is not None:
+                    self._check_signature(lie.vehicle_id, lie.first)
                 self._check_signature(lie.vehicle_id, lie.second)
             case "session_ended":
                 self._ended = True

@@ -96,7 +96,7 @@ def events(detector) -> list[dict[str, Any]]:
         answered(0, f"{0:064x}", against, found, trusted=("rsu", "car-3")),
         answered(1, f"{1:064x}", source=Source.TRUSTED, trusted=("rsu", "car-3")),
         audit.message_refused("car-2", Reason.MALFORMED, "ein Würfel", frame=2, field="pose"),
-        audit.equivocation("rsu", 1, proof("rsu", 1)["digest"], proof("rsu", 99)),
+        audit.equivocation("rsu", 1, {"digest": proof("rsu", 1)["digest"]}, proof("rsu", 99)),
         audit.team_changed(team, [*team, "car-4"], keys, {"trusted": ["rsu"], "frames_since_check": 0}),
         answered(5, f"{2:064x}", against, found, trusted=("rsu", "car-3")),
         audit.session_ended("closed"),

@@ -1,13 +1,19 @@
+import base64
 import json
 from datetime import UTC, datetime
 
+import numpy as np
 import pytest
 from typer.testing import CliRunner
 
-from robosac.audit import misbehaviour
+from clients.errors import GatewayError
+from robosac.audit import misbehaviour, verify
 from robosac.cli import app
-from robosac.signatures import read_public_key
+from robosac.detectors import Message
+from robosac.signatures import is_valid, read_public_key, show_public_key
+from robosac.wire import content_digest
 from tests.robosac.audit.conftest import KEY, SESSION, head, proof, seal_all
+from tests.service.conftest import serve
 
 NOW = datetime(2025, 1, 1, tzinfo=UTC)
 
@@ -58,6 +64,23 @@ def test_an_equivocation_is_reported_with_both_signatures(lines):
     assert [pdu["signature"] for pdu in stream["v2xPdus"]] == [proof("rsu", f)["signature"] for f in (1, 99)]
     assert stream["certificate"]["vehicleId"] == "rsu"
     assert read_public_key(stream["certificate"]["ed25519PublicKey"]) == KEY.public_key()
+
+
+async def test_two_signed_messages_of_the_gateway_prove_an_equivocation(messages):
+    other = Message(messages["rsu"].pose + 0.25 * np.eye(4, k=3), messages["rsu"].tensors)
+    async with serve() as served:
+        session = await served.open(gather_ms=20, public_keys={"rsu": show_public_key(KEY)})
+        unit = served.client.vehicle(session.session_id, "rsu", session.teammate_tokens["rsu"], KEY)
+        await unit.send(3, messages["rsu"])
+        with pytest.raises(GatewayError):
+            await unit.send(3, other)
+        lines = [line.encode() for line in await served.ego(session).audit_lines()]
+    assert verify(lines) == []
+    (stream,) = misbehaviour.report(lines, "rsu", NOW)["report"]["content"]["v2xPduEvidence"]
+    key = read_public_key(stream["certificate"]["ed25519PublicKey"])
+    for pdu, message in zip(stream["v2xPdus"], (messages["rsu"], other), strict=True):
+        assert pdu["digest"] == content_digest(3, "rsu", message)
+        assert is_valid(key, session.session_id, pdu["digest"], base64.b64decode(pdu["signature"]))
 
 
 def test_a_dissensus_with_the_previous_answer_is_a_conflict_with_other_stations(events):
