@@ -318,7 +318,7 @@ class VehicleClient:
         """As `audit`, the lines as they are chained."""
         response = await self._request("GET", f"{self._path}/audit", params={"after": after}, headers=self.bearer)
         text: str = response.text
-        return text.splitlines()
+        return text.split("\n")[:-1]  # and not where Unicode would also break a line
 
     async def kept_messages(self, frame: int) -> bytes:
         """As the ego: the messages of a decided frame as a whole frame, where the gateway keeps them."""

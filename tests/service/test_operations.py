@@ -88,3 +88,12 @@ def test_settings_come_from_the_environment(monkeypatch):
     monkeypatch.setenv("ROBOSAC_GATHER_MS", "-1")
     with pytest.raises(ValueError, match="gather_ms"):
         Settings()
+
+
+async def test_what_a_strange_header_puts_into_the_log_breaks_no_line(served):
+    session = await served.open()
+    headers = {"Content-Type": b"a\x85b", "Authorization": f"Bearer {session.teammate_tokens['rsu']}"}
+    path = f"/v1/sessions/{session.session_id}/messages"
+    assert (await served.http.post(path, content=b"x", headers=headers)).status_code == 415
+    (_, refused) = await served.ego(session).audit()
+    assert refused["detail"].endswith("a\x85b")
