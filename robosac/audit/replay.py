@@ -113,8 +113,8 @@ def replay(decision: LoggedDecision, body: bytes, detector: Preparer) -> list[Di
     """Make a decision again and compare.
 
     Jaccard indices are compared to `JACCARD_TOLERANCE`, boxes to `BOX_TOLERANCE`, the defence's state to
-    `STATE_TOLERANCE`; times are not. A decision that the
-    deadline cut short is made again with a clock that runs out after as many hypotheses.
+    `STATE_TOLERANCE`; times are not. A decision that the deadline cut short is made again with a clock that runs out
+    after as many hypotheses.
 
     Parameters
     ----------

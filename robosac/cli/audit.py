@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import json
 import re
-from collections.abc import Iterator
+from collections.abc import Iterable, Iterator
 from contextlib import contextmanager
 from datetime import UTC, datetime
 from pathlib import Path
@@ -30,16 +30,23 @@ def verify(
     """Check that nothing in a log was changed, and that it does not contradict itself; 1 if something is wrong."""
     if head is not None and re.fullmatch("[0-9a-f]{64}", head) is None:
         raise typer.BadParameter("must be 64 hexadecimal digits, lower case", param_hint="--head")
+    count, last = 0, b""
+
+    def counted(lines: Iterable[bytes]) -> Iterator[bytes]:
+        nonlocal count, last
+        for last in lines:
+            count += 1
+            yield last
+
     with _opened(file) as lines:
-        findings = verification.verify(lines, head)
+        findings = verification.verify(counted(lines), head)
     for finding in findings:
-        typer.echo(str(finding))
+        _say(finding)
     if findings:
-        typer.echo(f"{file}: {len(findings)} findings")
+        _say(f"{file}: findings: {len(findings)}")
         raise typer.Exit(1)
-    count, last = _end(file)
     proved = "which is the head given" if head else "to be compared with a head from elsewhere"
-    typer.echo(f"{file}: {count} records, nothing wrong; head {last}, {proved}")
+    _say(f"{file}: {count} records, nothing wrong; head {digest(last.decode().removesuffix(chr(10)))}, {proved}")
 
 
 @app.command("replay")
@@ -63,10 +70,7 @@ def replay_decision(
             decision = replay.find(lines, number)
     except replay.ReplayError as error:
         raise typer.BadParameter(str(error), param_hint="FILE") from error
-    try:
-        loaded = detectors.load(detector or decision.session.detector)
-    except (ValueError, OSError) as error:
-        raise typer.BadParameter(str(error), param_hint="--detector") from error
+    loaded = _load(detector, decision.session.detector)
     try:
         differences = replay.replay(decision, body, loaded)
     except replay.ReplayError as error:
@@ -75,11 +79,11 @@ def replay_decision(
     what = f"frame {answer.frame} (line {decision.line})"
     if differences:
         for difference in differences:
-            typer.echo(str(difference))
-        typer.echo(f"{what}: not the decision in the log")
+            _say(difference)
+        _say(f"{what}: not the decision in the log")
         raise typer.Exit(1)
     accepted = ", ".join(answer.accepted) or "nobody"
-    typer.echo(
+    _say(
         f"{what}: the same decision: {answer.source}, {accepted}; "
         f"{len(answer.hypotheses)} hypotheses, {len(answer.boxes)} boxes"
     )
@@ -95,13 +99,13 @@ def report(
     with _opened(file) as lines:
         findings = verification.verify(lines)
     if findings:
-        typer.echo(f"{file}: {findings[0]}; see robosac audit verify", err=True)
+        _say(f"{file}: {findings[0]}; see robosac audit verify", err=True)
         raise typer.Exit(1)
     try:
         with _opened(file) as lines:
             fields = misbehaviour.report(lines, vehicle, datetime.now(UTC))
     except misbehaviour.NothingToReport as nothing:
-        typer.echo(f"{file}: {nothing}", err=True)
+        _say(f"{file}: {nothing}", err=True)
         raise typer.Exit(1) from nothing
     text = json.dumps(fields, indent=2) + "\n"
     if out is None:
@@ -111,7 +115,7 @@ def report(
         out.write_text(text)
     except OSError as error:
         raise typer.BadParameter(str(error), param_hint="--out") from error
-    typer.echo(f"{out}: {len(fields['report']['content']['v2xPduEvidence'])} observations of {vehicle}")
+    _say(f"{out}: {len(fields['report']['content']['v2xPduEvidence'])} observations of {vehicle}")
 
 
 @contextmanager
@@ -123,10 +127,17 @@ def _opened(path: Path) -> Iterator[BinaryIO]:
         raise typer.BadParameter(str(error), param_hint="FILE") from error
 
 
-def _end(path: Path) -> tuple[int, str]:
-    """Number of lines, and the digest of the last."""
-    count, last = 0, b""
-    with path.open("rb") as lines:
-        for count, last in enumerate(lines, 1):  # noqa: B007
-            pass
-    return count, digest(last.decode().removesuffix("\n"))
+def _load(wanted: str | None, logged: str) -> detectors.Detector:
+    """The detector that the user wants, or one that ships: what a log names may be anything."""
+    if wanted is None and logged not in detectors.available():
+        raise typer.BadParameter(f"the log's detector, {logged!r}, does not ship; give it", param_hint="--detector")
+    try:
+        return detectors.load(wanted or logged)
+    except (ValueError, OSError) as error:
+        raise typer.BadParameter(str(error), param_hint="--detector") from error
+
+
+def _say(what: object, *, err: bool = False) -> None:
+    """Print what may hold a log's own words; a terminal must not obey them."""
+    shown = (character if character.isprintable() else repr(character)[1:-1] for character in str(what))
+    typer.echo("".join(shown), err=err)

@@ -195,6 +195,20 @@ def test_the_commands_prove_a_decision(got, tmp_path):
     assert "line 4 (seq 4): wrong-head" in said
 
 
+def test_a_log_names_no_code_to_run_and_says_nothing_to_the_terminal(got, tmp_path):
+    log, messages = tmp_path / "log.jsonl", tmp_path / "frame.msgpack"
+    messages.write_bytes(got.bodies[2])
+    log.write_bytes(b"".join(changed(got, 0, detector="antigravity:fly")))
+    code, said = run("replay", log, "--messages", messages)
+    assert code == 2
+    assert "'antigravity:fly', does not ship" in said
+    log.write_bytes(b"".join(changed(got, accepted=["\x1b[2J"])))
+    code, said = run("verify", log)
+    assert code == 1
+    assert "\x1b" not in said
+    assert r"\x1b[2J fused without a message" in said
+
+
 @pytest.mark.parametrize(
     ("arguments", "complaint"),
     [
