@@ -9,6 +9,7 @@ import signal
 import socket
 import subprocess
 import sys
+import tempfile
 import time
 from collections.abc import AsyncIterator, Iterator
 from pathlib import Path
@@ -25,7 +26,8 @@ KEY_SETTINGS = ("ROBOSAC_API_KEYS", "ROBOSAC_API_KEYS_FILE")
 async def local_gateway(log: Path) -> AsyncIterator[str]:
     """Start ``uvicorn service.app:app``, wait until it is ready, yield its URL, and stop it.
 
-    It asks for no API key, whatever the environment says: it serves loopback only.
+    It asks for no API key, whatever the environment says: it serves loopback only. It keeps its sessions where
+    ``ROBOSAC_DATABASE_URL`` says, else in a temporary folder that is removed afterwards.
 
     Parameters
     ----------
@@ -37,22 +39,12 @@ async def local_gateway(log: Path) -> AsyncIterator[str]:
     GatewayUnreachable
         If it ends or is not ready in time; the message holds the end of its log.
     """
-    with socket.socket() as probe:
-        probe.bind(("127.0.0.1", 0))
-        port = probe.getsockname()[1]
-    url = f"http://127.0.0.1:{port}"
-    command = [sys.executable, "-m", "uvicorn", "service.app:app", "--host", "127.0.0.1", "--port", str(port)]
-    log.parent.mkdir(parents=True, exist_ok=True)
-    with log.open("wb") as output:
-        process = subprocess.Popen(
-            [*command, "--log-level", "warning", "--timeout-graceful-shutdown", "5"],
-            stdout=output,
-            stderr=subprocess.STDOUT,
-            env={name: value for name, value in os.environ.items() if name not in KEY_SETTINGS},
-        )
+    with tempfile.TemporaryDirectory(prefix="robosac-") as folder:
+        database_url = os.environ.get("ROBOSAC_DATABASE_URL", f"sqlite+aiosqlite:///{folder}/robosac.db")
+        process, url = start_gateway(log, database_url)
         try:
             with _cancelled_by_sigterm():
-                await _until_ready(url, process, log)
+                await until_ready(url, process, log)
                 yield url
         finally:
             process.terminate()
@@ -61,6 +53,48 @@ async def local_gateway(log: Path) -> AsyncIterator[str]:
             except subprocess.TimeoutExpired:
                 process.kill()
                 process.wait()
+
+
+def start_gateway(log: Path, database_url: str) -> tuple[subprocess.Popen[bytes], str]:
+    """Start a gateway on a free loopback port; its process and its URL.
+
+    Parameters
+    ----------
+    log : Path
+        What the gateway prints is added to it.
+    database_url : str
+    """
+    with socket.socket() as probe:
+        probe.bind(("127.0.0.1", 0))
+        port = probe.getsockname()[1]
+    command = [sys.executable, "-m", "uvicorn", "service.app:app", "--host", "127.0.0.1", "--port", str(port)]
+    environment = {name: value for name, value in os.environ.items() if name not in KEY_SETTINGS}
+    log.parent.mkdir(parents=True, exist_ok=True)
+    with log.open("ab") as output:
+        process = subprocess.Popen(
+            [*command, "--log-level", "warning", "--timeout-graceful-shutdown", "5"],
+            stdout=output,
+            stderr=subprocess.STDOUT,
+            env=environment | {"ROBOSAC_DATABASE_URL": database_url},
+        )
+    return process, f"http://127.0.0.1:{port}"
+
+
+async def until_ready(url: str, process: subprocess.Popen[bytes], log: Path) -> None:
+    """Wait until a gateway that was started is ready.
+
+    Raises
+    ------
+    GatewayUnreachable
+        If it ends or is not ready in time; the message holds the end of its log.
+    """
+    end = time.monotonic() + START_TIMEOUT_S
+    async with GatewayClient(url, timeout_s=2.0) as gateway:
+        while not await gateway.ready():
+            if process.poll() is not None or time.monotonic() > end:
+                why = f"ended with status {process.poll()}" if process.poll() is not None else "was not ready in time"
+                raise GatewayUnreachable(f"the gateway {why}; its log ends:\n{log.read_text()[-2000:]}")
+            await asyncio.sleep(0.05)
 
 
 @contextlib.contextmanager
@@ -76,13 +110,3 @@ def _cancelled_by_sigterm() -> Iterator[None]:
         yield
     finally:
         loop.remove_signal_handler(signal.SIGTERM)
-
-
-async def _until_ready(url: str, process: subprocess.Popen[bytes], log: Path) -> None:
-    end = time.monotonic() + START_TIMEOUT_S
-    async with GatewayClient(url, timeout_s=2.0) as gateway:
-        while not await gateway.ready():
-            if process.poll() is not None or time.monotonic() > end:
-                why = f"ended with status {process.poll()}" if process.poll() is not None else "was not ready in time"
-                raise GatewayUnreachable(f"the gateway {why}; its log ends:\n{log.read_text()[-2000:]}")
-            await asyncio.sleep(0.1)

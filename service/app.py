@@ -27,7 +27,8 @@ from service.metrics import Metrics  # noqa: E402
 from service.routes import keyed, operations, v1  # noqa: E402
 from service.sessions import Sessions  # noqa: E402
 from service.settings import Settings  # noqa: E402
-from service.store import MemoryStore, Store, new_seed  # noqa: E402
+from service.sql_store import SqlStore  # noqa: E402
+from service.store import new_seed  # noqa: E402
 from service.tracing import Traced, Tracing, provider_from_environment  # noqa: E402
 
 if TYPE_CHECKING:
@@ -40,7 +41,6 @@ def create_app(
     settings: Settings | None = None,
     seeds: Callable[[], str] = new_seed,
     spans: TracerProvider | None = None,
-    store: Store | None = None,
 ) -> FastAPI:
     """A gateway.
 
@@ -53,13 +53,11 @@ def create_app(
         knows the seed knows which subsets will be sampled.
     spans : TracerProvider, optional
         Takes the traces; by default what the environment says, see `service.tracing`.
-    store : Store, optional
-        Where sessions are kept; by default in memory.
     """
     settings = settings or Settings()
     engine = Engine(settings.torch_threads, settings.extra_detectors)
     metrics = Metrics()
-    store = store or MemoryStore()
+    store = SqlStore(settings.database_url)
     api_keys, tokens = ApiKeys.configured(settings), Tokens.configured(settings)
     sessions = Sessions(settings, store, engine, metrics, tokens, seeds)
     admission = Admission()
@@ -72,19 +70,23 @@ def create_app(
         with logging_to_stderr(settings):
             if not api_keys:
                 logger.warning("no API key is set (ROBOSAC_API_KEYS): only requests from this machine are served")
-            await tokens.start(store)
-            await engine.start()
-            if settings.detector not in engine.detectors:
-                raise ValueError(
-                    f"ROBOSAC_DETECTOR: unknown detector {settings.detector!r}; known: {list(engine.detectors)}"
-                )
-            sweeper = asyncio.create_task(sessions.expire_idle())
-            logger.info("gateway ready", version=version("robosac"), detectors=list(engine.detectors))
             try:
-                yield
+                await asyncio.gather(store.start(), engine.start())
+                await tokens.start(store)
+                metrics.sessions.set(await store.count())
+                if settings.detector not in engine.detectors:
+                    raise ValueError(
+                        f"ROBOSAC_DETECTOR: unknown detector {settings.detector!r}; known: {list(engine.detectors)}"
+                    )
+                sweeper = asyncio.create_task(sessions.expire_idle())
+                logger.info("gateway ready", version=version("robosac"), detectors=list(engine.detectors))
+                try:
+                    yield
+                finally:
+                    sweeper.cancel()
             finally:
-                sweeper.cancel()
                 engine.stop()
+                await store.close()
                 tracing.close()
                 logger.info("gateway stopped")
 

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import contextlib
 import logging
 import time
 from collections.abc import Mapping
@@ -23,10 +24,13 @@ from service.metrics import Metrics
 from service.problems import Problem
 from service.sessions import Caller, Sessions
 from service.settings import Settings
+from service.store import SessionChanged
 from service.tracing import Tracing
 
 logger = structlog.stdlib.get_logger(__name__)
 
+ATTEMPTS = 3
+"""To decide a frame while other processes change its session."""
 STRANGERS_NAMED = 8
 SLACK_BYTES = 64 * 1024
 """What a message may have besides its tensors."""
@@ -214,6 +218,25 @@ class Frames:
     ) -> dict[str, Any]:
         """Fuse, keep the decision, and build the frame result. The session's lock is held.
 
+        What was worked out from a session that another process has changed by then is worked out again.
+        """
+        for _ in range(ATTEMPTS):
+            with contextlib.suppress(SessionChanged):
+                return await self._decide(caller, frame, ego, messages, unusable, arrived, timings)
+        raise Problem(409, "session-changed", "the session keeps being changed elsewhere; try again")
+
+    async def _decide(
+        self,
+        caller: Caller,
+        frame: int,
+        ego: Received,
+        messages: Mapping[str, Received],
+        unusable: Mapping[str, Rejection],
+        arrived: float,
+        timings: dict[str, float],
+    ) -> dict[str, Any]:
+        """As `_answer`, from the session as this process knows it.
+
         The team is the one of this moment, whoever was in it when the messages came; ``unusable`` says why parts of the
         body are not among the messages.
         """
@@ -255,10 +278,10 @@ class Frames:
             previous_frame=None if live.previous is None else live.previous.frame,
             unlogged=live.unlogged(),
         )
-        await self._sessions.decide(caller, frame, result.state, event, self._to_keep(frame, ego, present))
+        await self._sessions.decide(record, frame, result.state, event, self._to_keep(frame, ego, present))
         timings["store"] = (time.perf_counter() - arrived) * 1e3 - timings["total"]
         self._admission.learn(sum(timings[stage] for stage in _WORK) / 1e3, timings["store"] / 1e3)
-        live.previous, live.ego_digest = result.previous, ego.digest
+        live.answered, live.previous, live.ego_digest = frame, result.previous, ego.digest
         for name, received in {record.ego_id: ego, **present}.items():
             live.motion.moved(name, frame, received.message.pose)
         reasons = [entry["reason"] for entry in answer["rejected"]]

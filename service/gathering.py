@@ -108,6 +108,11 @@ class Gathering:
         self._closed = closed
         self._arrival = asyncio.Event()
 
+    @property
+    def closed(self) -> int:
+        """The latest frame that is answered, or being answered; -1 before the first."""
+        return self._closed
+
     def offer(self, frame: int, sender: str, received: Received) -> None:
         """Keep a message for its frame.
 

@@ -18,6 +18,7 @@ from starlette.exceptions import HTTPException
 
 from robosac.wire import WireError
 from service.schemas import DEFENSE_KINDS
+from service.store import StoreUnavailable
 
 logger = structlog.stdlib.get_logger(__name__)
 
@@ -99,6 +100,11 @@ def install(app: FastAPI) -> None:
     @app.exception_handler(Problem)
     async def _problem(_: Request, error: Problem) -> JSONResponse:
         return error.response()
+
+    @app.exception_handler(StoreUnavailable)
+    async def _unavailable(_: Request, __: StoreUnavailable) -> JSONResponse:
+        detail = "the database failed; nothing is acknowledged, try again"
+        return Problem(503, "store-unavailable", detail, headers={"Retry-After": "1"}).response()
 
     @app.exception_handler(RequestValidationError)
     async def _invalid(_: Request, error: RequestValidationError) -> JSONResponse:

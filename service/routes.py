@@ -32,8 +32,8 @@ from service.sessions import Caller
 MSGPACK = "application/vnd.msgpack"
 MSGPACK_TYPES = (MSGPACK, "application/msgpack", "application/x-msgpack")
 
-v1 = APIRouter(prefix="/v1", responses=documented(422))
-keyed = APIRouter(prefix="/v1", responses=documented(422), route_class=KeyedRoute)
+v1 = APIRouter(prefix="/v1", responses=documented(422, 503))
+keyed = APIRouter(prefix="/v1", responses=documented(422, 503), route_class=KeyedRoute)
 operations = APIRouter()
 _bearer = HTTPBearer(auto_error=False, scheme_name="Token", description="A vehicle's token.")
 _api_key = HTTPBearer(auto_error=False, scheme_name="ApiKey", description="An API key, where the gateway has any.")
@@ -79,7 +79,7 @@ async def list_detectors(gateway: GatewayDep) -> DetectorList:
     return DetectorList(detectors=[DetectorEntry.of(detector.info) for detector in gateway.engine.detectors.values()])
 
 
-@keyed.post("/sessions", status_code=201, responses=documented(400, 401, 413, 503), dependencies=[Depends(_api_key)])
+@keyed.post("/sessions", status_code=201, responses=documented(400, 401, 413), dependencies=[Depends(_api_key)])
 async def open_session(request: SessionRequest, gateway: GatewayDep) -> SessionCreated:
     """Open a session of one ego with its teammates. The tokens are shown only in this answer."""
     return await gateway.sessions.open(request)

@@ -35,7 +35,16 @@ from service.schemas import (
     read_defense,
 )
 from service.settings import Settings
-from service.store import AuditEvent, FrameDecided, SessionOver, SessionRecord, Store, new_seed
+from service.store import (
+    AuditEvent,
+    FrameDecided,
+    SessionChanged,
+    SessionOver,
+    SessionRecord,
+    Store,
+    StoreUnavailable,
+    new_seed,
+)
 
 logger = structlog.stdlib.get_logger(__name__)
 
@@ -50,19 +59,34 @@ MAX_RENEWALS = 16
 
 @dataclass
 class LiveSession:
-    """What a session holds in this process only; the lock is held while a frame is answered or the team changes."""
+    """What a session holds in this process only; the lock is held while a frame is answered or the team changes.
+
+    ``previous`` and ``ego_digest`` are of the frame ``answered``, the latest that this process answered.
+    """
 
     detector: Detector
     defense: Defense
+    team: tuple[str, ...]
     gathering: Gathering
     motion: Motion
     budget_s: float
+    answered: int | None = None
     previous: PreviousAnswer | None = None
     ego_digest: str | None = None
     lock: asyncio.Lock = field(default_factory=asyncio.Lock)
     last_used: float = field(default_factory=time.monotonic)
     refusals: Counter[str] = field(default_factory=Counter)
     renewals: Counter[str] = field(default_factory=Counter)
+
+    def follow(self, record: SessionRecord) -> None:
+        """Catch up with what another process did to the session, if one did."""
+        if self.team != record.teammates:
+            self.team = record.teammates
+            self.gathering.change_team(record.teammates)
+        if record.last_frame is not None and record.last_frame > self.gathering.closed:
+            self.gathering.close(record.last_frame)
+        if record.last_frame != self.answered:
+            self.previous = self.ego_digest = None
 
     def unlogged(self) -> dict[str, int]:
         """Refusals by vehicle that got no record since the last call; all counts begin again."""
@@ -137,7 +161,8 @@ class Sessions:
             raise Problem(
                 422, "invalid-request", f"must not exceed the latency budget of {budget_ms:g} ms", "gather_ms"
             )
-        if await self._store.count() >= self._settings.max_sessions:
+        already_open = await self._store.count()
+        if already_open >= self._settings.max_sessions:
             raise Problem(
                 503, "too-many-sessions", "the gateway holds as many sessions as it may", headers={"Retry-After": "30"}
             )
@@ -161,7 +186,7 @@ class Sessions:
         )
         await self._store.create(record, audit.session_opened(record, detector.info))
         self._live[record.session_id] = self._revive(record)
-        self._metrics.sessions.set(await self._store.count())
+        self._metrics.sessions.set(already_open + 1)
         logger.info(
             "session opened",
             session_id=record.session_id,
@@ -192,9 +217,11 @@ class Sessions:
         """
         record = await self._store.get(session_id)
         if record is None or record.ended_at is not None:
+            self._forget(session_id)
             raise Problem(404, "unknown-session", "there is no such session; it may have ended or expired")
-        live = self._live_session(record)
         vehicle = await self._holder(record, token)
+        live = self._live_session(record)
+        live.follow(record)
         live.last_used = time.monotonic()
         return Caller(record, live, vehicle)
 
@@ -233,7 +260,7 @@ class Sessions:
             tokens = {name: self._tokens.issue(record.session_id, name, is_ego=False) for name in newcomers}
             token_ids = {**record.token_ids, **{name: token.token_id for name, token in tokens.items()}}
             keys = {**record.public_keys, **public_keys}
-            await self._change_team(caller, (*record.teammates, *newcomers), token_ids, keys)
+            await self._change_team(caller, record, (*record.teammates, *newcomers), token_ids, keys)
             return TeamChanged(
                 teammates=[*record.teammates, *newcomers],
                 teammate_tokens={name: token.text for name, token in tokens.items()},
@@ -249,7 +276,7 @@ class Sessions:
             token_ids = {name: token_id for name, token_id in record.token_ids.items() if name != leaver}
             keys = {name: key for name, key in record.public_keys.items() if name != leaver}
             team = tuple(name for name in record.teammates if name != leaver)
-            await self._change_team(caller, team, token_ids, keys)
+            await self._change_team(caller, record, team, token_ids, keys)
 
     async def renew(self, caller: Caller) -> TokenRenewed:
         """A fresh token of the caller; the one it came with is worth nothing any more."""
@@ -304,31 +331,52 @@ class Sessions:
                 for session_id in await self._store.unused_since(time.time() - self._settings.session_idle_s):
                     if not self._in_use(session_id):
                         await self._end(session_id, "expired")
+                for session_id in [one for one in self._live if not self._in_use(one)]:
+                    record = await self._store.get(session_id)
+                    if record is None or record.ended_at is not None:  # by another process
+                        self._forget(session_id)
                 await self._store.purge(time.time() - self._settings.audit_retention_s)
             except Exception:  # a sweep that fails must not be the last one
                 logger.exception("idle sessions could not be ended")
 
     async def current(self, caller: Caller) -> SessionRecord:
-        """The session as it is now; it may have moved on, or ended, since the caller was authenticated."""
-        record = await self._store.get(caller.record.session_id)
+        """The session as it is now; it may have moved on, or ended, since the caller was authenticated.
+
+        What another process changed meanwhile may be missing; `decide` finds out.
+        """
+        session_id = caller.record.session_id
+        record = self._store.seen(session_id) or await self._store.get(session_id)
         if record is None or record.ended_at is not None:
             raise _over()
+        caller.live.follow(record)
         return record
 
     async def decide(
-        self, caller: Caller, frame: int, state: Mapping[str, Any], event: AuditEvent, messages: bytes | None = None
+        self,
+        record: SessionRecord,
+        frame: int,
+        state: Mapping[str, Any],
+        event: AuditEvent,
+        messages: bytes | None = None,
     ) -> None:
-        """Keep a decision, its record, and the commitment to the next frame's seed."""
+        """Keep a decision that was worked out from ``record``, its own record, and the commitment to the next seed.
+
+        Raises
+        ------
+        SessionChanged
+            If the session is another by now: the decision is void, and has to be worked out again.
+        """
         next_seed = self._seeds()
         event = {**event, "next_seed_commitment": commitment(next_seed)}
         try:
-            await self._store.decide(caller.record.session_id, frame, state, next_seed, event, messages)
+            await self._store.decide(record.session_id, record.revision, frame, state, next_seed, event, messages)
         except SessionOver as error:
             raise _over() from error
         except FrameDecided as error:
             raise Problem(409, "stale-frame", f"frame {frame} or a later one is answered already", "frame") from error
         if messages is not None:
-            await self._store.forget_messages(caller.record.session_id, frame - self._settings.keep_frames + 1)
+            with contextlib.suppress(StoreUnavailable):  # the decision is kept; the next one forgets these as well
+                await self._store.forget_messages(record.session_id, frame - self._settings.keep_frames + 1)
 
     async def messages(self, caller: Caller, frame: int) -> bytes | None:
         """The messages kept of a decided frame."""
@@ -366,18 +414,29 @@ class Sessions:
             await self.log(caller, audit.equivocation(caller.vehicle_id, frame, first, second.proof))
 
     async def _change_team(
-        self, caller: Caller, team: Sequence[str], token_ids: Mapping[str, str], keys: Mapping[str, str]
+        self,
+        caller: Caller,
+        record: SessionRecord,
+        team: Sequence[str],
+        token_ids: Mapping[str, str],
+        keys: Mapping[str, str],
     ) -> None:
-        """Keep a new team. The session's lock is held."""
+        """Keep a new team of the session ``record``. The session's lock is held."""
         self._check_size(team)
-        record = await self.current(caller)
         try:
             state = caller.live.defense.change_team(record.state, team)
         except DomainError as error:
             raise Problem(422, "impossible-defense", str(error), "teammates") from error
         event = audit.team_changed(record.teammates, team, keys, state)
-        await self._store.change_team(record.session_id, tuple(team), token_ids, keys, state, event)
-        caller.live.gathering.change_team(team)
+        try:
+            await self._store.change_team(
+                record.session_id, record.revision, tuple(team), token_ids, keys, state, event
+            )
+        except SessionChanged as error:
+            raise Problem(409, "session-changed", "the session was changed at the same time; try again") from error
+        except SessionOver as error:
+            raise _over() from error
+        caller.live.follow(await self.current(caller))
 
     def _check_size(self, team: Sequence[str]) -> None:
         most = self._settings.max_teammates
@@ -398,6 +457,7 @@ class Sessions:
         return LiveSession(
             self._detector(record.detector),
             read_defense(record.defense).build(),
+            record.teammates,
             Gathering(record.teammates, settings.max_pending_frames, self.backlog, closed),
             Motion(settings.max_speed_mps, record.frame_period_ms / 1e3, settings.max_range_m),
             record.latency_budget_ms / 1e3,
@@ -409,10 +469,13 @@ class Sessions:
         recently = time.monotonic() - self._settings.session_idle_s
         return live is not None and (live.lock.locked() or live.last_used >= recently)
 
-    async def _end(self, session_id: str, why: str) -> None:
+    def _forget(self, session_id: str) -> None:
         live = self._live.pop(session_id, None)
         if live is not None:
             live.gathering.clear()
+
+    async def _end(self, session_id: str, why: str) -> None:
+        self._forget(session_id)
         with contextlib.suppress(SessionOver):
             event = audit.session_ended(why)
             logger.info("session ended", session_id=session_id, why=why)

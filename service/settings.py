@@ -9,6 +9,7 @@ from pydantic import Field, SecretStr, field_validator
 from pydantic_settings import BaseSettings, NoDecode, SettingsConfigDict
 
 from robosac.detectors import DEFAULT_DETECTOR
+from service.database import read_url
 
 
 class Settings(BaseSettings):
@@ -37,6 +38,9 @@ class Settings(BaseSettings):
         le=60_000,
         description="Longest wait for teammates once the ego's message is in; by default at most half the budget.",
     )
+    database_url: str = Field(
+        "sqlite+aiosqlite:///robosac.db", repr=False, description="Where sessions and audit logs are kept."
+    )
     max_body_bytes: int = Field(32 * 2**20, ge=1024, description="Largest request body.")
     body_timeout_s: float = Field(10.0, gt=0, description="Time that a body may take from first to last byte.")
     max_sessions: int = Field(10_000, ge=1, description="Open sessions at a time.")
@@ -57,6 +61,12 @@ class Settings(BaseSettings):
     log_level: Literal["debug", "info", "warning", "error"] = Field("info", description="Least of what is logged.")
     log_format: Literal["json", "console"] = Field("json", description="One JSON object a line, or for the eye.")
     torch_threads: int = Field(1, ge=1, description="Threads of one detector pass; at this size one is fastest.")
+
+    @field_validator("database_url")
+    @classmethod
+    def _check_url(cls, value: str) -> str:
+        read_url(value)
+        return value
 
     @field_validator("extra_detectors", "api_keys", "token_secrets", mode="before")
     @classmethod

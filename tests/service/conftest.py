@@ -12,7 +12,6 @@ from robosac import wire
 from service.app import create_app
 from service.gateway import Gateway
 from service.settings import Settings
-from service.store import Store
 
 EGO = "car-1"
 TEAM = ("car-2", "car-3", "car-4", "car-5", "rsu")
@@ -50,12 +49,14 @@ async def serve(
     seeds: Iterable[int] | None = None,
     *,
     spans: TracerProvider | None = None,
-    store: Store | None = None,
     api_key: str | None = None,
     **settings: Any,
 ) -> AsyncIterator[Served]:
-    """A gateway; ``seeds`` are those of its frames, one after another, if it is to be foreseen."""
-    options: dict[str, Any] = {"spans": spans, "store": store}
+    """A gateway, by default on a database in memory; ``seeds`` are those of its frames, one after another, if it is to
+    be foreseen.
+    """
+    settings.setdefault("database_url", "sqlite://")
+    options: dict[str, Any] = {"spans": spans}
     if seeds is not None:
         numbers = iter(seeds)
         options["seeds"] = lambda: f"{next(numbers):064x}"

@@ -176,16 +176,17 @@ async def test_a_refused_message_counts_for_its_own_frame(served, messages):
 
 
 async def test_a_message_for_a_session_that_has_ended_is_not_accepted(served, messages, monkeypatch):
-    from service.frames import Frames
+    from service import routes
 
     session = await served.open()
-    reading = Frames.body_limit
+    reading = routes.read_bounded
 
-    def ends_meanwhile(self, caller, *, whole_frame):
-        served.gateway.sessions._store._sessions.pop(session.session_id)
-        return reading(self, caller, whole_frame=whole_frame)
+    async def ends_meanwhile(request, limit):
+        if request.url.path.endswith("/messages"):
+            await served.ego(session).close()
+        return await reading(request, limit)
 
-    monkeypatch.setattr(Frames, "body_limit", ends_meanwhile)
+    monkeypatch.setattr(routes, "read_bounded", ends_meanwhile)
     body = wire.pack_message(0, "rsu", messages["rsu"])
     problem(await served.post(session, "messages", body, session.teammate_tokens["rsu"]), 404, "unknown-session")
 

@@ -13,7 +13,6 @@ from robosac import wire
 from service.app import create_app
 from service.identity import AUDIENCE, CLAIMS, ISSUER, is_local
 from service.settings import Settings
-from service.store import MemoryStore
 from tests.service.conftest import EGO, TEAM, problem, serve
 
 KEY, OTHER_KEY = "key-number-one-0123", "key-number-two-4567"
@@ -135,11 +134,11 @@ async def test_any_of_the_keys_opens_a_session_and_the_client_sends_its_own(tmp_
         assert response.headers["www-authenticate"] == "Bearer"
 
 
-async def test_a_retired_key_opens_nothing_while_its_sessions_live_on():
-    store = MemoryStore()
-    async with serve(store=store, api_key=KEY, api_keys=KEY) as served:
+async def test_a_retired_key_opens_nothing_while_its_sessions_live_on(tmp_path):
+    database = f"sqlite+aiosqlite:///{tmp_path}/robosac.db"
+    async with serve(database_url=database, api_key=KEY, api_keys=KEY) as served:
         session = await served.open()
-    async with serve(store=store, api_key=KEY, api_keys=OTHER_KEY) as served:
+    async with serve(database_url=database, api_key=KEY, api_keys=OTHER_KEY) as served:
         with pytest.raises(AccessDenied):
             await served.open()
         assert (await served.ego(session).state())["session_id"] == session.session_id
@@ -411,19 +410,19 @@ async def test_refused_access_does_not_keep_a_session_from_expiring(monkeypatch)
 
 
 @pytest.mark.parametrize("secrets", [("", ""), (SECRET, SECRET), (SECRET, f"{OTHER_SECRET},{SECRET}")])
-async def test_tokens_outlive_a_restart_and_a_rotation_of_secrets(secrets, good_frame):
-    store = MemoryStore()
-    async with serve(store=store, token_secrets=secrets[0]) as served:
+async def test_tokens_outlive_a_restart_and_a_rotation_of_secrets(secrets, good_frame, tmp_path):
+    database = f"sqlite+aiosqlite:///{tmp_path}/robosac.db"
+    async with serve(database_url=database, token_secrets=secrets[0]) as served:
         session = await served.open()
         renewed = await served.teammate(session, "rsu").renew()
-    async with serve(store=store, token_secrets=secrets[1]) as served:
+    async with serve(database_url=database, token_secrets=secrets[1]) as served:
         assert (await served.post(session, "frames", good_frame(0))).status_code == 200
         with pytest.raises(AccessDenied):
             await served.teammate(session, "rsu").renew()
         unit = served.client.vehicle(session.session_id, "rsu", renewed.token)
         fresh = (await unit.renew()).token
     if secrets[1].startswith(OTHER_SECRET):
-        async with serve(store=store, token_secrets=OTHER_SECRET) as served:
+        async with serve(database_url=database, token_secrets=OTHER_SECRET) as served:
             await served.client.vehicle(session.session_id, "rsu", fresh).renew()
             with pytest.raises(AccessDenied):
                 await served.ego(session).state()

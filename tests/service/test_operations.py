@@ -8,7 +8,7 @@ from tests.service.conftest import problem
 
 
 async def test_alive_at_once_and_ready_after_the_warm_up():
-    app = create_app(Settings())
+    app = create_app(Settings(database_url="sqlite://"))
     transport = httpx.ASGITransport(app)
     async with httpx.AsyncClient(base_url="http://gateway", transport=transport) as http:
         assert (await http.get("/healthz")).status_code == 200
@@ -44,7 +44,7 @@ async def test_late_frames_are_counted(served, ego_message, attacked):
 
 
 async def test_a_default_detector_that_does_not_exist_keeps_the_gateway_from_starting():
-    app = create_app(Settings(detector="nonesuch"))
+    app = create_app(Settings(detector="nonesuch", database_url="sqlite://"))
     with pytest.raises(ValueError, match="ROBOSAC_DETECTOR"):
         async with app.router.lifespan_context(app):
             pytest.fail("it started")

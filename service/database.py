@@ -1,0 +1,251 @@
+"""Transactions on SQLite or PostgreSQL, off the event loop's critical path.
+
+Work is a plain function of a connection; each call is one transaction. SQLite has one connection that writes and some
+that read, each on a thread of its own; a piece of work goes there as a whole, since on few, busy cores each change of
+threads costs more than a statement. Work that waits for the writer is committed together: what each piece did is kept
+or undone by itself, but all share one flush to disk, which is what a commit costs.
+"""
+
+from __future__ import annotations
+
+import asyncio
+import logging
+import os
+import sqlite3
+from collections.abc import Callable, Iterator
+from concurrent.futures import ThreadPoolExecutor
+from contextlib import contextmanager, suppress
+from functools import partial
+from typing import Any, Protocol, TypeVar
+
+import asyncpg
+from sqlalchemy import Connection, Engine, create_engine, event
+from sqlalchemy.engine import URL, make_url
+from sqlalchemy.exc import ArgumentError, SQLAlchemyError
+from sqlalchemy.ext.asyncio import create_async_engine
+from sqlalchemy.pool import QueuePool
+
+from service.store import StoreUnavailable
+
+logger = logging.getLogger(__name__)
+
+T = TypeVar("T")
+Work = Callable[[Connection], T]
+
+BUSY_TIMEOUT_S = 5.0
+"""How long SQLite waits for another process that writes."""
+COMMAND_TIMEOUT_S = 10.0
+"""How long PostgreSQL may take for a statement."""
+CONNECT_TIMEOUT_S = 5.0
+READERS = 2
+WRITTEN_TOGETHER = 64
+_DRIVERS = {
+    "sqlite": "sqlite",
+    "sqlite+aiosqlite": "sqlite",
+    "postgresql": "postgresql+asyncpg",
+    "postgresql+asyncpg": "postgresql+asyncpg",
+}
+
+
+class Database(Protocol):
+    """Where transactions run.
+
+    Whatever goes wrong with the database is a `StoreUnavailable`; of a `write` it is then unknown whether it is kept,
+    as when a connection breaks before the answer to a commit. Other exceptions of the work are passed on, and nothing
+    is kept.
+    """
+
+    async def read(self, work: Work[T]) -> T:
+        """Run work that only reads."""
+        ...
+
+    async def write(self, work: Work[T]) -> T:
+        """Run work; what it did is kept once this returns."""
+        ...
+
+    async def close(self) -> None:
+        """Let go of files and connections."""
+        ...
+
+
+def read_url(text: str) -> URL:
+    """A database's URL with its driver.
+
+    Raises
+    ------
+    ValueError
+        If it is none, or of another kind of database. The message does not show it, since it may hold a password.
+    """
+    try:
+        url = make_url(text)
+    except ArgumentError as error:
+        raise ValueError("not a database URL") from error
+    if url.drivername not in _DRIVERS:
+        raise ValueError(f"a database must be one of {', '.join(_DRIVERS)}, not {url.drivername}")
+    return url.set(drivername=_DRIVERS[url.drivername])
+
+
+def connect(text: str) -> Database:
+    """The database of a URL; nothing is opened before the first transaction.
+
+    Raises
+    ------
+    ValueError
+        As `read_url`.
+    """
+    url = read_url(text)
+    return Sqlite(url) if url.get_backend_name() == "sqlite" else Postgres(url)
+
+
+class Postgres:
+    """PostgreSQL, for several gateways on several machines."""
+
+    def __init__(self, url: URL) -> None:
+        self._engine = create_async_engine(
+            url,
+            pool_size=5,
+            max_overflow=15,
+            pool_timeout=CONNECT_TIMEOUT_S,
+            hide_parameters=True,
+            connect_args={"timeout": CONNECT_TIMEOUT_S, "command_timeout": COMMAND_TIMEOUT_S},
+        )
+        self._reader = self._engine.execution_options(isolation_level="AUTOCOMMIT")
+
+    async def read(self, work: Work[T]) -> T:
+        with _unavailable():
+            async with self._reader.connect() as connection:
+                return await connection.run_sync(work)
+
+    async def write(self, work: Work[T]) -> T:
+        with _unavailable():
+            async with self._engine.begin() as connection:
+                return await connection.run_sync(work)
+
+    async def close(self) -> None:
+        await self._engine.dispose()
+
+
+class Sqlite:
+    """One SQLite file in WAL mode, or a database in memory, which has a single connection."""
+
+    def __init__(self, url: URL) -> None:
+        self._writer = _SqliteThreads(url, 1)
+        event.listen(self._writer.engine, "begin", _begin_immediate)
+        in_memory = url.database in (None, "", ":memory:")
+        self._readers = None if in_memory else _SqliteThreads(url, READERS)
+        self._waiting: list[tuple[Work[Any], asyncio.Future[Any]]] = []
+        self._writing: asyncio.Task[None] | None = None
+
+    async def read(self, work: Work[T]) -> T:
+        if self._readers is None:
+            return await self.write(work)
+        with _unavailable():
+            return await self._readers.run(work)
+
+    async def write(self, work: Work[T]) -> T:
+        done: asyncio.Future[T] = asyncio.get_running_loop().create_future()
+        self._waiting.append((work, done))
+        if self._writing is None:
+            self._writing = asyncio.create_task(self._write_all())
+        with _unavailable():
+            return await done
+
+    async def close(self) -> None:
+        if self._writing is not None:
+            await self._writing
+        if self._readers is not None:
+            await self._readers.close()
+        await self._writer.close()
+
+    async def _write_all(self) -> None:
+        while self._waiting:
+            batch, self._waiting = self._waiting[:WRITTEN_TOGETHER], self._waiting[WRITTEN_TOGETHER:]
+            outcomes: list[Any] = []
+            try:
+                outcomes = await self._writer.run(partial(_each, batch=[work for work, _ in batch]))
+            except BaseException as error:
+                outcomes = [error] * len(batch)
+            for (_, done), outcome in zip(batch, outcomes, strict=True):
+                if done.done():  # whoever asked was cancelled
+                    continue
+                if isinstance(outcome, BaseException):
+                    done.set_exception(outcome)
+                else:
+                    done.set_result(outcome)
+        self._writing = None
+
+
+class _SqliteThreads:
+    """Connections to a SQLite database with as many threads to use them."""
+
+    def __init__(self, url: URL, number: int) -> None:
+        self.engine: Engine = create_engine(
+            url,
+            poolclass=QueuePool,
+            pool_size=number,
+            max_overflow=0,
+            hide_parameters=True,
+            connect_args={"timeout": BUSY_TIMEOUT_S, "check_same_thread": False},
+        )
+        event.listen(self.engine, "do_connect", _create_for_us_alone)
+        event.listen(self.engine, "connect", _prepare)
+        self._threads = ThreadPoolExecutor(number, "sqlite")
+
+    async def run(self, work: Work[T]) -> T:
+        """Run work in a transaction on one of the threads."""
+        return await asyncio.get_running_loop().run_in_executor(self._threads, self._run, work)
+
+    async def close(self) -> None:
+        """Close the connections and end the threads."""
+        await asyncio.get_running_loop().run_in_executor(self._threads, self.engine.dispose)
+        self._threads.shutdown()
+
+    def _run(self, work: Work[T]) -> T:
+        with self.engine.begin() as connection:
+            return work(connection)
+
+
+def _each(connection: Connection, batch: list[Work[Any]]) -> list[Any]:
+    """Results, and exceptions of work that is undone; a database error undoes all."""
+    if len(batch) == 1:
+        return [batch[0](connection)]
+    outcomes: list[Any] = []
+    for work in batch:
+        try:
+            with connection.begin_nested():
+                outcomes.append(work(connection))
+        except SQLAlchemyError:
+            raise
+        except Exception as error:
+            outcomes.append(error)
+    return outcomes
+
+
+def _prepare(connection: Any, _: object) -> None:
+    """Leave transactions to us, and see that what is committed survives a power cut."""
+    connection.isolation_level = None
+    cursor = connection.cursor()
+    for setting in ("journal_mode = WAL", "synchronous = FULL", "foreign_keys = ON"):
+        cursor.execute(f"PRAGMA {setting}")
+    cursor.close()
+
+
+def _begin_immediate(connection: Connection) -> None:
+    """Take the write lock at once: a transaction that read first could not always take it later."""
+    connection.exec_driver_sql("BEGIN IMMEDIATE")
+
+
+def _create_for_us_alone(_dialect: object, _record: object, arguments: list[str], _options: object) -> None:
+    """The file holds secrets; SQLite would let everybody read it, and gives its own files the same rights."""
+    if arguments[0] != ":memory:":
+        with suppress(OSError):  # SQLite explains it better
+            os.close(os.open(arguments[0], os.O_CREAT | os.O_RDWR, 0o600))
+
+
+@contextmanager
+def _unavailable() -> Iterator[None]:
+    try:
+        yield
+    except (SQLAlchemyError, asyncpg.PostgresError, asyncpg.InterfaceError, sqlite3.Error, OSError) as error:
+        logger.error("the database failed: %s: %s", type(error).__name__, getattr(error, "orig", error))
+        raise StoreUnavailable(type(error).__name__) from error

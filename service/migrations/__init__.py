@@ -1,0 +1,45 @@
+"""Brings a database to the schema of this version."""
+
+from __future__ import annotations
+
+from pathlib import Path
+
+from sqlalchemy import Connection, func, inspect, select, text
+
+HEAD = "0001"
+"""The latest step."""
+_LOCK = 0x0D5EAC
+"""Number of the advisory lock that processes starting at once take in PostgreSQL, chosen at random."""
+
+
+def upgrade(connection: Connection) -> None:
+    """Take the steps that are missing, in the transaction of the connection; nobody else takes them meanwhile.
+
+    In SQLite the transaction must be an immediate one.
+
+    Raises
+    ------
+    alembic.util.CommandError
+        If the database is of a later version than this one.
+    """
+    lock(connection)
+    if _revision(connection) == HEAD:
+        return
+    from alembic import command  # noqa: PLC0415 - 0.2 s that most starts need not spend
+    from alembic.config import Config  # noqa: PLC0415
+
+    config = Config(Path(__file__).parent / "alembic.ini")
+    config.attributes["connection"] = connection
+    command.upgrade(config, "head")
+
+
+def lock(connection: Connection) -> None:
+    """Keep others from changing the schema until the transaction's end."""
+    if connection.dialect.name == "postgresql":
+        connection.execute(select(func.pg_advisory_xact_lock(_LOCK)))
+
+
+def _revision(connection: Connection) -> str | None:
+    if not inspect(connection).has_table("alembic_version"):
+        return None
+    return connection.execute(text("SELECT version_num FROM alembic_version")).scalar()

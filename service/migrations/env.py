@@ -1,0 +1,40 @@
+"""How alembic reaches the database: over the gateway's connection, or, by hand, the one of ``ROBOSAC_DATABASE_URL``."""
+
+from __future__ import annotations
+
+import asyncio
+
+from alembic import context
+from sqlalchemy import Connection
+
+from service.database import connect
+from service.migrations import lock
+from service.settings import Settings
+from service.tables import metadata
+
+
+def _run(connection: Connection) -> None:
+    context.configure(connection=connection, target_metadata=metadata)
+    context.run_migrations()
+
+
+def _run_locked(connection: Connection) -> None:
+    lock(connection)
+    _run(connection)
+
+
+async def _by_hand() -> None:
+    database = connect(Settings().database_url)
+    try:
+        await database.write(_run_locked)
+    finally:
+        await database.close()
+
+
+if context.is_offline_mode():
+    raise SystemExit("the steps need the database; run alembic without --sql")
+given: Connection | None = context.config.attributes.get("connection")
+if given is None:
+    asyncio.run(_by_hand())
+else:
+    _run(given)

@@ -1,0 +1,159 @@
+import asyncio
+import contextlib
+import json
+import os
+import pwd
+import shutil
+import subprocess
+import tempfile
+from collections.abc import AsyncIterator, Iterator
+from dataclasses import dataclass
+from itertools import count
+from pathlib import Path
+
+import asyncpg
+import pytest
+
+from robosac.audit import GENESIS, digest
+from service.sql_store import SqlStore
+from service.store import SessionRecord
+
+NUMBERS = count()
+
+
+@dataclass
+class Server:
+    """A PostgreSQL server of one's own, on a socket in a folder of its own."""
+
+    programs: Path
+    folder: Path
+    user: list[str]
+
+    @property
+    def options(self) -> list[str]:
+        quick = "-c fsync=off -c full_page_writes=off -c max_connections=60"
+        return ["-o", f"-c listen_addresses= -c unix_socket_directories={self.folder} {quick}"]
+
+    def run(self, program: str, *arguments: str) -> None:
+        command = [*self.user, str(self.programs / program), "-D", str(self.folder / "data"), *arguments]
+        done = subprocess.run(command, check=False, capture_output=True, text=True, cwd=self.folder)
+        assert done.returncode == 0, done.stdout + done.stderr
+
+    def start(self) -> None:
+        self.run("pg_ctl", "start", "--wait", "--silent", "-l", str(self.folder / "log"), *self.options)
+
+    def stop(self) -> None:
+        self.run("pg_ctl", "stop", "--wait", "--silent", "--mode=immediate")
+
+    async def new_database(self) -> str:
+        name = f"gateway{next(NUMBERS)}"
+        connection = await asyncpg.connect(host=str(self.folder), user="postgres", database="postgres")
+        await connection.execute(f"CREATE DATABASE {name}")
+        await connection.close()
+        return f"postgresql+asyncpg://postgres@/{name}?host={self.folder}"
+
+
+def _programs() -> Path | None:
+    found = shutil.which("initdb")
+    places = [Path(found).parent] if found else sorted(Path("/usr/lib/postgresql").glob("*/bin"), reverse=True)
+    return next((place for place in places if (place / "initdb").exists()), None)
+
+
+def _unprivileged(folder: Path) -> list[str]:
+    """The server refuses to run as root: what to put before its programs, whose folder is then another user's."""
+    if os.geteuid() != 0:
+        return []
+    names = {entry.pw_name for entry in pwd.getpwall()}
+    user = pwd.getpwnam("postgres" if "postgres" in names else "nobody")
+    os.chown(folder, user.pw_uid, user.pw_gid)
+    return ["setpriv", f"--reuid={user.pw_uid}", f"--regid={user.pw_gid}", "--clear-groups"]
+
+
+@pytest.fixture(scope="session")
+def postgres() -> Iterator[Server]:
+    programs = _programs()
+    if programs is None:
+        pytest.skip("no PostgreSQL server program")
+    folder = Path(tempfile.mkdtemp(prefix="pg-", dir="/tmp"))  # a socket's path must be short
+    server = Server(programs, folder, _unprivileged(folder))
+    try:
+        server.run("initdb", "--username=postgres", "--auth=trust", "--encoding=UTF8", "--no-sync", "--no-instructions")
+        server.start()
+        yield server
+        server.stop()
+    finally:
+        shutil.rmtree(folder)
+
+
+async def _empty(request: pytest.FixtureRequest, tmp_path: Path) -> str:
+    if request.param == "postgresql":
+        server: Server = request.getfixturevalue("postgres")
+        return await server.new_database()
+    return "sqlite://" if request.param == "memory" else f"sqlite+aiosqlite:///{tmp_path}/robosac.db"
+
+
+@pytest.fixture(params=["sqlite", "memory", "postgresql"])
+async def url(request: pytest.FixtureRequest, tmp_path: Path) -> str:
+    """An empty database."""
+    return await _empty(request, tmp_path)
+
+
+@pytest.fixture(params=["sqlite", "postgresql"])
+async def shared_url(request: pytest.FixtureRequest, tmp_path: Path) -> str:
+    """An empty database that several stores can share."""
+    return await _empty(request, tmp_path)
+
+
+@contextlib.asynccontextmanager
+async def opened(url: str) -> AsyncIterator[SqlStore]:
+    store = SqlStore(url)
+    try:
+        await store.start()
+        yield store
+    finally:
+        await store.close()
+
+
+@pytest.fixture
+async def store(url: str) -> AsyncIterator[SqlStore]:
+    async with opened(url) as store:
+        yield store
+
+
+def a_session(number: int = 0, **changes: object) -> SessionRecord:
+    values = {
+        "session_id": f"{number:032x}", "ego_id": "ego", "teammates": ("a", "b"), "detector": "d",
+        "defense": {"kind": "static_team", "attacker_ratio": 0.2, "note": "ünïcode \u0000 '; DROP TABLE sessions; --"},
+        "latency_budget_ms": 200.0, "gather_ms": 100.5, "frame_period_ms": 200.0,
+        "token_ids": {"ego": "t0", "a": "t1", "b": "t2"}, "public_keys": {"a": "key"},
+        "created_at": "2025-01-01T00:00:00Z", "seed": "ab" * 32,
+        "state": {"trusted": ["a"], "counters": [1, 2.5, None]},
+    }  # fmt: skip
+    return SessionRecord(**{**values, **changes})
+
+
+async def added(store: SqlStore, number: int = 0, **changes: object) -> str:
+    record = a_session(number, **changes)
+    await store.create(record, {"event": "session_opened"})
+    return record.session_id
+
+
+async def decided(store: SqlStore, sid: str, frame: int, **state: object) -> None:
+    record = await store.get(sid)
+    await store.decide(sid, record.revision, frame, state, f"{frame:064x}", {"event": "frame", "frame": frame})
+
+
+async def check_chain(store: SqlStore, sid: str) -> list[str]:
+    """The log, whose chain ends at the session's head."""
+    lines, before = await store.audit(sid, 0), GENESIS
+    for seq, line in enumerate(lines, 1):
+        record = json.loads(line)
+        assert (record["seq"], record["previous"], record["session_id"]) == (seq, before, sid)
+        before = digest(line)
+    kept = await store.get(sid)
+    assert (kept.audit_seq, kept.audit_head) == (len(lines), before)
+    return lines
+
+
+async def all_of(*calls: object) -> list[object]:
+    return await asyncio.gather(*calls, return_exceptions=True)

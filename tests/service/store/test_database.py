@@ -1,0 +1,188 @@
+"""Migrations, files, and what happens when the database fails."""
+
+import asyncio
+import contextlib
+import os
+import sqlite3
+from pathlib import Path
+
+import pytest
+from alembic import command
+from alembic.autogenerate import compare_metadata
+from alembic.config import Config
+from alembic.runtime.migration import MigrationContext
+from alembic.script import ScriptDirectory
+from alembic.util import CommandError
+from sqlalchemy import text
+
+from clients.errors import SessionNotFound
+from service import migrations
+from service.database import connect
+from service.sql_store import SqlStore
+from service.store import StoreUnavailable
+from service.tables import metadata
+from tests.service.conftest import problem, serve
+from tests.service.store.conftest import added, all_of, check_chain, opened
+
+INI = Path(migrations.__file__).parent / "alembic.ini"
+
+
+@contextlib.asynccontextmanager
+async def a_database(url):
+    database = connect(url)
+    try:
+        yield database
+    finally:
+        await database.close()
+
+
+def differences(connection):
+    return compare_metadata(MigrationContext.configure(connection), metadata)
+
+
+async def test_the_steps_lead_to_the_schema_and_taking_them_again_changes_nothing(url):
+    async with a_database(url) as database:
+        assert len(await database.write(differences)) >= len(metadata.tables)
+        for _ in range(2):
+            await database.write(migrations.upgrade)
+            assert await database.write(differences) == []
+
+
+def test_the_latest_step_is_the_one_that_is_looked_for():
+    assert ScriptDirectory.from_config(Config(INI)).get_heads() == [migrations.HEAD]
+
+
+async def test_several_stores_may_start_at_once_on_an_empty_database(shared_url):
+    stores = [SqlStore(shared_url) for _ in range(6)]
+    assert set(await all_of(*(store.start() for store in stores))) == {None}
+    sid = await added(stores[0])
+    assert (await stores[5].get(sid)).session_id == sid
+    for store in stores:
+        await store.close()
+
+
+async def test_a_database_of_a_later_version_is_refused(shared_url):
+    async with opened(shared_url):
+        pass
+    async with a_database(shared_url) as database:
+        await database.write(
+            lambda connection: connection.execute(text("UPDATE alembic_version SET version_num = '9'"))
+        )
+    store = SqlStore(shared_url)
+    with pytest.raises(CommandError, match="9"):
+        await store.start()
+    await store.close()
+
+
+def test_the_steps_can_be_taken_and_undone_by_hand(tmp_path, monkeypatch):
+    path = tmp_path / "by-hand.db"
+    monkeypatch.setenv("ROBOSAC_DATABASE_URL", f"sqlite+aiosqlite:///{path}")
+    command.upgrade(Config(INI), "head")
+    with contextlib.closing(sqlite3.connect(path)) as connection:
+        assert connection.execute("SELECT version_num FROM alembic_version").fetchall() == [(migrations.HEAD,)]
+    command.downgrade(Config(INI), "base")
+    with contextlib.closing(sqlite3.connect(path)) as connection:
+        names = connection.execute("SELECT name FROM sqlite_master WHERE type = 'table'").fetchall()
+        assert names == [("alembic_version",)]
+
+
+async def test_the_file_is_its_owners_and_survives_a_power_cut(tmp_path):
+    path = tmp_path / "robosac.db"
+    before = os.umask(0)
+    try:
+        async with opened(f"sqlite+aiosqlite:///{path}") as store:
+            await added(store)
+            files = sorted(tmp_path.iterdir())
+            assert [file.name for file in files] == ["robosac.db", "robosac.db-shm", "robosac.db-wal"]
+            assert {file.stat().st_mode & 0o777 for file in files} == {0o600}
+        async with a_database(f"sqlite:///{path}") as database:
+            settings = {
+                name: await database.read(lambda c, name=name: c.exec_driver_sql(f"PRAGMA {name}").scalar())
+                for name in ("journal_mode", "synchronous", "foreign_keys", "busy_timeout")
+            }
+        assert settings == {"journal_mode": "wal", "synchronous": 2, "foreign_keys": 1, "busy_timeout": 5000}
+    finally:
+        os.umask(before)
+
+
+@pytest.mark.parametrize("url", ["", "nonsense", "mysql://u:secret@h/d", "sqlite+pysqlite:///x"])
+def test_other_urls_are_refused_without_showing_them(url):
+    with pytest.raises(ValueError, match="database") as caught:
+        connect(url)
+    assert "secret" not in str(caught.value)
+
+
+async def test_a_database_that_is_not_there_is_unavailable(tmp_path):
+    for url in (f"sqlite:///{tmp_path}/no/such/folder/x.db", f"postgresql://nobody@/x?host={tmp_path}"):
+        store = SqlStore(url)
+        for call in (store.start(), store.count(), store.get("0" * 32)):
+            with pytest.raises(StoreUnavailable):
+                await call
+        await store.close()
+
+
+async def test_while_another_process_holds_the_file_nothing_is_acknowledged_and_then_it_goes_on(
+    tmp_path, monkeypatch, good_frame
+):
+    monkeypatch.setattr("service.database.BUSY_TIMEOUT_S", 0.05)
+    path = tmp_path / "robosac.db"
+    async with serve(database_url=f"sqlite+aiosqlite:///{path}") as served:
+        session = await served.open()
+        assert (await served.post(session, "frames", good_frame(0))).status_code == 200
+        with contextlib.closing(sqlite3.connect(path, isolation_level=None)) as other:
+            other.execute("BEGIN IMMEDIATE")
+            refused = await served.post(session, "frames", good_frame(1))
+            problem(refused, 503, "store-unavailable")
+            assert refused.headers["retry-after"] == "1"
+            opening = await served.http.post("/v1/sessions", json={"ego_id": "a", "teammates": ["b"]})
+            problem(opening, 503, "store-unavailable")
+            assert (await served.ego(session).state())["last_frame"] == 0
+            other.execute("ROLLBACK")
+        assert (await served.post(session, "frames", good_frame(1))).status_code == 200
+        log = [record["frame"] for record in await served.ego(session).audit() if "frame" in record]
+        assert log == [0, 1]
+
+
+async def test_a_gateway_serves_from_each_database(shared_url, good_frame):
+    async with serve(database_url=shared_url, keep_frames=1) as served:
+        session = await served.open()
+        ego = served.ego(session)
+        for frame in (0, 1):
+            assert (await served.post(session, "frames", good_frame(frame))).json()["source"] == "consensus"
+        problem(await served.post(session, "frames", good_frame(1)), 409, "stale-frame")
+        assert await ego.kept_messages(1) == good_frame(1)
+        with pytest.raises(SessionNotFound, match="messages-not-kept"):
+            await ego.kept_messages(0)
+        await ego.dismiss("rsu")
+        await ego.close()
+        events = [record["event"] for record in await ego.audit()]
+        refused = ["message_refused"]
+        assert events == ["session_opened", *["frame_answered"] * 2, *refused, "team_changed", "session_ended"]
+
+
+async def test_a_server_that_goes_away_and_comes_back(postgres):
+    async with opened(await postgres.new_database()) as store:
+        sid = await added(store)
+        assert set(await all_of(*(store.log(sid, {"event": "note"}) for _ in range(10)))) == {None}
+        postgres.stop()
+        try:
+            failed = await all_of(*(store.log(sid, {"event": "lost"}) for _ in range(5)), store.get(sid))
+        finally:
+            postgres.start()
+        assert {type(outcome) for outcome in failed} == {StoreUnavailable}
+        for _ in range(30):  # connections that broke are found out one by one
+            with contextlib.suppress(StoreUnavailable):
+                await store.log(sid, {"event": "again"})
+                break
+        assert "again" in (await check_chain(store, sid))[-1]
+
+
+async def test_a_write_goes_on_when_who_asked_has_gone(store):
+    sid = await added(store)
+    asking = asyncio.create_task(store.log(sid, {"event": "note"}))
+    await asyncio.sleep(0)
+    asking.cancel()
+    with pytest.raises(asyncio.CancelledError):
+        await asking
+    await store.log(sid, {"event": "note"})
+    assert len(await check_chain(store, sid)) in (2, 3)

@@ -1,0 +1,227 @@
+"""What every store must do, on SQLite and PostgreSQL."""
+
+import dataclasses
+import json
+import time
+
+import pytest
+import rfc8785
+from sqlalchemy import text
+
+from service.store import FrameDecided, SessionChanged, SessionOver
+from tests.service.store.conftest import a_session, added, all_of, check_chain, decided, opened
+
+LATER = time.time() + 3600
+
+
+async def test_a_session_comes_back_as_it_was_kept(store):
+    record = a_session()
+    await store.create(record, {"event": "session_opened", "note": "first"})
+    kept = await store.get(record.session_id)
+    (line,) = await check_chain(store, record.session_id)
+    assert json.loads(line)["note"] == "first"
+    assert kept == dataclasses.replace(record, audit_seq=1, audit_head=kept.audit_head)
+    assert store.seen(record.session_id) == kept
+    assert await store.count() == 1
+
+
+@pytest.mark.parametrize("sid", ["f" * 32, "", "x' OR '1'='1", "\x00", "\udcff", "ä"])
+async def test_a_session_that_is_not_there(store, sid):
+    await added(store)
+    assert await store.get(sid) is None
+    assert store.seen(sid) is None
+
+
+async def test_a_decision_changes_state_seed_frame_and_log_together(store):
+    sid = await added(store)
+    await store.decide(sid, 0, 2**53 - 1, {"trusted": ["b"]}, "cd" * 32, {"event": "frame"}, b"\x00messages\xff")
+    kept = await store.get(sid)
+    assert (kept.last_frame, kept.frames_answered, kept.state) == (2**53 - 1, 1, {"trusted": ["b"]})
+    assert (kept.seed, kept.revision) == ("cd" * 32, 1)
+    assert len(await check_chain(store, sid)) == 2
+    assert await store.messages(sid, 2**53 - 1) == b"\x00messages\xff"
+    assert await store.messages(sid, 1) is None
+
+
+async def test_a_frame_is_decided_once_and_frames_increase(store):
+    sid = await added(store)
+    await decided(store, sid, 5)
+    for frame in (5, 4):
+        with pytest.raises(FrameDecided):
+            await decided(store, sid, frame)
+    await decided(store, sid, 6)
+    assert len(await check_chain(store, sid)) == 3
+
+
+async def test_of_decisions_at_once_one_is_kept(store):
+    sid = await added(store)
+    calls = [store.decide(sid, 0, frame, {}, f"{frame:064x}", {"event": "frame"}) for frame in (7, 7, 7, 8, 9)]
+    outcomes = await all_of(*calls)
+    assert sum(outcome is None for outcome in outcomes) == 1
+    assert {type(outcome) for outcome in outcomes if outcome} <= {FrameDecided, SessionChanged}
+    assert (await store.get(sid)).frames_answered == 1
+    assert len(await check_chain(store, sid)) == 2
+
+
+async def test_fifty_logs_at_once_make_one_chain(store):
+    sid, other = await added(store), await added(store, 1)
+    outcomes = await all_of(
+        *(store.log(sid, {"event": "note", "n": n}) for n in range(50)),
+        decided(store, sid, 3),
+        *(store.log(other, {"event": "note", "n": n}) for n in range(5)),
+    )
+    assert set(outcomes) == {None}
+    lines = [json.loads(line) for line in await check_chain(store, sid)]
+    assert {line["n"] for line in lines if line["event"] == "note"} == set(range(50))
+    assert len(lines) == 52
+    assert len(await check_chain(store, other)) == 6
+    assert (await store.audit(sid, 50)) == (await store.audit(sid, 0))[50:]
+    assert await store.audit(sid, 99) == []
+
+
+async def test_an_exception_inside_a_transaction_leaves_nothing(store):
+    sid = await added(store)
+    before, lines = await store.get(sid), await store.audit(sid, 0)
+    outcomes = await all_of(
+        store.decide(sid, 0, 1, {}, "ef" * 32, {"event": "frame"}, "no bytes"),
+        store.decide(sid, 0, 1, {"bad": object()}, "ef" * 32, {"event": "frame"}),
+        store.log(sid, {"event": "note", "value": float("nan")}),
+    )
+    assert all(isinstance(outcome, Exception) for outcome in outcomes)
+    assert await store.get(sid) == before
+    assert await store.audit(sid, 0) == lines
+    with pytest.raises(rfc8785.FloatDomainError):
+        await store.create(a_session(1), {"value": float("nan")})
+    assert await store.get(a_session(1).session_id) is None
+
+
+async def test_what_fails_takes_nothing_else_with_it(store):
+    sid = await added(store)
+    bad = {"event": "note", "value": float("inf")}
+    outcomes = await all_of(*(store.log(sid, bad if n % 3 == 0 else {"event": "note"}) for n in range(30)))
+    assert [isinstance(outcome, Exception) for outcome in outcomes] == [n % 3 == 0 for n in range(30)]
+    assert len(await check_chain(store, sid)) == 1 + 20
+
+
+async def test_a_change_worked_out_from_an_older_session_is_refused(store):
+    sid = await added(store)
+    await store.log(sid, {"event": "note"})
+    assert (await store.get(sid)).revision == 0
+    await store.renew_token(sid, "a", "t9", {"event": "token"})
+    team = (("a",), {"ego": "t0", "a": "t1"}, {}, {"trusted": []}, {"event": "team"})
+    for change in (store.decide(sid, 0, 1, {}, "00" * 32, {"event": "frame"}), store.change_team(sid, 0, *team)):
+        with pytest.raises(SessionChanged):
+            await change
+    await store.change_team(sid, 1, *team)
+    kept = await store.get(sid)
+    assert (kept.teammates, kept.token_ids, kept.public_keys) == (("a",), {"ego": "t0", "a": "t1"}, {})
+    assert kept.state == {"trusted": []}
+    assert len(await check_chain(store, sid)) == 4
+
+
+async def test_one_token_is_renewed_and_the_others_stay(store):
+    sid = await added(store)
+    await store.renew_token(sid, "a", "new", {"event": "token"})
+    assert (await store.get(sid)).token_ids == {"ego": "t0", "a": "new", "b": "t2"}
+
+
+async def test_nothing_is_added_to_a_session_that_is_over(store):
+    sid = await added(store)
+    await store.end(sid, "2025-01-01T01:00:00Z", {"event": "session_ended"})
+    for session_id in (sid, "f" * 32):
+        calls = (
+            store.decide(session_id, 1, 1, {}, "00" * 32, {"event": "frame"}),
+            store.log(session_id, {"event": "note"}),
+            store.renew_token(session_id, "a", "t", {"event": "token"}),
+            store.change_team(session_id, 1, ("a",), {}, {}, {}, {"event": "team"}),
+            store.end(session_id, "later", {"event": "session_ended"}),
+        )
+        for call in calls:
+            with pytest.raises(SessionOver):
+                await call
+    assert (await store.get(sid)).ended_at == "2025-01-01T01:00:00Z"
+    assert len(await check_chain(store, sid)) == 2
+    assert await store.count() == 0
+
+
+async def test_old_messages_are_forgotten(store):
+    sid, other = await added(store), await added(store, 1)
+    for session_id in (sid, other):
+        for frame in range(4):
+            await store.decide(session_id, frame, frame, {}, "00" * 32, {"event": "frame"}, bytes([frame]))
+    await store.forget_messages(sid, 2)
+    assert [await store.messages(sid, frame) for frame in range(4)] == [None, None, b"\x02", b"\x03"]
+    assert await store.messages(other, 0) == b"\x00"
+
+
+async def test_idle_sessions_are_found_and_only_ended_ones_are_purged(store):
+    idle, ended = await added(store), await added(store, 1)
+    await store.decide(ended, 0, 0, {}, "00" * 32, {"event": "frame"}, b"kept")
+    await store.end(ended, "2025-01-01T01:00:00Z", {"event": "session_ended"})
+    assert await store.unused_since(LATER) == [idle]
+    assert await store.unused_since(time.time() - 60) == []
+    await store.purge(time.time() - 60)
+    assert await store.get(ended) is not None
+    await store.purge(LATER)
+    assert (await store.get(ended), await store.audit(ended, 0), await store.messages(ended, 0)) == (None, [], None)
+    assert store.seen(ended) is None
+    assert len(await check_chain(store, idle)) == 1
+
+
+async def test_a_secret_is_made_once(store):
+    made = iter(["first", "second", "other"])
+    assert [await store.secret("key", lambda: next(made)) for _ in range(2)] == ["first", "first"]
+    assert await store.secret("another", lambda: "x") == "x"
+
+
+async def test_everything_is_there_when_the_database_is_opened_again(shared_url):
+    async with opened(shared_url) as store:
+        sid = await added(store)
+        await decided(store, sid, 4, trusted=["b"])
+        secret = await store.secret("key", lambda: "one")
+        before, lines = await store.get(sid), await store.audit(sid, 0)
+    async with opened(shared_url) as store:
+        assert store.seen(sid) is None
+        assert await store.get(sid) == before
+        assert await store.audit(sid, 0) == lines
+        assert await store.secret("key", lambda: "two") == secret
+        await decided(store, sid, 5)
+        assert len(await check_chain(store, sid)) == 3
+
+
+async def test_two_stores_on_one_database_never_fork_a_chain_or_decide_twice(shared_url):
+    async with opened(shared_url) as one, opened(shared_url) as two:
+        sid = await added(one)
+        assert (await two.get(sid)).revision == 0
+        outcomes = await all_of(*(store.log(sid, {"event": "note"}) for _ in range(15) for store in (one, two)))
+        assert set(outcomes) == {None}
+        calls = [store.decide(sid, 0, 1, {}, "00" * 32, {"event": "frame"}) for store in (one, two)]
+        assert sum(outcome is None for outcome in await all_of(*calls)) == 1
+        assert len(await check_chain(one, sid)) == len(await check_chain(two, sid)) == 32
+
+
+async def test_a_store_learns_of_a_conflict_what_the_other_did(shared_url):
+    async with opened(shared_url) as one, opened(shared_url) as two:
+        sid = await added(one)
+        await two.renew_token(sid, "a", "t9", {"event": "token"})
+        assert one.seen(sid).revision == 0
+        with pytest.raises(SessionChanged):
+            await one.decide(sid, 0, 1, {}, "00" * 32, {"event": "frame"})
+        assert one.seen(sid) == await two.get(sid)
+
+
+async def test_many_sessions_are_remembered_but_not_all(store, monkeypatch):
+    monkeypatch.setattr("service.sql_store.REMEMBERED", 3)
+    sids = [await added(store, number) for number in range(5)]
+    assert [store.seen(sid) is None for sid in sids] == [True, True, False, False, False]
+    assert (await store.get(sids[0])).session_id == sids[0]
+
+
+async def test_the_database_is_right_even_where_it_lost_what_was_written(store):
+    """As a standby may have that is promoted."""
+    sid = await added(store)
+    await store.renew_token(sid, "a", "t9", {"event": "token"})
+    undone = text("UPDATE sessions SET revision = 0, audit_seq = 1")
+    await store._database.write(lambda connection: connection.execute(undone))
+    assert (await store.get(sid)).revision == 0
+    assert store.seen(sid).revision == 0

@@ -1,0 +1,152 @@
+"""Gateways that come after one another, or run side by side, on one database."""
+
+import contextlib
+
+import pytest
+
+from clients.errors import AccessDenied, FrameConflict, SessionNotFound
+from tests.service.conftest import EGO, TEAM, serve
+
+
+@pytest.fixture
+def url(tmp_path):
+    return f"sqlite+aiosqlite:///{tmp_path}/robosac.db"
+
+
+@pytest.fixture
+async def two(url):
+    async with serve(database_url=url) as one, serve(database_url=url) as other:
+        yield one, other
+
+
+def answered(records):
+    return [record["frame"] for record in records if record["event"] == "frame_answered"]
+
+
+async def test_a_gateway_goes_on_where_the_one_before_was(url, messages, benign):
+    async with serve(database_url=url) as served:
+        session = await served.open(defense={"kind": "static_team"}, gather_ms=20)
+        first = await served.ego(session).post_frame(4, messages[EGO], benign)
+        before = await served.ego(session).state()
+    async with serve(database_url=url) as served:
+        ego = served.ego(session)
+        assert await ego.state() == before
+        assert "robosac_sessions 1.0" in (await served.http.get("/metrics")).text
+        with pytest.raises(FrameConflict):
+            await ego.post_frame(4, messages[EGO], benign)
+        again = await ego.post_frame(5, messages[EGO], benign)
+        assert first.source == "consensus"
+        assert (again.source, again.accepted, again.sampling_steps) == ("trusted", first.accepted, 0)
+        await served.teammate(session, "rsu").send(6, messages["rsu"])
+        assert (await ego.ask(6, messages[EGO])).frame == 6
+        assert answered(await ego.audit()) == [4, 5, 6]
+        await ego.close()
+
+
+async def test_two_gateways_take_turns(two, messages, benign):
+    one, other = two
+    session = await one.open()
+    for frame in range(4):
+        answer = await two[frame % 2].ego(session).post_frame(frame, messages[EGO], benign)
+        assert answer.source == "consensus"
+    for served in two:
+        with pytest.raises(FrameConflict):
+            await served.ego(session).post_frame(3, messages[EGO], benign)
+        assert answered(await served.ego(session).audit()) == [0, 1, 2, 3]
+    assert (await one.ego(session).state()) == (await other.ego(session).state())
+
+
+async def test_who_left_at_one_gateway_is_a_stranger_at_the_other(two, messages, benign):
+    one, other = two
+    session = await one.open(defense={"kind": "none"}, gather_ms=20)
+    assert (await other.ego(session).post_frame(0, messages[EGO], benign)).accepted == TEAM
+    await one.ego(session).dismiss("rsu")
+    with pytest.raises(AccessDenied):
+        await other.teammate(session, "rsu").send(1, messages["rsu"])
+    answer = await other.ego(session).post_frame(1, messages[EGO], benign)
+    assert answer.accepted == TEAM[:-1]
+    assert answer.rejected["rsu"]["reason"] == "unauthenticated"
+    tokens = await one.ego(session).enrol(["rsu"])
+    await other.client.vehicle(session.session_id, "rsu", tokens["rsu"]).send(2, messages["rsu"])
+    assert (await other.ego(session).ask(2, messages[EGO])).accepted == ("rsu",)
+
+
+@contextlib.contextmanager
+def meanwhile(served, monkeypatch, *happenings):
+    """Let something happen at each of the next fusions, once it is done but before the decision is kept."""
+    fuse, left = served.gateway.engine.fuse, list(happenings)
+
+    async def interrupted(*arguments, **options):
+        outcome = await fuse(*arguments, **options)
+        if left:
+            await left.pop(0)()
+        return outcome
+
+    monkeypatch.setattr(served.gateway.engine, "fuse", interrupted)
+    yield
+    assert not left
+
+
+async def test_a_decision_is_worked_out_again_if_the_team_changed_elsewhere(two, messages, benign, monkeypatch):
+    one, other = two
+    session = await one.open(defense={"kind": "none"})
+    ego = other.ego(session)
+    with meanwhile(other, monkeypatch, lambda: one.ego(session).dismiss("rsu")):
+        answer = await ego.post_frame(0, messages[EGO], benign)
+    assert answer.accepted == TEAM[:-1]
+    records = await ego.audit()
+    assert [record["event"] for record in records] == ["session_opened", "team_changed", "frame_answered"]
+
+
+async def test_a_frame_that_is_decided_elsewhere_meanwhile_is_stale(two, messages, benign, monkeypatch):
+    one, other = two
+    session = await one.open()
+    with (
+        meanwhile(other, monkeypatch, lambda: one.ego(session).post_frame(0, messages[EGO], benign)),
+        pytest.raises(FrameConflict),
+    ):
+        await other.ego(session).post_frame(0, messages[EGO], benign)
+    assert answered(await one.ego(session).audit()) == [0]
+    seeds = [r["seed"] for r in await one.ego(session).audit() if r["event"] == "frame_answered"]
+    await other.ego(session).post_frame(1, messages[EGO], benign)
+    (_, second) = [r for r in await one.ego(session).audit() if r["event"] == "frame_answered"]
+    assert second["seed"] not in seeds
+
+
+async def test_a_session_that_keeps_changing_is_a_conflict(two, messages, benign, monkeypatch):
+    one, other = two
+    session = await one.open(defense={"kind": "none"})
+    changes = [lambda name=name: one.ego(session).dismiss(name) for name in TEAM[:3]]
+    with meanwhile(other, monkeypatch, *changes), pytest.raises(FrameConflict, match="session-changed"):
+        await other.ego(session).post_frame(0, messages[EGO], benign)
+    remaining = {name: benign[name] for name in TEAM[3:]}
+    assert (await other.ego(session).post_frame(0, messages[EGO], remaining)).accepted == TEAM[3:]
+
+
+async def test_a_session_that_ended_at_one_gateway_is_over_at_the_other(two, messages, benign):
+    one, other = two
+    session = await one.open()
+    await other.ego(session).post_frame(0, messages[EGO], benign)
+    await one.ego(session).close()
+    with pytest.raises(SessionNotFound):
+        await other.ego(session).post_frame(1, messages[EGO], benign)
+    assert session.session_id not in other.gateway.sessions._live
+    assert (await other.ego(session).audit())[-1]["event"] == "session_ended"
+
+
+async def test_teams_that_change_at_both_gateways_at_once(two, monkeypatch):
+    one, other = two
+    session = await one.open(defense={"kind": "none"})
+    store = other.gateway.sessions._store
+    change_team = store.change_team
+
+    async def late(*arguments):
+        await one.ego(session).dismiss("rsu")
+        await change_team(*arguments)
+
+    monkeypatch.setattr(store, "change_team", late)
+    with pytest.raises(FrameConflict, match="session-changed"):
+        await other.ego(session).dismiss("car-2")
+    monkeypatch.undo()
+    await other.ego(session).dismiss("car-2")
+    assert (await one.ego(session).state())["teammates"] == ["car-3", "car-4", "car-5"]
