@@ -105,7 +105,7 @@ class Figures:
         }
 
 
-class PreparedBodies:
+class Bodies:
     """Packed frames of one fleet, renumbered without packing them again."""
 
     def __init__(self, frames: Sequence[bytes]) -> None:
@@ -126,20 +126,18 @@ class PreparedBodies:
         return b"".join((self._prefix, wire.pack(index), self._tails[index % len(self._tails)]))
 
 
-def prepare(attacked: bool, scene_seed: int, console: Console) -> PreparedBodies:
+def prepare(attacked: bool, scene_seed: int, console: Console, frames: int = PREPARED_FRAMES) -> Bodies:
     """Sense, attack and pack the frames of one ego and its five teammates."""
     fleet = Fleet(IntersectionScene(scene_seed), load(), 1, int(attacked), PGD(), seed=0)
     bodies = []
     label = f"preparing {'attacked' if attacked else 'benign'} frames"
-    for index in track(range(PREPARED_FRAMES), label, console=console, transient=True):
+    for index in track(range(frames), label, console=console, transient=True):
         (frame,) = fleet.sense(index)
         bodies.append(wire.pack_frame(0, frame.message, frame.sent))
-    return PreparedBodies(bodies)
+    return Bodies(bodies)
 
 
-async def run_load(
-    gateway: GatewayClient, work: Load, bodies: PreparedBodies, seconds: float, budget_ms: float
-) -> Figures:
+async def run_load(gateway: GatewayClient, work: Load, bodies: Bodies, seconds: float, budget_ms: float) -> Figures:
     """Load the gateway for a time, after a few frames that do not count."""
     figures = Figures(work)
     agents = IntersectionScene(0).agents
@@ -163,13 +161,7 @@ async def run_load(
 
 
 async def _closed(
-    ego: VehicleClient,
-    _: int,
-    bodies: PreparedBodies,
-    figures: Figures,
-    started: float,
-    seconds: float,
-    budget_ms: float,
+    ego: VehicleClient, _: int, bodies: Bodies, figures: Figures, started: float, seconds: float, budget_ms: float
 ) -> None:
     index = WARM_UP_FRAMES
     while time.perf_counter() - started < seconds:
@@ -178,13 +170,7 @@ async def _closed(
 
 
 async def _open(
-    ego: VehicleClient,
-    number: int,
-    bodies: PreparedBodies,
-    figures: Figures,
-    started: float,
-    seconds: float,
-    budget_ms: float,
+    ego: VehicleClient, number: int, bodies: Bodies, figures: Figures, started: float, seconds: float, budget_ms: float
 ) -> None:
     rate = figures.load.rate_hz or 1 / FRAME_PERIOD_S
     offset = number / figures.load.egos / rate  # egos are not in step
@@ -300,7 +286,7 @@ async def _run_all(
     url: str | None,
     api_key: str | None,
     loads: Sequence[Load],
-    bodies: dict[bool, PreparedBodies],
+    bodies: dict[bool, Bodies],
     seconds: float,
     budget_ms: float,
     console: Console,

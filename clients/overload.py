@@ -28,7 +28,7 @@ from rich.progress import Progress
 
 from clients.client import MSGPACK, GatewayClient, VehicleClient
 from clients.errors import GatewayError
-from clients.load_test import DEFENSE, Load, PreparedBodies, prepare, run_load
+from clients.load_test import DEFENSE, Bodies, Load, prepare, run_load
 from clients.local_gateway import local_gateway
 from clients.simulation import make_folder
 from robosac import wire
@@ -135,7 +135,7 @@ async def _response(reader: asyncio.StreamReader) -> tuple[int, bytes]:
 
 
 async def run_overload(
-    url: str, bodies: PreparedBodies, egos: int, factor: float, seconds: float, budget_ms: float, progress: Progress
+    url: str, bodies: Bodies, egos: int, factor: float, seconds: float, budget_ms: float, progress: Progress
 ) -> OverloadFigures:
     """Find the capacity, then offer a multiple of it."""
     agents = IntersectionScene(0).agents
@@ -208,7 +208,7 @@ def main(
 
 async def _run(
     url: str | None,
-    bodies: PreparedBodies,
+    bodies: Bodies,
     egos: int,
     factor: float,
     seconds: float,

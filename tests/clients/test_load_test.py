@@ -4,7 +4,7 @@ import pytest
 import typer
 from typer.testing import CliRunner
 
-from clients.load_test import Figures, Load, PreparedBodies, main
+from clients.load_test import Bodies, Figures, Load, main
 from robosac import wire
 
 
@@ -43,5 +43,5 @@ def test_refused_frames_count_as_not_answered_in_time():
 
 @pytest.mark.parametrize("index", [0, 3, 200, 70_000])
 def test_prepared_bodies_are_renumbered(ego_message, benign, index):
-    bodies = PreparedBodies([wire.pack_frame(0, ego_message, benign)])
+    bodies = Bodies([wire.pack_frame(0, ego_message, benign)])
     assert bodies.numbered(index) == wire.pack_frame(index, ego_message, benign)

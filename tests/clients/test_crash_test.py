@@ -1,0 +1,78 @@
+import json
+
+import numpy as np
+import pytest
+import typer
+from typer.testing import CliRunner
+
+from clients.client import FrameAnswer, OpenedSession
+from clients.crash_test import Driven, main
+from robosac.audit import commitment, digest, seal
+
+SEEDS = ["ab" * 32, "cd" * 32]
+ANSWER = {
+    "boxes": [[1.0, 2.5, 4.0, 2.0, 0.1, 0.9]], "source": "consensus", "accepted": ["a"], "rejected": [],
+    "hypotheses": [], "sampling_steps": 1, "attacker_ratio": None, "deadline_met": True, "degraded_by": None,
+    "timings_ms": {"total": 1.5},
+}  # fmt: skip
+
+
+@pytest.fixture
+def driven():
+    return Driven("none", OpenedSession("s", "token", {}, {}, {}))
+
+
+def log(*frames, seeds=SEEDS):
+    """Lines of a session that answered these frames."""
+    events = [{"event": "session_opened", "next_seed_commitment": commitment(SEEDS[0]), "state": {}}]
+    for frame, seed in zip(frames, seeds, strict=False):
+        answer = {**ANSWER, "frame": frame, "seed": seed, "state": {"n": frame}}
+        events.append({"event": "frame_answered", **answer, "next_seed_commitment": commitment(SEEDS[1])})
+    lines, head = [], "0" * 64
+    for seq, event in enumerate(events, 1):
+        lines.append(seal(event, "s", seq, head))
+        head = digest(lines[-1])
+    return lines
+
+
+def complaints(driven, lines):
+    return [complaint for line in lines for complaint in driven.follow(line)]
+
+
+def test_two_kills_lose_nothing(tmp_path):
+    app = typer.Typer()
+    app.command()(main)
+    result = CliRunner().invoke(app, ["--kills", "2", "--out", str(tmp_path)])
+    assert result.exit_code == 0, result.output
+    kills = json.loads((tmp_path / "crash_test.json").read_text())["kills"]
+    assert [kill["wrong"] for kill in kills] == [[], []]
+    assert sum(kill["acknowledged"] for kill in kills) >= 4
+    assert all(kill["unacknowledged"] >= 0 for kill in kills)
+
+
+def test_a_good_log_is_followed(driven):
+    driven.acknowledged = {0: FrameAnswer.parse({**ANSWER, "frame": 0})}
+    lines = log(0, 1)
+    assert complaints(driven, lines) == []
+    assert (driven.seq, driven.head, driven.answered, driven.last_frame) == (3, digest(lines[-1]), 2, 1)
+    assert (driven.acknowledged, driven.state) == ({}, {"n": 1})
+
+
+@pytest.mark.parametrize(
+    ("lines", "complaint"),
+    [
+        (log(0, 1)[:1] + log(0, 1)[2:], "not sealed"),
+        ([log(0)[0], log(0)[1].replace("consensus", "trusted")], "another result"),
+        (log(0, 1, seeds=[SEEDS[1], SEEDS[1]]), "another seed"),
+        (log(1, 0), "decided after"),
+    ],
+)
+def test_a_bad_log_is_found_out(driven, lines, complaint):
+    driven.acknowledged = {0: FrameAnswer.parse({**ANSWER, "frame": 0})}
+    assert any(complaint in one for one in complaints(driven, lines))
+
+
+def test_boxes_count_too(driven):
+    answer = FrameAnswer.parse({**ANSWER, "frame": 0, "boxes": np.ones((1, 6))})
+    driven.acknowledged = {0: answer}
+    assert any("another result" in one for one in complaints(driven, log(0)))
