@@ -246,8 +246,9 @@ async def test_a_flood_of_refused_messages_is_counted_not_recorded(served, messa
 
 async def test_a_client_that_goes_away_in_mid_body_is_no_error_of_the_gateway(caplog):
     from service.app import create_app
+    from service.settings import Settings
 
-    app = create_app()
+    app = create_app(Settings(database_url="sqlite://"))
     async with app.router.lifespan_context(app):
         sent = []
         session = None
