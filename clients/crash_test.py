@@ -288,7 +288,7 @@ def main(
         make_folder(out, "--out")
     bodies = prepare(True, 3, console, PREPARED_FRAMES)
     with tempfile.TemporaryDirectory(prefix="robosac-") as folder:
-        url = database_url or f"sqlite+aiosqlite:///{folder}/robosac.db"
+        url = database_url or f"sqlite:///{folder}/robosac.db"
         crashes = Crashes(url, (out or Path(folder)) / "gateway.log", bodies, np.random.default_rng(seed))
         try:
             done = asyncio.run(_run(crashes, kills, sessions, console))

@@ -40,7 +40,7 @@ async def local_gateway(log: Path) -> AsyncIterator[str]:
         If it ends or is not ready in time; the message holds the end of its log.
     """
     with tempfile.TemporaryDirectory(prefix="robosac-") as folder:
-        database_url = os.environ.get("ROBOSAC_DATABASE_URL", f"sqlite+aiosqlite:///{folder}/robosac.db")
+        database_url = os.environ.get("ROBOSAC_DATABASE_URL", f"sqlite:///{folder}/robosac.db")
         process, url = start_gateway(log, database_url)
         try:
             with _cancelled_by_sigterm():

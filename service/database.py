@@ -41,7 +41,6 @@ READERS = 2
 WRITTEN_TOGETHER = 64
 _DRIVERS = {
     "sqlite": "sqlite",
-    "sqlite+aiosqlite": "sqlite",
     "postgresql": "postgresql+asyncpg",
     "postgresql+asyncpg": "postgresql+asyncpg",
 }

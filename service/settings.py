@@ -38,9 +38,7 @@ class Settings(BaseSettings):
         le=60_000,
         description="Longest wait for teammates once the ego's message is in; by default at most half the budget.",
     )
-    database_url: str = Field(
-        "sqlite+aiosqlite:///robosac.db", repr=False, description="Where sessions and audit logs are kept."
-    )
+    database_url: str = Field("sqlite:///robosac.db", repr=False, description="Where sessions and audit logs are kept.")
     max_body_bytes: int = Field(32 * 2**20, ge=1024, description="Largest request body.")
     body_timeout_s: float = Field(10.0, gt=0, description="Time that a body may take from first to last byte.")
     max_sessions: int = Field(10_000, ge=1, description="Open sessions at a time.")

@@ -135,7 +135,7 @@ async def test_any_of_the_keys_opens_a_session_and_the_client_sends_its_own(tmp_
 
 
 async def test_a_retired_key_opens_nothing_while_its_sessions_live_on(tmp_path):
-    database = f"sqlite+aiosqlite:///{tmp_path}/robosac.db"
+    database = f"sqlite:///{tmp_path}/robosac.db"
     async with serve(database_url=database, api_key=KEY, api_keys=KEY) as served:
         session = await served.open()
     async with serve(database_url=database, api_key=KEY, api_keys=OTHER_KEY) as served:
@@ -411,7 +411,7 @@ async def test_refused_access_does_not_keep_a_session_from_expiring(monkeypatch)
 
 @pytest.mark.parametrize("secrets", [("", ""), (SECRET, SECRET), (SECRET, f"{OTHER_SECRET},{SECRET}")])
 async def test_tokens_outlive_a_restart_and_a_rotation_of_secrets(secrets, good_frame, tmp_path):
-    database = f"sqlite+aiosqlite:///{tmp_path}/robosac.db"
+    database = f"sqlite:///{tmp_path}/robosac.db"
     async with serve(database_url=database, token_secrets=secrets[0]) as served:
         session = await served.open()
         renewed = await served.teammate(session, "rsu").renew()

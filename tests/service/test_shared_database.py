@@ -10,7 +10,7 @@ from tests.service.conftest import EGO, TEAM, serve
 
 @pytest.fixture
 def url(tmp_path):
-    return f"sqlite+aiosqlite:///{tmp_path}/robosac.db"
+    return f"sqlite:///{tmp_path}/robosac.db"
 
 
 @pytest.fixture

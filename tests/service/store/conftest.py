@@ -89,7 +89,7 @@ async def _empty(request: pytest.FixtureRequest, tmp_path: Path) -> str:
     if request.param == "postgresql":
         server: Server = request.getfixturevalue("postgres")
         return await server.new_database()
-    return "sqlite://" if request.param == "memory" else f"sqlite+aiosqlite:///{tmp_path}/robosac.db"
+    return "sqlite://" if request.param == "memory" else f"sqlite:///{tmp_path}/robosac.db"
 
 
 @pytest.fixture(params=["sqlite", "memory", "postgresql"])

@@ -76,7 +76,7 @@ async def test_a_database_of_a_later_version_is_refused(shared_url):
 
 def test_the_steps_can_be_taken_and_undone_by_hand(tmp_path, monkeypatch):
     path = tmp_path / "by-hand.db"
-    monkeypatch.setenv("ROBOSAC_DATABASE_URL", f"sqlite+aiosqlite:///{path}")
+    monkeypatch.setenv("ROBOSAC_DATABASE_URL", f"sqlite:///{path}")
     command.upgrade(Config(INI), "head")
     with contextlib.closing(sqlite3.connect(path)) as connection:
         assert connection.execute("SELECT version_num FROM alembic_version").fetchall() == [(migrations.HEAD,)]
@@ -90,7 +90,7 @@ async def test_the_file_is_its_owners_and_survives_a_power_cut(tmp_path):
     path = tmp_path / "robosac.db"
     before = os.umask(0)
     try:
-        async with opened(f"sqlite+aiosqlite:///{path}") as store:
+        async with opened(f"sqlite:///{path}") as store:
             await added(store)
             files = sorted(tmp_path.iterdir())
             assert [file.name for file in files] == ["robosac.db", "robosac.db-shm", "robosac.db-wal"]
@@ -126,7 +126,7 @@ async def test_while_another_process_holds_the_file_nothing_is_acknowledged_and_
 ):
     monkeypatch.setattr("service.database.BUSY_TIMEOUT_S", 0.05)
     path = tmp_path / "robosac.db"
-    async with serve(database_url=f"sqlite+aiosqlite:///{path}") as served:
+    async with serve(database_url=f"sqlite:///{path}") as served:
         session = await served.open()
         assert (await served.post(session, "frames", good_frame(0))).status_code == 200
         with contextlib.closing(sqlite3.connect(path, isolation_level=None)) as other:
