@@ -22,7 +22,7 @@ from clients.errors import GatewayError
 from clients.simulation import EgoFrame, Fleet, make_folder
 from clients.summary import FleetSummary
 from robosac import attacks, detectors
-from robosac.attacks import ATTACKS
+from robosac.attacks import CAMPAIGN_HELP
 from robosac.detectors import DEFAULT_DETECTOR
 from robosac.scenes import FRAME_PERIOD_S, IntersectionScene
 
@@ -42,7 +42,7 @@ class FleetOptions:
         Seed of the first scene; the others follow.
     egos, attackers : int
     attack, detector : str
-        As `robosac.attacks.load` and `robosac.detectors.load` take them.
+        As `robosac.attacks.load_campaign` and `robosac.detectors.load` take them.
     defense : mapping
         The ``defense`` of the sessions.
     seed : int
@@ -153,7 +153,7 @@ async def run_fleet(options: FleetOptions, console: Console) -> FleetSummary:
     ValueError
         If there is no such attack or detector, or the gateway's has other weights.
     """
-    detector, attack = detectors.load(options.detector), attacks.load(options.attack)
+    detector, attack = detectors.load(options.detector), attacks.load_campaign(options.attack)
     summary = FleetSummary(detector)
     screen = _Screen(console, options.scenes * options.frames * options.egos)
     with screen.live:
@@ -204,7 +204,7 @@ def main(
     first_scene: Annotated[int, typer.Option(min=0, help="Seed of the first scene; 0 to 999 are test scenes.")] = 0,
     egos: Annotated[int, typer.Option(min=1, help="Vehicles that ask; the first cars.")] = 1,
     attackers: Annotated[int, typer.Option(min=0, help="Vehicles that attack.")] = 1,
-    attack: Annotated[str, typer.Option(help=f"One of {', '.join(ATTACKS)}, or module:callable.")] = "pgd",
+    attack: Annotated[str, typer.Option(help=CAMPAIGN_HELP)] = "pgd",
     detector: Annotated[
         str, typer.Option(help="The vehicles' own copy: a name, a weights file, or module:callable.")
     ] = DEFAULT_DETECTOR,
@@ -224,7 +224,7 @@ def main(
     console = Console()
     if report is not None:
         make_folder(report, "--report")
-    for option, load, value in (("--attack", attacks.load, attack), ("--detector", detectors.load, detector)):
+    for option, load, value in (("--attack", attacks.load_campaign, attack), ("--detector", detectors.load, detector)):
         try:
             load(value)
         except ValueError as error:

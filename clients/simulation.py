@@ -9,7 +9,7 @@ from pathlib import Path
 import numpy as np
 import typer
 
-from robosac.attacks import Attack
+from robosac.attacks import Attack, Campaign
 from robosac.boxes import FloatArray
 from robosac.detectors import Detector, Message
 from robosac.evaluation.frames import encode_all, under_attack
@@ -26,6 +26,7 @@ class EgoFrame:
         Its seed.
     ego_id : str
     attackers : frozenset of str
+        Those whose message of this frame is not what an honest one would send.
     benign : mapping of teammate to Message
     sent : mapping of teammate to Message
         What each teammate really sends to this ego.
@@ -70,7 +71,7 @@ class Fleet:
         The first cars are egos.
     attackers : int
         Chosen at random among the vehicles that are not egos.
-    attack : Attack
+    attack : Attack or Campaign
     seed : int
 
     Raises
@@ -85,7 +86,7 @@ class Fleet:
         detector: Detector,
         egos: int,
         attackers: int,
-        attack: Attack,
+        attack: Attack | Campaign,
         seed: int,
     ) -> None:
         others = scene.agents[egos:]
@@ -114,13 +115,12 @@ class Fleet:
         return [self._for_ego(ego_id, frame, messages) for ego_id in self.egos]
 
     def _for_ego(self, ego_id: str, frame: SceneFrame, messages: Mapping[str, Message]) -> EgoFrame:
-        met = under_attack(
-            self.detector, messages, frame.truth(ego_id), ego_id, self.attackers, self._attack, self._rng
-        )
+        truth = frame.truth(ego_id)
+        met = under_attack(self.detector, messages, truth, ego_id, self.attackers, self._attack, self._rng, frame.index)
         return EgoFrame(
             self.scene.seed,
             ego_id,
-            self.attackers,
+            met.attackers,
             met.benign,
             met.received,
             met.ego,

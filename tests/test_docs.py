@@ -67,6 +67,14 @@ def test_the_examples_of_the_pages_can_be_evaluated():
 
 
 @pytest.mark.usefixtures("examples")
+def test_an_attack_on_boxes_needs_a_detector_that_shows_them():
+    options = ["evaluate", "--scenes", "1", "--frames", "1", "--detector", "my_detector:build", "--attack", "shift"]
+    result = CliRunner().invoke(app, options)
+    assert result.exit_code == 2
+    assert "perceive" in result.output
+
+
+@pytest.mark.usefixtures("examples")
 async def test_the_gateway_serves_the_example_detector_and_fuses_as_the_library_does():
     detector, attack = detectors.load("my_detector:build"), attacks.load("my_attack:Suppress")
     scene = robosac.IntersectionScene(3)

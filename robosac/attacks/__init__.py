@@ -3,14 +3,36 @@
 from __future__ import annotations
 
 from robosac import references
-from robosac.attacks.adaptive import Erase
+from robosac.attacks.adaptive import Erase, Invent, Shift
 from robosac.attacks.base import Attack, IterativeAttack, Knowledge, inverted_pseudo_truth
+from robosac.attacks.campaign import BEHAVIOURS, HONEST, SEPARATOR, Campaign
 from robosac.attacks.carlini_wagner import CarliniWagner
+from robosac.attacks.geometric import NoGeometry
 from robosac.attacks.gradient import BIM, PGD
 from robosac.attacks.noise import GaussianNoise
+from robosac.attacks.still import EraseStill, InventStill, ShiftStill
 
-ATTACKS: dict[str, type[Attack]] = {attack.name: attack for attack in (PGD, BIM, CarliniWagner, GaussianNoise, Erase)}
+_ALL: tuple[type[Attack], ...] = (
+    PGD,
+    BIM,
+    CarliniWagner,
+    GaussianNoise,
+    Erase,
+    EraseStill,
+    Invent,
+    InventStill,
+    Shift,
+    ShiftStill,
+)
+ATTACKS: dict[str, type[Attack]] = {attack.name: attack for attack in _ALL}
 """All attacks by name."""
+
+
+CAMPAIGN_HELP = (
+    f"One of {', '.join(ATTACKS)}, or module:callable, or {HONEST}; after it, if wanted, {SEPARATOR} and one of "
+    f"{', '.join(BEHAVIOURS)}."
+)
+"""What `load_campaign` takes, for the help of a command."""
 
 
 def load(attack: str) -> Attack:
@@ -37,16 +59,48 @@ def load(attack: str) -> Attack:
     return made
 
 
+def load_campaign(spec: str) -> Campaign:
+    """Make a campaign.
+
+    Parameters
+    ----------
+    spec : str
+        ``attack`` or ``attack@behaviour@...``: an attack as `load` takes it, or ``honest``, and names of `BEHAVIOURS`.
+
+    Raises
+    ------
+    ValueError
+        If there is no such attack or behaviour, or they don't go together.
+    """
+    attack, *behaviours = spec.split(SEPARATOR)
+    campaign = Campaign(None if attack == HONEST else load(attack))
+    for name in behaviours:
+        if name not in BEHAVIOURS:
+            raise ValueError(f"unknown behaviour {name!r}; known: {', '.join(BEHAVIOURS)}")
+        campaign = BEHAVIOURS[name](campaign)
+    return campaign
+
+
 __all__ = [
     "ATTACKS",
+    "BEHAVIOURS",
     "BIM",
+    "CAMPAIGN_HELP",
     "PGD",
     "Attack",
+    "Campaign",
     "CarliniWagner",
     "Erase",
+    "EraseStill",
     "GaussianNoise",
+    "Invent",
+    "InventStill",
     "IterativeAttack",
     "Knowledge",
+    "NoGeometry",
+    "Shift",
+    "ShiftStill",
     "inverted_pseudo_truth",
     "load",
+    "load_campaign",
 ]

@@ -1,17 +1,23 @@
-"""Attacks that know the defence."""
+"""Attacks that know the defence: they leave alone what the ego can check by itself."""
 
 from __future__ import annotations
 
+from collections.abc import Collection
+from dataclasses import dataclass
 from typing import ClassVar
 
 import torch
 from torch.nn import functional
 
-from robosac.attacks.base import Knowledge, Tensors
+from robosac.attacks.base import SEEN, Aim, Knowledge, Tensors
+from robosac.attacks.geometric import Perception, average, balanced, geometric
 from robosac.attacks.gradient import BIM
+from robosac.detectors.base import AttackSurface
 
-SEEN = 0.1
-"""A cell with a score from here on counts as one where something is seen."""
+APART_M = 5.0
+"""Invented objects keep this far from one another and from everything seen."""
+MAX_PLACES = 5000
+"""Places that are considered for invented objects, best first: bounds the search where there are many anchors."""
 
 
 class Erase(BIM):
@@ -29,5 +35,99 @@ class Erase(BIM):
         """Cross-entropy against the ego-only scores, balanced between what is seen and the background."""
         wanted = torch.sigmoid(known.ego_logits)
         matters = torch.maximum(wanted, torch.sigmoid(known.benign_logits)) >= SEEN
-        loss = functional.binary_cross_entropy_with_logits(logits, wanted, reduction="none")
-        return loss[matters].mean().nan_to_num() + loss[~matters].mean().nan_to_num()
+        return balanced(logits, wanted, matters)
+
+
+@dataclass(frozen=True)
+class Invent(BIM):
+    """Leave all that is seen, and invent objects where the ego has nothing to set against them.
+
+    1. The places: those least certainly empty to the ego alone, at least 5 m from one another and from everything that
+       the ego or the benign fusion sees.
+    2. Descends the cross-entropy between the fusion's class scores and the benign ones with a 1 in each place: places,
+       other cells where something is seen, and background count equally.
+
+    So many more boxes lower the Jaccard index against the ego, but seldom below the threshold: with n boxes of the ego
+    in a benign fusion of m it is about ``n / (m + objects)``, and m is about twice the default.
+
+    Parameters
+    ----------
+    epsilon, steps, step_size : float
+        As in `IterativeAttack`.
+    objects : int
+        How many, at most.
+    """
+
+    name: ClassVar[str] = "invent"
+
+    objects: int = 12
+
+    def aim(self, surface: AttackSurface, attackers: Collection[str]) -> Aim:  # noqa: ARG002
+        """Step 2."""
+        honest = Perception.of(surface, surface.messages)
+        with torch.no_grad():
+            ego_logits = surface.class_logits({})
+        seen = torch.maximum(torch.sigmoid(ego_logits), honest.scores) >= SEEN
+        place = self._places(ego_logits, honest.geometry[..., :2], seen)
+        background = ~(seen | place)
+
+        def loss(sent: Tensors, delta: Tensors) -> torch.Tensor:  # noqa: ARG001
+            logits = surface.class_logits({**surface.messages, **sent})
+            entropy = functional.binary_cross_entropy_with_logits(
+                logits, torch.where(place, 1.0, honest.scores), reduction="none"
+            )
+            return average(entropy, place) + average(entropy, seen) + average(entropy, background)
+
+        return loss
+
+    def _places(self, ego_logits: torch.Tensor, centres: torch.Tensor, seen: torch.Tensor) -> torch.Tensor:
+        """Mask of the places of step 1."""
+        taken = centres[seen].reshape(-1, 2)
+        order = torch.where(seen, -torch.inf, ego_logits).flatten().argsort(descending=True)[:MAX_PLACES]
+        chosen = torch.zeros(seen.numel(), dtype=torch.bool)
+        flat = centres.reshape(-1, 2)
+        for index in order[: int((~seen).sum())].tolist():
+            if int(chosen.sum()) == self.objects:
+                break
+            if bool((torch.linalg.vector_norm(taken - flat[index], dim=1) >= APART_M).all()):
+                chosen[index] = True
+                taken = torch.cat([taken, flat[index : index + 1]])
+        return chosen.reshape(seen.shape)
+
+
+@dataclass(frozen=True)
+class Shift(BIM):
+    """Leave what the ego sees, and move what only its teammates see to the side.
+
+    Descends ``displacement + cross-entropy``: the boxes that the benign fusion is certain of and the ego alone does not
+    see should lie ``distance`` metres to their left, and every class score should be as in the benign fusion. No box
+    appears or disappears, so that counting and matching at IoU 0.5 tell little.
+
+    Parameters
+    ----------
+    epsilon, steps, step_size : float
+        As in `IterativeAttack`.
+    distance : float
+        Metres; under one.
+    """
+
+    name: ClassVar[str] = "shift"
+
+    distance: float = 0.9
+
+    def aim(self, surface: AttackSurface, attackers: Collection[str]) -> Aim:  # noqa: ARG002
+        """Moved boxes with unchanged scores."""
+        shown = geometric(surface)
+        ego, honest = Perception.of(surface, ()), Perception.of(surface, surface.messages)
+        seen = honest.scores >= SEEN
+        moved = seen & (ego.scores < SEEN)
+        heading = torch.atan2(honest.geometry[..., 5], honest.geometry[..., 4]) / 2
+        left = torch.stack([-heading.sin(), heading.cos()], dim=-1)
+        wanted = honest.geometry[..., :2] + self.distance * left
+
+        def loss(sent: Tensors, delta: Tensors) -> torch.Tensor:  # noqa: ARG001
+            logits, geometry = shown.perceive({**surface.messages, **sent})
+            away = (geometry[..., :2] - wanted).abs().sum(dim=-1)
+            return average(away, moved) + balanced(logits, honest.scores, seen)
+
+        return loss

@@ -7,7 +7,7 @@ Several attackers are optimised jointly. The attack acts on the message as it is
 from __future__ import annotations
 
 from abc import ABC, abstractmethod
-from collections.abc import Collection, Mapping
+from collections.abc import Callable, Collection, Mapping
 from dataclasses import dataclass
 from typing import ClassVar
 
@@ -17,7 +17,11 @@ from torch.nn import functional
 
 from robosac.detectors.base import AttackSurface
 
+SEEN = 0.1
+"""A place with a class score from here on counts as one where something is seen."""
 Tensors = Mapping[str, torch.Tensor]
+Aim = Callable[[Tensors, Tensors], torch.Tensor]
+"""What the adversary minimises: of the attackers' present messages and their perturbations."""
 
 
 @dataclass(frozen=True)
@@ -76,7 +80,7 @@ class Attack(ABC):
 
     def __post_init__(self) -> None:
         for parameter, value in vars(self).items():
-            if not value > 0:
+            if isinstance(value, int | float) and not value > 0:
                 raise ValueError(f"{parameter} must be positive, got {value}")
 
     @abstractmethod
@@ -132,17 +136,16 @@ class IterativeAttack(Attack):
     ) -> dict[str, torch.Tensor]:
         """Optimise the attackers' messages jointly."""
         clean = {name: surface.messages[name] for name in sorted(attackers)}
-        if not clean:
-            return {}
-        with torch.no_grad():
-            known = Knowledge(surface.class_logits({}), surface.class_logits(surface.messages))
+        return self.descend(self.aim(surface, clean), clean, rng) if clean else {}
+
+    def descend(self, aim: Aim, clean: Tensors, rng: np.random.Generator) -> dict[str, torch.Tensor]:
+        """The loop: messages within the bound around these benign ones at which the aim is small."""
         variables = {name: v.requires_grad_(True) for name, v in self.start(clean, rng).items()}
         optimiser = self.optimiser(list(variables.values()))
         for _ in range(self.steps):
             delta = {name: self.perturbation(v) for name, v in variables.items()}
             attacked = {name: clean[name] + d for name, d in delta.items()}
-            loss = self.objective(known, surface.class_logits({**surface.messages, **attacked}), delta)
-            gradients = torch.autograd.grad(loss, list(variables.values()))
+            gradients = torch.autograd.grad(aim(attacked, delta), list(variables.values()))
             with torch.no_grad():
                 for variable, gradient in zip(variables.values(), gradients, strict=True):
                     variable.grad = self.normalise(gradient)
@@ -154,6 +157,16 @@ class IterativeAttack(Attack):
     @abstractmethod
     def start(self, clean: Tensors, rng: np.random.Generator) -> dict[str, torch.Tensor]:
         """The first variables, within the bound."""
+
+    def aim(self, surface: AttackSurface, attackers: Collection[str]) -> Aim:  # noqa: ARG002
+        """What the adversary minimises in this frame; by default `objective` of the class logits of the whole team."""
+        with torch.no_grad():
+            known = Knowledge(surface.class_logits({}), surface.class_logits(surface.messages))
+
+        def loss(sent: Tensors, delta: Tensors) -> torch.Tensor:
+            return self.objective(known, surface.class_logits({**surface.messages, **sent}), delta)
+
+        return loss
 
     def objective(self, known: Knowledge, logits: torch.Tensor, delta: Tensors) -> torch.Tensor:  # noqa: ARG002
         """What the adversary minimises; by default `inverted_pseudo_truth`.

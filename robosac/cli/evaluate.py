@@ -17,7 +17,7 @@ from rich.progress import Progress
 from rich.table import Table
 
 from robosac import attacks, detectors
-from robosac.attacks import ATTACKS, Attack
+from robosac.attacks import CAMPAIGN_HELP, Campaign, NoGeometry
 from robosac.detectors import DEFAULT_DETECTOR, Detector, V2XSimDetector
 from robosac.evaluation import BoundsReport, NoFrames, evaluate_bounds
 from robosac.evaluation.bounds import TEAM_SIZE
@@ -31,7 +31,7 @@ def run(
     scenes: Annotated[int, typer.Option(min=1, help="Test scenes, the first so many.")] = 40,
     frames: Annotated[int, typer.Option(min=1, help="Frames of each, 1 s apart.")] = 5,
     attackers: Annotated[int, typer.Option(min=0, max=5, help="Attackers among the five teammates.")] = 1,
-    attack: Annotated[str, typer.Option(help=f"One of {', '.join(ATTACKS)}, or module:callable.")] = "pgd",
+    attack: Annotated[str, typer.Option(help=CAMPAIGN_HELP)] = "pgd",
     collaborators: Annotated[int, typer.Option(min=1, max=5, help="Teammates in a hypothesis.")] = 3,
     seed: Annotated[int, typer.Option(min=0, help="Of everything random.")] = 0,
     detector: Annotated[
@@ -54,7 +54,7 @@ def run(
         if out is not None:
             out.mkdir(parents=True, exist_ok=True)
     with _blaming("--attack", ValueError):
-        chosen_attack = attacks.load(attack)
+        chosen_attack = attacks.load_campaign(attack)
     with _blaming("--weights", ValueError):
         chosen = detectors.load(detector)
     rng = np.random.default_rng([seed, 0])
@@ -62,7 +62,11 @@ def run(
         total, source = _synthetic(chosen, scenes, frames, chosen_attack, attackers, rng)
     else:
         total, source = _v2xsim(chosen, data, scenes, frames, chosen_attack, attackers, collaborators, rng)
-    with _blaming("--data", SampleError, NoFrames), Progress(console=console) as progress:
+    with (
+        _blaming("--attack", NoGeometry),
+        _blaming("--data", SampleError, NoFrames),
+        Progress(console=console) as progress,
+    ):
         task = progress.add_task("frames", total=total)
         report = evaluate_bounds(
             chosen,
@@ -73,7 +77,7 @@ def run(
             seed=seed,
             tick=lambda: progress.advance(task),
         )
-    _print(console, report, chosen_attack, attackers)
+    _print(console, report, attack, attackers)
     if out is not None:
         settings = {
             "scenes": scenes,
@@ -103,7 +107,7 @@ _Source = tuple[int, Iterator[EvaluationFrame | None]]
 
 
 def _synthetic(
-    detector: Detector, scenes: int, frames: int, attack: Attack, attackers: int, rng: np.random.Generator
+    detector: Detector, scenes: int, frames: int, attack: Campaign, attackers: int, rng: np.random.Generator
 ) -> _Source:
     """How many frames, and the frames."""
     if scenes > len(TEST_SEEDS):
@@ -116,7 +120,7 @@ def _v2xsim(
     root: Path,
     scenes: int,
     frames: int,
-    attack: Attack,
+    attack: Campaign,
     attackers: int,
     collaborators: int,
     rng: np.random.Generator,
@@ -135,9 +139,9 @@ def _v2xsim(
     return total, v2xsim_frames(detector, root, chosen, frames, attack, attackers, collaborators, rng)
 
 
-def _print(console: Console, report: BoundsReport, attack: Attack, attackers: int) -> None:
+def _print(console: Console, report: BoundsReport, attack: str, attackers: int) -> None:
     table = Table(
-        title=f"{report.frames} test frames, {attackers} {attack.name.upper()} attacker(s) of five teammates",
+        title=f"{report.frames} test frames, {attackers} {attack.upper()} attacker(s) of five teammates",
         title_justify="left",
     )
     for heading in ("perception", "AP50", "AP70", "steps", "success", "infiltrated"):

@@ -112,6 +112,24 @@ class AttackSurface(Protocol):
         ...
 
 
+@runtime_checkable
+class GeometricSurface(AttackSurface, Protocol):
+    """A surface that shows boxes too: what an attack needs that moves them, or leaves them where they are."""
+
+    def perceive(self, messages: Mapping[str, torch.Tensor]) -> tuple[torch.Tensor, torch.Tensor]:
+        """What the ego fused with these messages makes of every place where it might find a vehicle.
+
+        Returns
+        -------
+        logits : tensor
+            As `class_logits`.
+        geometry : tensor of the same shape with six more numbers at the end
+            The box that each logit stands for: x, y (ego frame, metres), log length, log width, cos and sin of twice
+            the yaw.
+        """
+        ...
+
+
 class Preparer(Protocol):
     """What fusion needs of a detector."""
 

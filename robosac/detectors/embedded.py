@@ -14,7 +14,7 @@ from safetensors import safe_open
 
 from robosac.boxes import FloatArray
 from robosac.detectors.base import DetectorInfo, Message, TensorSpec
-from robosac.detectors.decoding import decode_boxes
+from robosac.detectors.decoding import cell_centres, decode_boxes
 from robosac.detectors.network import FEATURES, MAP, MeanFusionNetwork, fold_batchnorm
 from robosac.detectors.voxels import AREA_M, occupancy
 from robosac.detectors.warp import sampling_matrix, warp
@@ -213,7 +213,7 @@ class PreparedEmbedded:
 
 
 class EmbeddedAttackSurface:
-    """A frame of the embedded detector for an attacker; see `robosac.detectors.base.AttackSurface`."""
+    """A frame of the embedded detector for an attacker; see `robosac.detectors.base.GeometricSurface`."""
 
     def __init__(
         self,
@@ -235,12 +235,20 @@ class EmbeddedAttackSurface:
 
     def class_logits(self, messages: Mapping[str, torch.Tensor]) -> torch.Tensor:
         """Class logits (64, 64) of the ego fused with these messages; benign ones are not warped again."""
+        return self._heads(messages)[0][0]
+
+    def perceive(self, messages: Mapping[str, torch.Tensor]) -> tuple[torch.Tensor, torch.Tensor]:
+        """Class logits (64, 64) and the boxes (64, 64, 6) of all cells."""
+        logits, codes = self._heads(messages)
+        centres = torch.from_numpy(np.stack(cell_centres())).float()
+        return logits[0], torch.cat([codes[0, :2] + centres, codes[0, 2:]]).permute(1, 2, 0)
+
+    def _heads(self, messages: Mapping[str, torch.Tensor]) -> tuple[torch.Tensor, torch.Tensor]:
         warped = [
             self._benign[name] if tensor is self.messages[name] else self._warp(name, tensor)
             for name, tensor in messages.items()
         ]
-        logits, _ = self._network.decode(_mean([self._own, *warped])[None])
-        return logits[0]
+        return self._network.decode(_mean([self._own, *warped])[None])
 
 
 def _mean(maps: list[torch.Tensor]) -> torch.Tensor:

@@ -8,7 +8,7 @@ from itertools import combinations
 
 import numpy as np
 
-from robosac.attacks import Attack
+from robosac.attacks import Attack, Campaign
 from robosac.consensus import Verdict, at_least, compare
 from robosac.defenses import SampleConsensus
 from robosac.detectors import Detector, PreparedFrame
@@ -76,7 +76,7 @@ class BoundsReport:
 def evaluate_bounds(
     detector: Detector,
     frames: Iterable[EvaluationFrame | None],
-    attack: Attack,
+    attack: Attack | Campaign,
     *,
     attackers: int = 1,
     collaborators: int = 3,
@@ -92,7 +92,7 @@ def evaluate_bounds(
     detector : Detector
     frames : iterable of EvaluationFrame or None
         From `robosac.evaluation.frames`, made with this detector, attack and number of attackers; None is skipped.
-    attack : Attack
+    attack : Attack or Campaign
     attackers : int
         Among the five teammates: the ratio that the defence assumes.
     collaborators : int

@@ -8,7 +8,7 @@ from pathlib import Path
 
 import numpy as np
 
-from robosac.attacks import Attack
+from robosac.attacks import Attack, Campaign
 from robosac.boxes import FloatArray
 from robosac.detectors import Detector, Message, PreparedFrame, V2XSimDetector
 from robosac.detectors.base import for_role
@@ -26,6 +26,7 @@ class EvaluationFrame:
     received : dict of teammate to Message
         With the attackers' messages in place of their benign ones.
     attackers : frozenset of str
+        Those whose message of this frame is not what an honest one would send.
     truth : (G, 5) ndarray
         Ego frame.
     """
@@ -48,8 +49,9 @@ def under_attack(
     truth: FloatArray,
     ego_id: str,
     attackers: Collection[str],
-    attack: Attack,
+    attack: Attack | Campaign,
     rng: np.random.Generator,
+    index: int = 0,
 ) -> EvaluationFrame:
     """One instant as one ego meets it, with some teammates under the adversary's control.
 
@@ -63,25 +65,23 @@ def under_attack(
     ego_id : str
     attackers : collection of str
         Optimised jointly.
-    attack : Attack
+    attack : Attack or Campaign
     rng : numpy.random.Generator
         The attack's.
+    index : int
+        The frame's number in its sequence, which a campaign's schedule goes by.
     """
     ego = messages[ego_id]
     benign = {name: for_role(m, detector.info, "teammate") for name, m in messages.items() if name != ego_id}
-    adversarial = attack.run(detector.attack_surface(ego, benign), attackers, rng) if attackers else {}
-    received = {
-        name: detector.perturbed(message, adversarial[name]) if name in adversarial else message
-        for name, message in benign.items()
-    }
-    return EvaluationFrame(ego, benign, received, frozenset(adversarial), truth)
+    sent = Campaign.of(attack).messages(detector, ego, benign, attackers, index, rng)
+    return EvaluationFrame(ego, benign, {**benign, **sent}, frozenset(sent), truth)
 
 
 def evaluation_frames(
     detector: Detector,
     seeds: Sequence[int],
     frames_per_scene: int,
-    attack: Attack,
+    attack: Attack | Campaign,
     attackers: int,
     rng: np.random.Generator,
 ) -> Iterator[EvaluationFrame]:
@@ -93,7 +93,8 @@ def evaluation_frames(
             ego_id = f"car-{turn % scene.car_agents + 1}"
             turn += 1
             chosen = _draw(set(scene.agents) - {ego_id}, attackers, rng)
-            yield under_attack(detector, encode_all(detector, frame), frame.truth(ego_id), ego_id, chosen, attack, rng)
+            messages, truth = encode_all(detector, frame), frame.truth(ego_id)
+            yield under_attack(detector, messages, truth, ego_id, chosen, attack, rng, frame.index)
 
 
 def v2xsim_frames(
@@ -101,7 +102,7 @@ def v2xsim_frames(
     root: Path,
     scenes: Sequence[int],
     frames_per_scene: int,
-    attack: Attack,
+    attack: Attack | Campaign,
     attackers: int,
     collaborators: int,
     rng: np.random.Generator,
@@ -131,7 +132,7 @@ def v2xsim_frames(
                 name: detector.encode_grid(sample.grid, frame.pose(name)) for name, sample in frame.samples.items()
             }
             chosen = _draw(set(messages) - {ego_id}, attackers, rng)
-            yield under_attack(detector, messages, frame.truth(ego_id), ego_id, chosen, attack, rng)
+            yield under_attack(detector, messages, frame.truth(ego_id), ego_id, chosen, attack, rng, frame.index)
 
 
 def _draw(team: Collection[str], attackers: int, rng: np.random.Generator) -> list[str]:

@@ -12,7 +12,7 @@ from clients.errors import GatewayUnreachable
 from clients.fleet import FleetOptions, close_run, main, run_fleet
 from clients.local_gateway import local_gateway
 from clients.simulation import Fleet
-from robosac.attacks import PGD
+from robosac.attacks import PGD, load_campaign
 from robosac.detectors import DEFAULT_DETECTOR
 from robosac.detectors.embedded import ADVERSARIAL_WEIGHTS
 from robosac.scenes import IntersectionScene
@@ -63,6 +63,13 @@ def test_attackers_are_never_the_ego_and_send_each_ego_its_own(detector):
         for honest in set(first.sent) - fleet.attackers:
             assert first.sent[honest] is first.benign[honest]
         assert second.ego_id in first.sent
+
+
+def test_a_fleet_follows_a_campaign(detector):
+    fleet = Fleet(IntersectionScene(3), detector, 1, 1, load_campaign("noise@asleep"), seed=0)
+    struck = [fleet.sense(index)[0].attackers for index in (0, 9, 10)]
+    assert struck == [frozenset(), frozenset(), fleet.attackers]
+    assert len(fleet.attackers) == 1
 
 
 @pytest.mark.parametrize(("egos", "attackers"), [(0, 1), (6, 0), (1, 6), (1, -1)])

@@ -11,6 +11,7 @@ Source of layout, decoding and thresholds: the published implementation (coperce
 from __future__ import annotations
 
 import math
+from functools import lru_cache
 
 import numpy as np
 import torch
@@ -27,6 +28,7 @@ MAX_CANDIDATES = 1000
 MAX_LOG_SIZE = 8.0
 """Bound on the codes of w and h, so that no message makes a box of infinite size."""
 
+_LEAST_SQUARE = 1e-12
 _SIZES_M = ((2.0, 4.0), (3.0, 12.0))
 _ANGLES = (0.0, math.pi / 2, -math.pi / 4)
 _SHAPES = np.array([[w, h, math.sin(a), math.cos(a)] for w, h in _SIZES_M for a in _ANGLES])
@@ -82,6 +84,42 @@ def to_lidar(boxes: FloatArray) -> FloatArray:
     x, y, w, h, sine, cosine = boxes.T
     norm = np.hypot(sine, cosine)
     return np.column_stack([-x, y, h * norm, w * norm, np.arctan2(cosine, -sine)])
+
+
+def geometry(codes: torch.Tensor) -> torch.Tensor:
+    """The box of every anchor as an attacker sees it, differentiable.
+
+    Parameters
+    ----------
+    codes : (393216, 6) tensor
+
+    Returns
+    -------
+    (393216, 6) tensor
+        x, y, log length, log width, cos and sin of twice the yaw, of the box that `decode` and `to_lidar` make.
+    """
+    anchors = _all_anchors()
+    log_size = anchors[:, 2:4].log() - codes[:, 2:4].clamp(-MAX_LOG_SIZE, MAX_LOG_SIZE)
+    centre = anchors[:, :2] - log_size.exp() * codes[:, :2]
+    sin_a, cos_a, sin_p, cos_p = anchors[:, 4], anchors[:, 5], codes[:, 4], codes[:, 5]
+    sine, cosine = sin_a * cos_p + cos_a * sin_p, cos_a * cos_p - sin_a * sin_p
+    square = (sine.square() + cosine.square()).clamp(min=_LEAST_SQUARE)
+    log_norm = square.log() / 2
+    columns = (
+        -centre[:, 0],
+        centre[:, 1],
+        log_size[:, 1] + log_norm,
+        log_size[:, 0] + log_norm,
+        (sine.square() - cosine.square()) / square,
+        -2 * sine * cosine / square,
+    )
+    return torch.stack(columns, dim=1)
+
+
+@lru_cache(maxsize=1)
+def _all_anchors() -> torch.Tensor:
+    """Every anchor, (393216, 6), float32."""
+    return torch.from_numpy(anchor_boxes(np.arange(GRID * GRID * ANCHORS))).float()
 
 
 def detections(

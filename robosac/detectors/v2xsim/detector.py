@@ -20,7 +20,7 @@ from safetensors.torch import save_file
 from robosac.boxes import FloatArray
 from robosac.detectors.base import DetectorInfo, Message, TensorSpec
 from robosac.detectors.embedded import WeightsError, read_weights, tensors_digest
-from robosac.detectors.v2xsim.anchors import SCORE_THRESHOLD, detections
+from robosac.detectors.v2xsim.anchors import SCORE_THRESHOLD, detections, geometry
 from robosac.detectors.v2xsim.fusions import FUSIONS, Fusion
 from robosac.detectors.v2xsim.network import FEATURES, MAP, Context, V2XSimNetwork, select_published
 from robosac.detectors.v2xsim.voxels import AREA_M, PACKED_SHAPE, BoolArray, occupancy, pack, unpack
@@ -208,7 +208,7 @@ class PreparedV2XSim:
 
 
 class V2XSimAttackSurface:
-    """A frame of the V2X-Sim detector for an attacker; see `robosac.detectors.base.AttackSurface`."""
+    """A frame of the V2X-Sim detector for an attacker; see `robosac.detectors.base.GeometricSurface`."""
 
     def __init__(
         self,
@@ -234,12 +234,20 @@ class V2XSimAttackSurface:
         """Logits (393216,) of every anchor's score, of the ego fused with these messages; benign ones are not warped
         again.
         """
+        logits, _ = self._heads(messages)
+        return logits[:, 1] - logits[:, 0]
+
+    def perceive(self, messages: Mapping[str, torch.Tensor]) -> tuple[torch.Tensor, torch.Tensor]:
+        """Class logits (393216,) and the boxes (393216, 6) of all anchors."""
+        logits, codes = self._heads(messages)
+        return logits[:, 1] - logits[:, 0], geometry(codes)
+
+    def _heads(self, messages: Mapping[str, torch.Tensor]) -> tuple[torch.Tensor, torch.Tensor]:
         warped = [
             self._benign[name] if tensor is self.messages[name] else self._warp(name, tensor)
             for name, tensor in messages.items()
         ]
-        logits, _ = self._network.decode(self._fusion([self._own, *warped])[None], self._context)
-        return logits[:, 1] - logits[:, 0]
+        return self._network.decode(self._fusion([self._own, *warped])[None], self._context)
 
 
 def _features(message: Message) -> torch.Tensor:

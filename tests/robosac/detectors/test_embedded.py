@@ -114,6 +114,20 @@ def test_the_attack_surface_agrees_with_detection(detector, ego_message, benign)
     assert variable.grad.abs().sum() > 0
 
 
+def test_an_attacker_sees_the_boxes_that_are_decoded(detector, ego_message, benign):
+    surface = detector.attack_surface(ego_message, benign)
+    logits, geometry = surface.perceive(surface.messages)
+    torch.testing.assert_close(logits, surface.class_logits(surface.messages))
+    assert geometry.shape == (*logits.shape, 6)
+    boxes = detector.prepare(ego_message, benign).detect(list(benign))[:10]
+    for x, y, length, width, yaw, score in boxes:
+        cell = (torch.sigmoid(logits) - score).abs().argmin()
+        expected = [x, y, np.log(length), np.log(width), np.cos(2 * yaw), np.sin(2 * yaw)]
+        shown = geometry.reshape(-1, 6)[cell].numpy()
+        shown[4:] /= np.hypot(*shown[4:])
+        np.testing.assert_allclose(shown, expected, atol=1e-3)
+
+
 def rewritten(tmp_path, change):
     tensors = load_file(SHIPPED_WEIGHTS)
     _, recipe = read_weights(SHIPPED_WEIGHTS)

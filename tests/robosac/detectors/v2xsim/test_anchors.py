@@ -3,7 +3,7 @@ import pytest
 import torch
 
 from robosac.boxes import corners
-from robosac.detectors.v2xsim.anchors import MAX_CANDIDATES, anchor_boxes, decode, detections, to_lidar
+from robosac.detectors.v2xsim.anchors import MAX_CANDIDATES, anchor_boxes, decode, detections, geometry, to_lidar
 from tests.conftest import GOLDEN
 
 ANCHORS = 256 * 256 * 6
@@ -75,3 +75,18 @@ def test_what_overflowed_is_no_box():
     codes[7, 0] = torch.inf
     _, anchor = detections(logits, codes)
     assert anchor.tolist() == [3000]
+
+
+def test_an_attacker_sees_the_boxes_that_are_decoded(rng):
+    codes = rng.normal(0.0, 0.5, (ANCHORS, 6)).astype(np.float32)
+    index = rng.choice(ANCHORS, 500, replace=False)
+    boxes = to_lidar(decode(anchor_boxes(index), codes[index]))
+    expected = [*boxes.T[:2], *np.log(boxes.T[2:4]), np.cos(2 * boxes[:, 4]), np.sin(2 * boxes[:, 4])]
+    variable = torch.from_numpy(codes).requires_grad_(True)
+    shown = geometry(variable)
+    np.testing.assert_allclose(shown.detach()[torch.from_numpy(index)], np.column_stack(expected), atol=2e-3)
+    (gradient,) = torch.autograd.grad(shown.sum(), variable)
+    assert torch.isfinite(gradient).all()
+    silent = torch.zeros(ANCHORS, 6, requires_grad=True)  # the norm of sine and cosine is 0
+    (gradient,) = torch.autograd.grad(geometry(silent).sum(), silent)
+    assert torch.isfinite(gradient).all()

@@ -155,6 +155,20 @@ def test_an_attacker_of_the_message_moves_the_logits(sharp, ego, others):
     assert loss(logits, goal) < loss(benign, goal)
 
 
+def test_an_attacker_sees_the_boxes_that_are_decoded(sharp, ego, others):
+    surface = sharp.attack_surface(ego, others)
+    variable = surface.messages["car-2"].clone().requires_grad_(True)
+    logits, geometry = surface.perceive({**surface.messages, "car-2": variable})
+    best = sharp.prepare(ego, others).detect(list(others))[0]
+    place = logits.argmax()
+    shown = geometry[place].detach().numpy()
+    np.testing.assert_allclose(shown[:4], [*best[:2], *np.log(best[2:4])], atol=1e-3)
+    np.testing.assert_allclose(shown[4:], [np.cos(2 * best[4]), np.sin(2 * best[4])], atol=1e-3)
+    (gradient,) = torch.autograd.grad(geometry[place, 0], variable)
+    assert torch.isfinite(gradient).all()
+    assert gradient.abs().sum() > 0
+
+
 @pytest.mark.parametrize(("fusion", "expected"), [("mean", [2.0, 0.0]), ("max", [5.0, 1.0]), ("sum", [6.0, 0.0])])
 def test_fusions(fusion, expected):
     maps = [torch.tensor(values).reshape(1, 1, 2) for values in ([1.0, 1.0], [5.0, 0.0], [0.0, -1.0])]

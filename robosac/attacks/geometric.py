@@ -1,0 +1,101 @@
+"""What attacks share that look at boxes, not only at class scores."""
+
+from __future__ import annotations
+
+from collections.abc import Collection
+from dataclasses import dataclass
+
+import torch
+from torch.nn import functional
+
+from robosac.attacks.base import SEEN, Tensors
+from robosac.detectors.base import AttackSurface, GeometricSurface
+
+CERTAIN = 0.5
+"""Places with a score from here on hold a box for certain; these are the ones whose movement a defence can judge."""
+
+
+class NoGeometry(ValueError):
+    """An attack needs boxes of a detector that shows attackers class scores only."""
+
+
+@dataclass(frozen=True)
+class Perception:
+    """What the ego makes of a set of messages.
+
+    Attributes
+    ----------
+    scores : tensor
+        Class scores in [0, 1].
+    geometry : tensor of that shape and (6,)
+        As `robosac.detectors.base.GeometricSurface.perceive` gives it.
+    """
+
+    scores: torch.Tensor
+    geometry: torch.Tensor
+
+    @classmethod
+    def of(cls, surface: AttackSurface, team: Collection[str]) -> Perception:
+        """Of the benign messages of these teammates."""
+        with torch.no_grad():
+            logits, geometry = geometric(surface).perceive({name: surface.messages[name] for name in team})
+        return cls(torch.sigmoid(logits), geometry)
+
+
+def geometric(surface: AttackSurface) -> GeometricSurface:
+    """The same surface, if it shows boxes.
+
+    Raises
+    ------
+    NoGeometry
+        If it shows class scores only.
+    """
+    if not isinstance(surface, GeometricSurface):
+        raise NoGeometry("this attack needs a detector whose attack surface has `perceive`")
+    return surface
+
+
+def balanced(logits: torch.Tensor, wanted: torch.Tensor, matters: torch.Tensor) -> torch.Tensor:
+    """Cross-entropy in which the places that matter count as much together as all others, which are many and empty.
+
+    Parameters
+    ----------
+    logits, wanted : tensors of one shape
+        Class logits, and scores in [0, 1] that they should have.
+    matters : bool tensor of that shape
+    """
+    loss = functional.binary_cross_entropy_with_logits(logits, wanted, reduction="none")
+    return average(loss, matters) + average(loss, ~matters)
+
+
+def average(values: torch.Tensor, where: torch.Tensor) -> torch.Tensor:
+    """Mean over the places of a mask; 0 over none."""
+    return values[where].sum() / max(int(where.sum()), 1)
+
+
+def displacement(geometry: torch.Tensor, wanted: torch.Tensor, where: torch.Tensor) -> torch.Tensor:
+    """How far boxes are from where they should be: mean over the places of a mask of the summed differences.
+
+    Metres of the centre, logarithms of the sides and the two numbers of the yaw are summed as they are: for a car each
+    unit of any of them is about as bad for the overlap as that of another.
+    """
+    return average((geometry - wanted).abs().sum(dim=-1), where)
+
+
+def unnoticed(surface: AttackSurface, team: Collection[str], sent: Tensors, honest: Perception) -> torch.Tensor:
+    """How far a fusion is from what it would be if all were honest (0 at best, but for the scores' own entropy).
+
+    Parameters
+    ----------
+    surface : AttackSurface
+    team : collection of str
+        Who is fused.
+    sent : mapping of attacker to tensor
+        In place of the benign messages.
+    honest : Perception
+        Of that team's benign messages.
+    """
+    logits, geometry = geometric(surface).perceive({n: sent.get(n, surface.messages[n]) for n in team})
+    seen = honest.scores >= SEEN
+    moved = displacement(geometry, honest.geometry, honest.scores >= CERTAIN)
+    return balanced(logits, honest.scores, seen) + moved

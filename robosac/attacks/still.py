@@ -1,0 +1,76 @@
+"""The same attacks holding still: boxes that they have no use for stay where they are."""
+
+from __future__ import annotations
+
+from collections.abc import Collection
+from dataclasses import dataclass
+from typing import ClassVar
+
+import torch
+
+from robosac.attacks.adaptive import Erase, Invent, Shift
+from robosac.attacks.base import SEEN, Aim, IterativeAttack, Tensors
+from robosac.attacks.geometric import CERTAIN, Perception, displacement, geometric
+from robosac.detectors.base import AttackSurface
+
+STILLNESS = 2.0
+"""Weight of the boxes that should not move against the attack's own aim."""
+
+
+@dataclass(frozen=True)
+class HoldingStill(IterativeAttack):
+    """Add to an attack's aim how far it moves the boxes that it has no use for.
+
+    An adversarial map shakes all boxes a little, and a defence can compare where the boxes of a subset T lie with where
+    they lie once a teammate has joined. The term added is the mean `displacement` of the certain boxes of T in the
+    fusion with the attackers, for T everybody honest and for T nobody (the ego alone), times `STILLNESS`. Steps are
+    smaller and more than elsewhere: a signed step of 0.1 shakes the boxes by itself.
+    """
+
+    steps: int = 30
+    step_size: float = 0.04
+
+    everything: ClassVar[bool]
+    """Whether also boxes that only teammates see should stay."""
+
+    def aim(self, surface: AttackSurface, attackers: Collection[str]) -> Aim:
+        """The attack's own aim and the term that holds still."""
+        harm, shown = super().aim(surface, attackers), geometric(surface)
+        ego = Perception.of(surface, ())
+        honest = Perception.of(surface, [name for name in surface.messages if name not in attackers])
+        held = honest.scores >= CERTAIN
+        if not self.everything:
+            held = held & (ego.scores >= SEEN)
+
+        def loss(sent: Tensors, delta: Tensors) -> torch.Tensor:
+            _, among_all = shown.perceive({**surface.messages, **sent})
+            _, alone = shown.perceive(sent)
+            shaken = displacement(among_all, honest.geometry, held)
+            shaken = shaken + displacement(alone, ego.geometry, ego.scores >= CERTAIN)
+            return harm(sent, delta) + STILLNESS * shaken
+
+        return loss
+
+
+@dataclass(frozen=True)
+class EraseStill(HoldingStill, Erase):
+    """`Erase`, while what the ego sees stays where it is."""
+
+    name: ClassVar[str] = "erase-still"
+    everything: ClassVar[bool] = False
+
+
+@dataclass(frozen=True)
+class InventStill(HoldingStill, Invent):
+    """`Invent`, while all that is seen stays where it is."""
+
+    name: ClassVar[str] = "invent-still"
+    everything: ClassVar[bool] = True
+
+
+@dataclass(frozen=True)
+class ShiftStill(HoldingStill, Shift):
+    """`Shift`, while what the ego sees stays where it is."""
+
+    name: ClassVar[str] = "shift-still"
+    everything: ClassVar[bool] = False

@@ -1,0 +1,145 @@
+import numpy as np
+import pytest
+
+from robosac.attacks import ATTACKS, BEHAVIOURS, BIM, PGD, Campaign, GaussianNoise, load_campaign
+from robosac.attacks.alibi import Covering, Framing
+from robosac.attacks.campaign import Always, Asleep, FalsePose, Flicker, Turns
+from robosac.boxes import from_world, pose_matrix
+from robosac.evaluation.frames import under_attack
+
+PAIR = ["car-2", "rsu"]
+
+
+def acting(schedule, frames, attackers=PAIR):
+    return [tuple(schedule.acting(frame, attackers)) for frame in range(frames)]
+
+
+def test_a_sleeper_wakes():
+    assert acting(Asleep(2), 4) == [(), (), ("car-2", "rsu"), ("car-2", "rsu")]
+
+
+def test_flickering_strikes_in_its_share_of_the_frames_without_a_rhythm():
+    struck = [bool(names) for names in acting(Flicker(0.2), 1000)]
+    assert np.mean(struck) == pytest.approx(0.2, abs=0.04)
+    gaps = np.diff(np.flatnonzero(struck))
+    assert len(set(gaps)) > 8
+    assert acting(Flicker(0.2), 50) == acting(Flicker(0.2), 50) != acting(Flicker(0.2, seed=1), 50)
+
+
+def test_attackers_take_turns():
+    assert acting(Turns(2), 6) == [("car-2",), ("car-2",), ("rsu",), ("rsu",), ("car-2",), ("car-2",)]
+    assert acting(Turns(), 1, []) == [()]
+    assert acting(Always(), 1, PAIR) == [("car-2", "rsu")]
+
+
+def test_a_false_pose_moves_the_message_along_the_sender_axes():
+    lie = FalsePose(forward_m=1.0, left_m=0.0, turn_deg=3.0)
+    true = pose_matrix(10.0, 5.0, 1.7, np.pi / 2)
+    claimed = lie.claimed(true)
+    np.testing.assert_allclose(claimed[:3, 3], [10.0, 6.0, 1.7])
+    turned = from_world(np.array([[0.0, 0.0, 4.0, 2.0, 0.0]]), claimed)[0, 4]
+    assert turned == pytest.approx(-np.pi / 2 - np.radians(3.0))
+    moved = np.linalg.norm(FalsePose().claimed(true)[:3, 3] - true[:3, 3])
+    assert moved == pytest.approx(1.0)
+
+
+def under(campaign, messages, detector, index=0, attackers=("car-2",)):
+    return under_attack(
+        detector, messages, np.empty((0, 5)), "car-1", attackers, campaign, np.random.default_rng(0), index
+    )
+
+
+def test_asleep_all_send_what_is_honest(detector, messages):
+    met = under(Campaign(PGD(steps=1), Asleep(3)), messages, detector, index=2)
+    assert not met.attackers
+    assert all(met.received[name] is met.benign[name] for name in met.benign)
+    awake = under(Campaign(PGD(steps=1), Asleep(3)), messages, detector, index=3)
+    assert awake.attackers == {"car-2"}
+    plain = under(PGD(steps=1), messages, detector)
+    np.testing.assert_array_equal(
+        awake.received["car-2"].tensors["features"], plain.received["car-2"].tensors["features"]
+    )
+
+
+def test_a_false_pose_needs_no_perturbation(detector, messages):
+    met = under(load_campaign("honest@false-pose"), messages, detector)
+    assert met.attackers == {"car-2"}
+    assert met.received["car-2"].tensors is met.benign["car-2"].tensors
+    np.testing.assert_allclose(met.received["car-2"].pose, FalsePose().claimed(met.benign["car-2"].pose))
+    honest, lied = (detector.prepare(met.ego, sent).detect(["car-2"]) for sent in (met.benign, met.received))
+    assert len(honest) != len(lied) or np.abs(honest - lied).max() > 0.1
+
+
+def test_who_lies_about_nothing_is_no_attacker(detector, messages):
+    met = under(load_campaign("honest"), messages, detector)
+    assert not met.attackers
+    assert met.received == met.benign
+
+
+def test_an_attack_under_a_false_pose_is_optimised_for_it(detector, messages):
+    met = under(load_campaign("pgd@false-pose"), messages, detector)
+    assert not np.array_equal(met.received["car-2"].pose, met.benign["car-2"].pose)
+    plain = under(PGD(), messages, detector).received["car-2"]
+    assert not np.array_equal(met.received["car-2"].tensors["features"], plain.tensors["features"])
+
+
+def test_who_covers_whom():
+    assert Covering().teams(["a", "b", "c"], ["a", "b"]) == [["b", "c"], ["a", "c"], ["a"], ["b"]]
+    assert Covering().teams(["a", "b", "c"], ["a"]) == []
+    assert Framing().teams(["a", "b", "c"], ["a"]) == [["a", "c"], ["a"]]
+    assert Framing("c").teams(["a", "b", "c"], ["a"]) == [["a", "b"], ["a"]]
+    assert Framing("x").teams(["a", "b", "c"], ["a"]) == []
+    assert Framing("a").teams(["a", "b"], ["a"]) == []
+    assert Framing().teams(["a"], ["a"]) == []
+
+
+def logits(detector, met, team):
+    surface = detector.attack_surface(met.ego, met.received)
+    return surface.class_logits({name: surface.messages[name] for name in team})
+
+
+@pytest.mark.parametrize(("behaviour", "attackers"), [("covering", ("car-2", "rsu")), ("framing", ("car-2",))])
+def test_with_an_alibi_the_other_fusions_look_more_honest(behaviour, attackers, detector, messages):
+    plain = under(BIM(), messages, detector, attackers=attackers)
+    clever = under(load_campaign(f"bim@{behaviour}"), messages, detector, attackers=attackers)
+    team = sorted(plain.benign)
+    changes = {}
+    for name, met in (("plain", plain), ("clever", clever)):
+        for part in (tuple(team), *map(tuple, BEHAVIOURS[behaviour](Campaign(BIM())).alibi.teams(team, attackers))):
+            benign = detector.attack_surface(met.ego, met.benign)
+            honest = benign.class_logits({member: benign.messages[member] for member in part})
+            changes[name, part] = float((logits(detector, met, part) - honest).abs().mean())
+    parts = [part for name, part in changes if name == "clever" and part != tuple(team)]
+    assert all(changes["clever", part] < changes["plain", part] for part in parts)
+    assert changes["clever", tuple(team)] > 0.2
+
+
+def test_campaigns_by_name():
+    assert load_campaign("erase") == Campaign(ATTACKS["erase"]())
+    assert load_campaign("erase@asleep@false-pose") == Campaign(ATTACKS["erase"](), Asleep(), FalsePose())
+    assert load_campaign("robosac.attacks:PGD@turns") == Campaign(PGD(), Turns())
+    assert (load_campaign("honest").name, load_campaign("honest").epsilon) == ("honest", 0.0)
+    assert (load_campaign("noise@flicker").name, load_campaign("pgd").epsilon) == ("noise", 0.5)
+    campaign = load_campaign("pgd@asleep")
+    assert Campaign.of(campaign) is campaign
+
+
+@pytest.mark.parametrize(
+    ("spec", "complaint"),
+    [
+        ("nonesuch@asleep", "unknown attack 'nonesuch'"),
+        ("pgd@nonesuch", "unknown behaviour 'nonesuch'; known: asleep"),
+        ("noise@framing", "only an attack that optimises"),
+        ("honest@covering", "only an attack that optimises can have an alibi, not honest"),
+    ],
+)
+def test_impossible_campaigns_are_explained(spec, complaint):
+    with pytest.raises(ValueError, match=complaint):
+        load_campaign(spec)
+    with pytest.raises(ValueError, match="alibi"):
+        Campaign(GaussianNoise(), alibi=Covering())
+
+
+def test_an_attacker_that_is_not_there_is_an_error(detector, messages):
+    with pytest.raises(KeyError):
+        under(load_campaign("honest@false-pose"), messages, detector, attackers=("nobody",))
