@@ -4,6 +4,9 @@ from __future__ import annotations
 
 from robosac.defenses.a2cp import A2CP
 from robosac.defenses.building import build
+from robosac.defenses.conformal import Conformal
+from robosac.defenses.halving import Halving
+from robosac.defenses.one_by_one import OneByOne
 from robosac.defenses.protocol import (
     Conversation,
     Decision,
@@ -22,10 +25,13 @@ from robosac.defenses.undefended import Undefended
 
 __all__ = [
     "A2CP",
+    "Conformal",
     "Conversation",
     "Decision",
     "Defense",
+    "Halving",
     "Hypothesis",
+    "OneByOne",
     "Outcome",
     "Reason",
     "Reference",
