@@ -20,6 +20,7 @@ from robosac.budget import DEFAULT_CONFIDENCE
 from robosac.consensus import DEFAULT_THRESHOLD
 from robosac.defenses import Defense, Reference, build
 from robosac.defenses.a2cp import DEFAULT_BUDGET as DEFAULT_A2CP_BUDGET
+from robosac.defenses.conformal import DEFAULT_RATE
 from robosac.defenses.static_team import DEFAULT_RECHECK
 from robosac.detectors import DetectorInfo
 from robosac.signatures import read_public_key
@@ -74,6 +75,38 @@ class A2CPSettings(_DefenseSettings):
     reference: Reference = Field(Reference.EGO, description="What a hypothesis is compared with.")
 
 
+class _MemorylessSettings(_DefenseSettings):
+    consensus_threshold: float = Field(DEFAULT_THRESHOLD, gt=0, le=1, description="Jaccard index of a consensus.")
+    reference: Reference = Field(Reference.EGO, description="What a hypothesis is compared with.")
+
+
+class HalvingSettings(_MemorylessSettings):
+    """Split the team until every group agrees with the reference or is a single teammate."""
+
+    kind: Literal["halving"]
+
+
+class OneByOneSettings(_MemorylessSettings):
+    """Test every teammate alone, then all that passed together."""
+
+    kind: Literal["one_by_one"]
+
+
+class ConformalSettings(_MemorylessSettings):
+    """Calibrated tests of every teammate with control of false discoveries."""
+
+    kind: Literal["conformal"]
+    false_discovery_rate: float = Field(
+        DEFAULT_RATE, gt=0, lt=1, description="Expected share of honest teammates among the accused, at most."
+    )
+    calibration: tuple[Annotated[float, Field(ge=0, le=1)], ...] | None = Field(
+        None,
+        min_length=1,
+        max_length=10_000,
+        description="Jaccard indices of honest single teammates; by default those of the shipped detector.",
+    )
+
+
 class UndefendedSettings(_DefenseSettings):
     """No defence: everybody is fused and nothing is tested. A baseline."""
 
@@ -81,9 +114,16 @@ class UndefendedSettings(_DefenseSettings):
 
 
 DefenseSettings = Annotated[
-    SampleConsensusSettings | StaticTeamSettings | A2CPSettings | UndefendedSettings, Field(discriminator="kind")
+    SampleConsensusSettings
+    | StaticTeamSettings
+    | A2CPSettings
+    | HalvingSettings
+    | OneByOneSettings
+    | ConformalSettings
+    | UndefendedSettings,
+    Field(discriminator="kind"),
 ]
-DEFENSE_KINDS = ("sample_consensus", "static_team", "a2cp", "none")
+DEFENSE_KINDS = ("sample_consensus", "static_team", "a2cp", "halving", "one_by_one", "conformal", "none")
 read_defense = TypeAdapter[DefenseSettings](DefenseSettings).validate_python
 """Settings of a defence from what a session keeps of them."""
 

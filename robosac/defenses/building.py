@@ -7,12 +7,17 @@ from typing import Any
 
 from robosac.budget import DomainError
 from robosac.defenses.a2cp import A2CP
+from robosac.defenses.conformal import Conformal
+from robosac.defenses.halving import Halving
+from robosac.defenses.one_by_one import OneByOne
 from robosac.defenses.protocol import Defense, Reference
 from robosac.defenses.sample_consensus import SampleConsensus
 from robosac.defenses.static_team import StaticTeam
 from robosac.defenses.undefended import Undefended
 
-_KINDS: Mapping[str, type[Any]] = {cls.kind: cls for cls in (SampleConsensus, StaticTeam, A2CP, Undefended)}
+_KINDS: Mapping[str, type[Any]] = {
+    cls.kind: cls for cls in (SampleConsensus, StaticTeam, A2CP, Halving, OneByOne, Conformal, Undefended)
+}
 
 
 def build(settings: Mapping[str, Any]) -> Defense:
@@ -28,15 +33,13 @@ def build(settings: Mapping[str, Any]) -> Defense:
     DomainError
         If there is no such kind, or it does not take these settings.
     """
-    options = dict(settings)
+    options = {name: tuple(value) if isinstance(value, list) else value for name, value in settings.items()}
     kind = options.pop("kind", None)
     if kind not in _KINDS:
         raise DomainError(f"no defence of kind {kind!r}; known: {', '.join(_KINDS)}")
     try:
         if "reference" in options:
             options["reference"] = Reference(options["reference"])
-        if options.get("ratios") is not None:
-            options["ratios"] = tuple(options["ratios"])
         defense: Defense = _KINDS[kind](**options)
     except DomainError:
         raise
