@@ -93,6 +93,7 @@ __all__ = [
     "Erase",
     "EraseStill",
     "GaussianNoise",
+    "HONEST",
     "Invent",
     "InventStill",
     "IterativeAttack",

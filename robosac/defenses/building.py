@@ -33,7 +33,7 @@ def build(settings: Mapping[str, Any]) -> Defense:
     DomainError
         If there is no such kind, or it does not take these settings.
     """
-    options = {name: tuple(value) if isinstance(value, list) else value for name, value in settings.items()}
+    options: dict[str, Any] = {n: tuple(v) if isinstance(v, list) else v for n, v in settings.items()}
     kind = options.pop("kind", None)
     if kind not in _KINDS:
         raise DomainError(f"no defence of kind {kind!r}; known: {', '.join(_KINDS)}")
