@@ -20,9 +20,10 @@ from service import audit
 from service.admission import Admission
 from service.engine import Engine
 from service.gathering import Equivocation, Received, Refused
+from service.live import Caller
 from service.metrics import Metrics
 from service.problems import Problem
-from service.sessions import Caller, Sessions
+from service.sessions import Sessions
 from service.settings import Settings
 from service.store import SessionChanged
 from service.tracing import Tracing
@@ -167,7 +168,7 @@ class Frames:
             reason = Reason.REPLAYED if frame == record.last_frame else Reason.STALE
             before = caller.live.ego_digest if reason is Reason.REPLAYED else None
             if before not in (None, ego.digest):
-                await self._sessions.log_equivocation(caller, frame, {"digest": str(before)}, ego)
+                await self._sessions.journal.equivocation(caller, frame, {"digest": str(before)}, ego)
             detail = f"frames must increase; the latest answered is {record.last_frame}"
             await self._refuse(caller, reason, detail, frame, "frame")
             raise Problem(409, "stale-frame", detail, "frame")
@@ -186,10 +187,10 @@ class Frames:
         try:
             caller.live.gathering.offer(frame, caller.vehicle_id, received)
         except Equivocation as lie:
-            await self._sessions.log_equivocation(caller, frame, lie.first, received)
+            await self._sessions.journal.equivocation(caller, frame, lie.first, received)
             raise Problem(409, "equivocation", str(lie), "frame") from lie
         except Refused as refused:
-            await self._sessions.log_refusal(caller, refused.reason, refused.detail, frame, "frame")
+            await self._sessions.journal.refusal(caller, refused.reason, refused.detail, frame, "frame")
             status, slug = _REFUSALS[refused.reason]
             raise Problem(status, slug, refused.detail, "frame") from refused
 
@@ -204,7 +205,7 @@ class Frames:
     async def _refuse(self, caller: Caller, reason: Reason, detail: str, frame: int | None, field: str) -> None:
         if not caller.is_ego:
             caller.live.gathering.refuse(caller.vehicle_id, frame, reason, detail)
-        await self._sessions.log_refusal(caller, reason, detail, frame, field)
+        await self._sessions.journal.refusal(caller, reason, detail, frame, field)
 
     async def _answer(
         self,

@@ -14,6 +14,7 @@ from robosac import wire
 from service.gateway import Gateway
 from service.identity import KeyedRoute
 from service.limits import read_bounded
+from service.live import Caller
 from service.problems import Problem, documented
 from service.schemas import (
     DetectorEntry,
@@ -27,7 +28,6 @@ from service.schemas import (
     TeamChanged,
     TokenRenewed,
 )
-from service.sessions import Caller
 
 MSGPACK = "application/vnd.msgpack"
 MSGPACK_TYPES = (MSGPACK, "application/msgpack", "application/x-msgpack")

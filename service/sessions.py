@@ -6,22 +6,21 @@ import asyncio
 import contextlib
 import secrets
 import time
-from collections import Counter
 from collections.abc import Callable, Mapping, Sequence
-from dataclasses import dataclass, field
 from typing import Any
 
 import structlog
 
 from robosac.audit import commitment
 from robosac.budget import DomainError
-from robosac.defenses import Defense, Reason
-from robosac.detectors import Detector, Role
-from robosac.previous import PreviousAnswer
+from robosac.defenses import Reason
+from robosac.detectors import Detector
 from service import audit
 from service.engine import Engine
-from service.gathering import Backlog, Gathering, Received
+from service.gathering import Backlog, Gathering
 from service.identity import TokenRefused, Tokens, unauthenticated
+from service.journal import Journal
+from service.live import Caller, LiveSession
 from service.metrics import Metrics
 from service.motion import Motion
 from service.problems import Problem
@@ -49,69 +48,8 @@ from service.store import (
 logger = structlog.stdlib.get_logger(__name__)
 
 SWEEP_EVERY_S = 30.0
-REFUSALS_LOGGED = 16
-"""Refused messages of one vehicle between two frames that get a record each; the others are counted."""
-STRANGERS = "?"
-"""Under which the refusals of all callers without a token that counts are counted: no vehicle is called so."""
 MAX_RENEWALS = 16
 """Tokens that a vehicle may take between two frames: each leaves a record."""
-
-
-@dataclass
-class LiveSession:
-    """What a session holds in this process only; the lock is held while a frame is answered or the team changes.
-
-    ``previous`` and ``ego_digest`` are of the frame ``answered``, the latest that this process answered.
-    """
-
-    detector: Detector
-    defense: Defense
-    team: tuple[str, ...]
-    gathering: Gathering
-    motion: Motion
-    budget_s: float
-    answered: int | None = None
-    previous: PreviousAnswer | None = None
-    ego_digest: str | None = None
-    lock: asyncio.Lock = field(default_factory=asyncio.Lock)
-    last_used: float = field(default_factory=time.monotonic)
-    refusals: Counter[str] = field(default_factory=Counter)
-    renewals: Counter[str] = field(default_factory=Counter)
-
-    def follow(self, record: SessionRecord) -> None:
-        """Catch up with what another process did to the session, if one did."""
-        if self.team != record.teammates:
-            self.team = record.teammates
-            self.gathering.change_team(record.teammates)
-        if record.last_frame is not None and record.last_frame > self.gathering.closed:
-            self.gathering.close(record.last_frame)
-        if record.last_frame != self.answered:
-            self.previous = self.ego_digest = None
-
-    def unlogged(self) -> dict[str, int]:
-        """Refusals by vehicle that got no record since the last call; all counts begin again."""
-        self.renewals.clear()
-        counted, self.refusals = self.refusals, Counter()
-        return {name: n - REFUSALS_LOGGED for name, n in counted.items() if n > REFUSALS_LOGGED}
-
-
-@dataclass(frozen=True)
-class Caller:
-    """Who speaks: the vehicle that a token belongs to, in the session it belongs to."""
-
-    record: SessionRecord
-    live: LiveSession
-    vehicle_id: str
-
-    @property
-    def is_ego(self) -> bool:
-        """Whether the ego speaks."""
-        return self.vehicle_id == self.record.ego_id
-
-    @property
-    def role(self) -> Role:
-        """In which role the vehicle speaks."""
-        return "ego" if self.is_ego else "teammate"
 
 
 class Sessions:
@@ -145,6 +83,7 @@ class Sessions:
         self._tokens = tokens
         self._live: dict[str, LiveSession] = {}
         self.backlog = Backlog(settings.max_pending_bytes)
+        self.journal = Journal(store, metrics)
 
     async def open(self, request: SessionRequest) -> SessionCreated:
         """Begin a session; the answer is the only place where its tokens are shown."""
@@ -230,7 +169,7 @@ class Sessions:
         caller = await self.authenticate(session_id, token)
         if not caller.is_ego:
             problem = _ego_only(caller.vehicle_id)
-            await self.log_refusal(caller, Reason.UNAUTHENTICATED, problem.detail, None, "")
+            await self.journal.refusal(caller, Reason.UNAUTHENTICATED, problem.detail, None, "")
             raise problem
         return caller
 
@@ -382,37 +321,6 @@ class Sessions:
         """The messages kept of a decided frame."""
         return await self._store.messages(caller.record.session_id, frame)
 
-    async def log(self, caller: Caller, event: AuditEvent) -> None:
-        """Append to a session's log, unless it has ended meanwhile."""
-        with contextlib.suppress(SessionOver):
-            await self._store.log(caller.record.session_id, event)
-
-    async def log_refusal(self, caller: Caller, reason: Reason, detail: str, frame: int | None, field: str) -> None:
-        """Record that a vehicle's message was refused."""
-        self._metrics.refused(reason.value)
-        caller.live.refusals[caller.vehicle_id] += 1
-        if caller.live.refusals[caller.vehicle_id] > REFUSALS_LOGGED:
-            return
-        logger.info(
-            "message refused",
-            session_id=caller.record.session_id,
-            vehicle_id=caller.vehicle_id,
-            reason=reason.value,
-            detail=detail,
-            frame=frame,
-        )
-        await self.log(caller, audit.message_refused(caller.vehicle_id, reason, detail, frame=frame, field=field))
-
-    async def log_equivocation(self, caller: Caller, frame: int, first: Mapping[str, str], second: Received) -> None:
-        """Record that a vehicle said two different things about one frame."""
-        self._metrics.refused(Reason.REPLAYED.value)
-        caller.live.refusals[caller.vehicle_id] += 1
-        if caller.live.refusals[caller.vehicle_id] <= REFUSALS_LOGGED:
-            logger.warning(
-                "equivocation", session_id=caller.record.session_id, vehicle_id=caller.vehicle_id, frame=frame
-            )
-            await self.log(caller, audit.equivocation(caller.vehicle_id, frame, first, second.proof))
-
     async def _change_team(
         self,
         caller: Caller,
@@ -493,14 +401,8 @@ class Sessions:
         try:
             return self._tokens.holder(record, token)
         except TokenRefused as refused:
-            self._metrics.refused(Reason.UNAUTHENTICATED.value)
-            if record.ended_at is None:
-                refusals = self._live_session(record).refusals
-                refusals[STRANGERS] += 1
-                if refusals[STRANGERS] <= REFUSALS_LOGGED:
-                    with contextlib.suppress(SessionOver):
-                        event = audit.access_refused(refused.vehicle_id, refused.problem.detail)
-                        await self._store.log(record.session_id, event)
+            live = None if record.ended_at is not None else self._live_session(record)
+            await self.journal.stranger(record.session_id, live, refused)
             raise refused.problem from refused
 
 

@@ -1,0 +1,72 @@
+"""What goes on record besides decisions: who was refused, and who said two things at once. Nobody can fill a log: of
+one vehicle, and of all strangers together, only so many records are kept between two frames; the others are counted.
+"""
+
+from __future__ import annotations
+
+import contextlib
+from collections.abc import Mapping
+
+import structlog
+
+from robosac.defenses import Reason
+from service import audit
+from service.gathering import Received
+from service.identity import TokenRefused
+from service.live import REFUSALS_LOGGED, STRANGERS, Caller, LiveSession
+from service.metrics import Metrics
+from service.store import AuditEvent, SessionOver, Store
+
+logger = structlog.stdlib.get_logger(__name__)
+
+
+class Journal:
+    """Appends to the logs of sessions.
+
+    Parameters
+    ----------
+    store : Store
+    metrics : Metrics
+    """
+
+    def __init__(self, store: Store, metrics: Metrics) -> None:
+        self._store = store
+        self._metrics = metrics
+
+    async def refusal(self, caller: Caller, reason: Reason, detail: str, frame: int | None, field: str) -> None:
+        """A vehicle's message, or call, was refused."""
+        session_id, vehicle_id = caller.record.session_id, caller.vehicle_id
+        if self._counted(caller.live, vehicle_id, reason):
+            logger.info(
+                "message refused",
+                session_id=session_id,
+                vehicle_id=vehicle_id,
+                reason=reason.value,
+                detail=detail,
+                frame=frame,
+            )
+            await self._append(session_id, audit.message_refused(vehicle_id, reason, detail, frame=frame, field=field))
+
+    async def equivocation(self, caller: Caller, frame: int, first: Mapping[str, str], second: Received) -> None:
+        """A vehicle said two different things about one frame."""
+        session_id, vehicle_id = caller.record.session_id, caller.vehicle_id
+        if self._counted(caller.live, vehicle_id, Reason.REPLAYED):
+            logger.warning("equivocation", session_id=session_id, vehicle_id=vehicle_id, frame=frame)
+            await self._append(session_id, audit.equivocation(vehicle_id, frame, first, second.proof))
+
+    async def stranger(self, session_id: str, live: LiveSession | None, refused: TokenRefused) -> None:
+        """Somebody came without a token that counts; ``live`` is None for a session that has ended."""
+        if live is None:
+            self._metrics.refused(Reason.UNAUTHENTICATED.value)
+        elif self._counted(live, STRANGERS, Reason.UNAUTHENTICATED):
+            await self._append(session_id, audit.access_refused(refused.vehicle_id, refused.problem.detail))
+
+    def _counted(self, live: LiveSession, who: str, reason: Reason) -> bool:
+        """Count a refusal; whether it gets a record."""
+        self._metrics.refused(reason.value)
+        live.refusals[who] += 1
+        return live.refusals[who] <= REFUSALS_LOGGED
+
+    async def _append(self, session_id: str, event: AuditEvent) -> None:
+        with contextlib.suppress(SessionOver):
+            await self._store.log(session_id, event)
