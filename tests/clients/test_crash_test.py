@@ -19,7 +19,7 @@ ANSWER = {
 
 @pytest.fixture
 def driven():
-    return Driven("none", OpenedSession("s", "token", {}, {}, {}))
+    return Driven("none", OpenedSession("s", "token", {}, "2100-01-01T00:00:00Z", {}, {}))
 
 
 def log(*frames, seeds=SEEDS):
