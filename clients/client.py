@@ -339,9 +339,10 @@ class VehicleClient:
         """As the ego: let a teammate leave."""
         await self._request("DELETE", f"{self._path}/teammates/{teammate}", headers=self.bearer)
 
-    async def close(self) -> None:
-        """As the ego: end the session."""
-        await self._request("DELETE", self._path, headers=self.bearer)
+    async def close(self) -> str:
+        """As the ego: end the session; the head of its audit log, to verify it against later."""
+        response = await self._request("DELETE", self._path, headers=self.bearer)
+        return str(response.headers.get("audit-head", ""))
 
 
 def _bearer(credential: str) -> dict[str, str]:

@@ -92,9 +92,9 @@ async def get_session(caller: Ego, gateway: GatewayDep) -> SessionState:
 
 
 @v1.delete("/sessions/{sid}", status_code=204, responses=_EGO_PROBLEMS)
-async def delete_session(caller: Ego, gateway: GatewayDep) -> None:
-    """End the session; its audit log can be read until it is purged."""
-    await gateway.sessions.close(caller)
+async def delete_session(caller: Ego, gateway: GatewayDep, response: Response) -> None:
+    """End the session; its log can be read until it is purged. The header `Audit-Head` is its last record's hash."""
+    response.headers["Audit-Head"] = await gateway.sessions.close(caller)
 
 
 @v1.post("/sessions/{sid}/token", status_code=201, responses=documented(401, 404, 429))

@@ -257,10 +257,14 @@ class Sessions:
             next_seed_commitment=commitment(record.seed),
         )
 
-    async def close(self, caller: Caller) -> None:
-        """End a session, after the frame in hand."""
+    async def close(self, caller: Caller) -> str:
+        """End a session, after the frame in hand; the head of its log, which is complete by then."""
         async with caller.live.lock:
             await self._end(caller.record.session_id, "closed")
+        record = await self._store.get(caller.record.session_id)
+        if record is None:
+            raise _over()
+        return record.audit_head
 
     async def expire_idle(self) -> None:
         """End, every so often and for ever, the sessions that nobody has used for too long, and purge old logs."""

@@ -1,6 +1,9 @@
+import json
+
 import pytest
 
 from clients.errors import AccessDenied, SessionNotFound
+from robosac.audit import verify
 from tests.service.conftest import EGO, TEAM, problem, serve
 
 
@@ -157,3 +160,18 @@ async def test_idle_sessions_expire(monkeypatch):
             await served.ego(busy).state()
         with pytest.raises(SessionNotFound):
             await served.ego(idle).state()
+
+
+async def test_an_ended_session_leaves_its_log_and_says_its_head(served, good_frame):
+    session = await served.open()
+    ego = served.ego(session)
+    assert (await served.post(session, "frames", good_frame(0))).status_code == 200
+    head = await ego.close()
+    lines = [line.encode() for line in await ego.audit_lines()]
+    assert [json.loads(line)["event"] for line in lines] == ["session_opened", "frame_answered", "session_ended"]
+    assert verify(lines, head=head) == []
+    assert verify(lines[:-1], head=head) != []
+    headers = {"Authorization": f"Bearer {session.teammate_tokens['rsu']}"}
+    response = await served.http.get(f"/v1/sessions/{session.session_id}/audit", headers=headers)
+    problem(response, 403, "ego-only")
+    problem(await served.post(session, "frames", good_frame(1)), 404, "unknown-session")
