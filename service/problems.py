@@ -114,7 +114,7 @@ def install(app: FastAPI) -> None:
                 400, "malformed-json", f"not JSON: {first.get('ctx', {}).get('error', first['msg'])}"
             ).response()
         where = [str(part) for part in first["loc"] if part not in ("body", "query", "path", *DEFENSE_KINDS)]
-        return Problem(422, "invalid-request", str(first["msg"]), ".".join(where) or None).response()
+        return Problem(422, "invalid-request", str(first["msg"]), ".".join(where) or "body").response()
 
     @app.exception_handler(HTTPException)
     async def _http(_: Request, error: HTTPException) -> JSONResponse:

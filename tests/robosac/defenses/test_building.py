@@ -28,7 +28,7 @@ def test_a_defence_is_built_from_json(settings, defense):
         ({"kind": "none", "ratios": [0.5]}, "none: .*ratios"),
         ({"kind": "sample_consensus", "reference": "next"}, "'next' is not a valid Reference"),
         ({"kind": "sample_consensus", "attacker_ratio": 2}, "^attacker_ratio must lie"),
-        ({"kind": "a2cp", "ratios": 3}, "a2cp: .*not iterable"),
+        ({"kind": "a2cp", "ratios": 3}, "a2cp: .*int"),
     ],
 )
 def test_settings_that_make_no_defence_are_refused(settings, complaint):
