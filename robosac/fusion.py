@@ -59,6 +59,8 @@ class FusionResult:
         The defence's state for the next frame.
     previous : PreviousAnswer or None
         What the next frame may be compared with; None after an ego-only answer.
+    suspicion : mapping of teammate id to float, or None
+        Probability that each teammate attacks, from a defence that knows it.
     """
 
     boxes: FloatArray
@@ -73,6 +75,7 @@ class FusionResult:
     timings_ms: Mapping[str, float]
     state: State
     previous: PreviousAnswer | None
+    suspicion: Mapping[str, float] | None = None
 
     @property
     def sampling_steps(self) -> int:
@@ -174,6 +177,7 @@ class _FrameRun:
             timings_ms=self.timings,
             state=decision.state,
             previous=self._to_remember(boxes) if decision.accepted else None,
+            suspicion=decision.suspicion,
         )
 
     def _prepare(self, teammates: Mapping[str, Message]) -> PreparedFrame:
@@ -222,7 +226,7 @@ class _FrameRun:
             started = self.clock()
             comparison = compare(reference, self._confident(boxes), self.defense.consensus_threshold)
             self._spend("consensus", started)
-            tested.append(Outcome(subset, comparison.jaccard_index, comparison.verdict))
+            tested.append(Outcome(subset, comparison.jaccard_index, comparison.verdict, boxes, reference))
             self.outcomes.append(tested[-1])
         return tested
 

@@ -18,6 +18,7 @@ from typing import Any, ClassVar, Protocol
 
 import numpy as np
 
+from robosac.boxes import FloatArray
 from robosac.consensus import Verdict
 
 Hypothesis = tuple[str, ...]
@@ -69,11 +70,17 @@ class Outcome:
     jaccard_index : float
         Against the reference, in [0, 1].
     verdict : Verdict
+    boxes : (n, 6) ndarray or None
+        All that was decoded, with scores; ego frame. None where only the verdict is known.
+    reference : (m, 6) ndarray or None
+        What took part in the comparison on the reference's side.
     """
 
     teammates: Hypothesis
     jaccard_index: float
     verdict: Verdict
+    boxes: FloatArray | None = field(default=None, compare=False, repr=False)
+    reference: FloatArray | None = field(default=None, compare=False, repr=False)
 
 
 @dataclass(frozen=True)
@@ -108,6 +115,8 @@ class Decision:
         Assumed or estimated share of attackers in the team.
     state : mapping
         To be handed to the next frame's conversation.
+    suspicion : mapping of teammate id to float, or None
+        Probability that each teammate of the session attacks; None from a defence that knows none.
     """
 
     accepted: Hypothesis
@@ -115,6 +124,7 @@ class Decision:
     rejected: Mapping[str, Rejection]
     attacker_ratio: float | None
     state: State
+    suspicion: Mapping[str, float] | None = None
 
 
 Conversation = Generator[Sequence[Hypothesis], Sequence[Outcome], Decision]

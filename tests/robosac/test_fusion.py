@@ -1,5 +1,6 @@
 import logging
 from collections.abc import Collection
+from dataclasses import replace
 
 import numpy as np
 import pytest
@@ -60,6 +61,28 @@ def test_the_answer_is_the_verified_subset(seed):
     ]
     np.testing.assert_array_equal(result.boxes, SEEN)
     assert set(result.rejected) == set(TEAM) - set(result.accepted)
+
+
+def test_a_defence_sees_what_was_decoded_and_what_it_was_compared_with():
+    weak = np.vstack([SEEN, NOISE * [[1, 1, 1, 1, 1, 0.1]]])
+    detector = FakeDetector()
+    detector.detect = lambda teammates=(): weak
+    (outcome,) = run(detector).hypotheses
+    np.testing.assert_array_equal(outcome.boxes, weak)
+    np.testing.assert_array_equal(outcome.reference, SEEN)
+
+
+class Suspicious(Undefended):
+    """Suspects one."""
+
+    def converse(self, team, state, rng):
+        decision = yield from super().converse(team, state, rng)
+        return replace(decision, suspicion={"c": 0.25})
+
+
+def test_the_suspicion_of_a_defence_is_in_the_result():
+    assert run(FakeDetector(), Suspicious()).suspicion == {"c": 0.25}
+    assert run(FakeDetector()).suspicion is None
 
 
 def test_with_attackers_everywhere_the_ego_answers_alone():
