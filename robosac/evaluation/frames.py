@@ -9,10 +9,13 @@ from pathlib import Path
 import numpy as np
 
 from robosac.attacks import Attack, Campaign
-from robosac.boxes import FloatArray
+from robosac.boxes import FloatArray, pose_matrix
 from robosac.detectors import Detector, Message, PreparedFrame, V2XSimDetector
 from robosac.detectors.base import for_role
 from robosac.scenes import FRAMES_PER_SECOND, IntersectionScene, SceneFrame, v2xsim
+
+YAW_PER_METRE = np.deg2rad(1.0)
+"""Standard deviation of the heading's error for each metre of the position's."""
 
 
 @dataclass(frozen=True)
@@ -41,6 +44,19 @@ class EvaluationFrame:
 def encode_all(detector: Detector, frame: SceneFrame) -> dict[str, Message]:
     """Every agent's message, with all that it would send as an ego."""
     return {name: detector.encode(view.points, view.pose) for name, view in frame.views.items()}
+
+
+def misplaced(message: Message, pose_error_m: float, rng: np.random.Generator) -> Message:
+    """A message whose sender is wrong about where it is: normal errors in x, y and heading."""
+    if not pose_error_m:
+        return message
+    pose = message.pose
+    dx, dy = rng.normal(0.0, pose_error_m, 2)
+    turn = pose_matrix(0.0, 0.0, 0.0, rng.normal(0.0, pose_error_m * YAW_PER_METRE))
+    wrong = pose.copy()
+    wrong[:3, :3] = turn[:3, :3] @ pose[:3, :3]
+    wrong[:2, 3] += dx, dy
+    return Message(wrong, message.tensors)
 
 
 def under_attack(
