@@ -5,6 +5,7 @@ from __future__ import annotations
 from robosac.defenses.a2cp import A2CP
 from robosac.defenses.building import build
 from robosac.defenses.conformal import Conformal
+from robosac.defenses.group_testing import GroupTesting
 from robosac.defenses.halving import Halving
 from robosac.defenses.one_by_one import OneByOne
 from robosac.defenses.protocol import (
@@ -30,6 +31,7 @@ __all__ = [
     "Decision",
     "Defense",
     "Halving",
+    "GroupTesting",
     "Hypothesis",
     "OneByOne",
     "Outcome",

@@ -1,0 +1,17 @@
+"""A defence that names attackers; see `GroupTesting`."""
+
+from __future__ import annotations
+
+from robosac.defenses.group_testing.defense import DEFAULT_HAZARDS, GroupTesting
+from robosac.defenses.group_testing.model import OPEN, Calibration, CalibrationError, EvidenceModel
+from robosac.defenses.group_testing.posterior import Hazards
+
+__all__ = [
+    "DEFAULT_HAZARDS",
+    "OPEN",
+    "Calibration",
+    "CalibrationError",
+    "EvidenceModel",
+    "GroupTesting",
+    "Hazards",
+]

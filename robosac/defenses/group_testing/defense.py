@@ -1,0 +1,175 @@
+"""Group testing: find out who attacks, name them, and answer with everybody else."""
+
+from __future__ import annotations
+
+from collections.abc import Mapping, Sequence
+from dataclasses import dataclass
+from typing import Any, ClassVar
+
+import numpy as np
+
+from robosac.budget import DomainError
+from robosac.consensus import DEFAULT_THRESHOLD
+from robosac.defenses.group_testing.frame import JudgedFrame
+from robosac.defenses.group_testing.memory import Memory
+from robosac.defenses.group_testing.model import Calibration, EvidenceModel
+from robosac.defenses.group_testing.posterior import Hazards, Posterior
+from robosac.defenses.protocol import Conversation, Reference, State
+from robosac.defenses.sampling import check_budget, check_threshold
+
+DEFAULT_HAZARDS = Hazards(hijack=0.003, recovery=0.001, change=0.02)
+DEFAULT_FIRST_BUDGET = 7
+DEFAULT_LATER_BUDGET = 4
+DEFAULT_NAMING_BOUND = 0.99
+DEFAULT_POSE_ERROR_M = 0.2
+"""To reckon with more error than there is costs some sharpness; with less, it names honest teammates."""
+
+
+@dataclass(frozen=True)
+class GroupTesting:
+    """Bayesian group testing over the team, with memory; the number of attackers is not assumed.
+
+    1. The posterior over (set of attackers, kind of attack) goes one frame on: hijacks, recoveries.
+    2. The next subset is the one with the greatest ``max(0, U(m) - best U so far) + .06 bits(m) - .004``: what it gains
+       as an answer, and what it is expected to tell. Nothing above 0, the frame's budget, or the deadline ends the
+       search.
+    3. A decoded subset is evidence by its Jaccard index against the ego, and by what it keeps, moves and invents
+       compared with each part and superset decoded in this frame (`geometry.measure`). A repeated test weighs less.
+    4. The answer is the decoded subset of greatest utility that is in consensus with the ego, or all trusted.
+    5. A teammate is named (``distrusted``) once its probability passes ``naming_bound`` and at least two different
+       subsets speak against it; it is cleared when the probability falls below a half.
+
+    An ego that sees fewer than two boxes gives no verdict: its consensus is none, and the answer falls back on the
+    trust list (source ``trusted``). Teammates get onto that list by having been in consensus, and stay while their
+    suspicion is at most .1. Exact for teams up to 8; see `Posterior` for larger ones.
+
+    Parameters
+    ----------
+    model : EvidenceModel
+        Of the detector it is used with; see `Calibration.at`.
+    attack_prior : float
+        Probability, before the first frame, that anybody attacks; in (0, 1).
+    attacker_prior : float
+        Probability of each teammate to attack if anybody does; in (0, 1).
+    hazards : Hazards
+        Per frame; each in [0, 0.5].
+    first_budget, budget : int
+        Most hypotheses tested in the first frame, and in later ones.
+    naming_bound : float
+        In [0.5, 1).
+    consensus_threshold : float
+        Jaccard index from which on a subset may be answered without trust.
+
+    Raises
+    ------
+    DomainError
+        If an argument is outside its range.
+    """
+
+    kind: ClassVar[str] = "group_testing"
+    reference: ClassVar[Reference] = Reference.EGO
+
+    model: EvidenceModel
+    attack_prior: float = 0.5
+    attacker_prior: float = 0.25
+    hazards: Hazards = DEFAULT_HAZARDS
+    first_budget: int = DEFAULT_FIRST_BUDGET
+    budget: int = DEFAULT_LATER_BUDGET
+    naming_bound: float = DEFAULT_NAMING_BOUND
+    consensus_threshold: float = DEFAULT_THRESHOLD
+
+    def __post_init__(self) -> None:
+        for name in ("attack_prior", "attacker_prior"):
+            if not 0.0 < getattr(self, name) < 1.0:
+                raise DomainError(f"{name} must lie strictly between 0 and 1, got {getattr(self, name)}")
+        for name, hazard in vars(self.hazards).items():
+            if not 0.0 <= hazard <= 0.5:
+                raise DomainError(f"the hazard of {name} must be in [0, 0.5], got {hazard}")
+        if not 0.5 <= self.naming_bound < 1.0:
+            raise DomainError(f"naming_bound must be in [0.5, 1), got {self.naming_bound}")
+        check_budget(self.first_budget)
+        check_budget(self.budget)
+        check_threshold(self.consensus_threshold)
+
+    @classmethod
+    def calibrated(
+        cls, calibration: Calibration, pose_error_m: float = DEFAULT_POSE_ERROR_M, **settings: Any
+    ) -> GroupTesting:
+        """With the likelihoods of a calibration at the pose error to be expected, metres.
+
+        Raises
+        ------
+        CalibrationError
+            If the calibration does not reach so far.
+        """
+        return cls(calibration.at(pose_error_m), **settings)
+
+    def check_team(self, team_size: int) -> None:
+        """Any team will do."""
+
+    def initial_state(self, team: Sequence[str]) -> State:
+        """The prior.
+
+        Returns
+        -------
+        dict
+            ``posterior``, ``memory`` (see `Posterior.to_state`, `Memory.to_state`); ``trusted``, ``named``, lists of
+            teammates; ``suspicion`` by teammate.
+        """
+        posterior = Posterior.of(len(self.model.kinds), self.attack_prior, self.attacker_prior, sorted(team))
+        return _state(posterior, Memory(), (), ())
+
+    def change_team(self, state: State, team: Sequence[str]) -> State:
+        """Those who left are remembered; newcomers start at the prior, those who return at what is left of what was
+        known of them.
+        """
+        posterior, memory = self._revive(state)
+        self._sync(posterior, memory, joined=team, kept=team)
+        kept = [[name for name in state[of] if name in set(team)] for of in ("trusted", "named")]
+        return _state(posterior, memory, *kept)
+
+    def converse(self, team: Sequence[str], state: State, rng: np.random.Generator) -> Conversation:
+        """Steps 1 to 5, one hypothesis a batch."""
+        posterior, memory = self._revive(state)
+        self._sync(posterior, memory, joined=team, kept=None)
+        first = memory.frame == 0
+        if not first:
+            posterior.step(self.hazards)
+        judged = JudgedFrame(self.model, posterior, memory, tuple(team), frozenset(state["trusted"]))
+        for _ in range(self.first_budget if first else self.budget):
+            subset = judged.next_test(rng)
+            if subset is None:
+                break
+            tested = yield [subset]
+            if not tested:
+                break
+            judged.learn(tested[0])
+        decision = judged.decide(frozenset(state["named"]), self.naming_bound)
+        memory.frame += 1
+        return decision.with_state(_state(posterior, memory, decision.trusted, decision.named))
+
+    def _revive(self, state: State) -> tuple[Posterior, Memory]:
+        posterior = Posterior.from_state(state["posterior"], self.attack_prior, self.attacker_prior)
+        if len(posterior.kinds) != len(self.model.kinds):  # calibrated again, for other kinds, since
+            members = posterior.members
+            posterior = Posterior.of(len(self.model.kinds), self.attack_prior, self.attacker_prior, members)
+        return posterior, Memory.from_state(state["memory"])
+
+    def _sync(self, posterior: Posterior, memory: Memory, joined: Sequence[str], kept: Sequence[str] | None) -> None:
+        known = set(posterior.members)
+        suspicion = dict(zip(posterior.members, map(float, posterior.marginals()), strict=True))
+        for name in sorted(known - set(joined if kept is None else kept)) if kept is not None else ():
+            memory.leave(name, suspicion[name])
+            posterior.remove(name)
+        for name in sorted(set(joined) - known):
+            posterior.add(name, memory.welcome(name, self.attack_prior * self.attacker_prior))
+
+
+def _state(posterior: Posterior, memory: Memory, trusted: Sequence[str], named: Sequence[str]) -> Mapping[str, Any]:
+    return {
+        "posterior": posterior.to_state(),
+        "memory": memory.to_state(),
+        "trusted": list(trusted),
+        "named": list(named),
+        "suspicion": dict(sorted(zip(posterior.members, posterior.marginals().round(6).tolist(), strict=True))),
+    }

@@ -1,0 +1,247 @@
+"""One frame of group testing: what to test, what to learn from it, what to conclude."""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Mapping, Sequence
+from dataclasses import dataclass
+from typing import Any
+
+import numpy as np
+
+from robosac.boxes import FloatArray
+from robosac.consensus import Verdict
+from robosac.defenses.group_testing import choice
+from robosac.defenses.group_testing.geometry import MIN_WITNESSES, measure
+from robosac.defenses.group_testing.memory import (
+    JACCARD_REPEAT,
+    PAIR_REPEAT,
+    WORTH_KEEPING,
+    Memory,
+    identity,
+    keys,
+)
+from robosac.defenses.group_testing.model import EvidenceModel, jaccard_bin, pair_bin
+from robosac.defenses.group_testing.posterior import BoolArray, Posterior
+from robosac.defenses.protocol import (
+    Decision,
+    Hypothesis,
+    Outcome,
+    Reason,
+    Rejection,
+    Source,
+    State,
+    explain_rejections,
+)
+
+TRUSTED_BELOW = 0.1
+"""Largest suspicion of a teammate on the trust list."""
+CLEARED_BELOW = 0.5
+"""A named teammate is named no longer once its suspicion is below."""
+FORGOTTEN_BELOW = 0.05
+"""Evidence about a teammate less suspected is dropped."""
+SUBSETS_TO_NAME = 2
+"""Different subsets that must speak against a teammate before it is named."""
+_CERTAIN = 1e-9
+_TIE = 1e-9
+_TINY = 1e-300
+
+
+@dataclass(frozen=True)
+class Conclusion:
+    """A decision without its state yet."""
+
+    accepted: Hypothesis
+    source: Source
+    rejected: Mapping[str, Rejection]
+    suspicion: Mapping[str, float]
+    trusted: Sequence[str]
+    named: Sequence[str]
+
+    def with_state(self, state: State) -> Decision:
+        """The decision."""
+        ratio = sum(self.suspicion.values()) / len(self.suspicion) if self.suspicion else None
+        return Decision(self.accepted, self.source, self.rejected, ratio, state, self.suspicion)
+
+
+@dataclass(frozen=True)
+class _Finding:
+    """One piece of evidence: a test of ``a`` (and ``d`` beside it), and how likely its outcome was."""
+
+    a: Hypothesis
+    d: Hypothesis
+    log_likelihood: FloatArray
+    weight: float
+    values: Mapping[str, Any]
+
+
+class JudgedFrame:
+    """Mutable; posterior and memory are changed in place.
+
+    Parameters
+    ----------
+    model : EvidenceModel
+    posterior : Posterior
+        Of this frame, before its evidence.
+    memory : Memory
+    team : tuple of str
+        Teammates present.
+    trusted : frozenset of str
+        The trust list that the frame began with.
+    """
+
+    def __init__(
+        self, model: EvidenceModel, posterior: Posterior, memory: Memory, team: Hypothesis, trusted: frozenset[str]
+    ) -> None:
+        self._model = model
+        self._posterior = posterior
+        self._memory = memory
+        self._team = team
+        self._trusted = trusted
+        self._outcomes: list[Outcome] = []
+        self._ego_sees = True
+        self._members = posterior.members
+        self._index = {name: i for i, name in enumerate(self._members)}
+        self._identities = np.array([identity(name) for name in self._members], dtype=np.uint64)
+
+    def next_test(self, rng: np.random.Generator) -> Hypothesis | None:
+        """The subset most worth decoding, ties broken at random; None if none is worth its pass."""
+        if not self._team:
+            return None
+        decoded = self._rows([o.teammates for o in self._outcomes])
+        options = choice.candidates(self._posterior, self._rows([self._team])[0], decoded)
+        if not len(options):
+            return None
+        bits = choice.expected_information(
+            self._model, self._posterior, self._memory, self._identities, options, decoded, ego_sees=self._ego_sees
+        )
+        worth = choice.utility(self._posterior, options) - max(0.0, self._best_answer()[1])
+        value = np.maximum(0.0, worth) + choice.INFORMATION_VALUE * bits - choice.TEST_COST
+        best = np.flatnonzero(value >= value.max() - _TIE)
+        chosen = int(best[rng.integers(len(best))])
+        if value[chosen] <= 0:
+            return None
+        return tuple(name for name in self._team if options[chosen, self._index[name]])
+
+    def learn(self, outcome: Outcome) -> None:
+        """Take in a decoded subset: its Jaccard index, and the pairs it makes with what was decoded before."""
+        self._ego_sees = outcome.reference is not None and len(outcome.reference) >= MIN_WITNESSES
+        findings = self._pairs(outcome)
+        if self._ego_sees:
+            size = np.array([len(outcome.teammates)])
+            likelihood = self._model.jaccard_tables(size)[0, :, jaccard_bin(outcome.jaccard_index)]
+            values = {"test": "jaccard", "jaccard_index": round(outcome.jaccard_index, 4)}
+            findings.append(_Finding(outcome.teammates, (), np.log(likelihood), 1.0, values))
+        self._outcomes.append(outcome)
+        for finding in findings:
+            self._apply(finding)
+
+    def _pairs(self, outcome: Outcome) -> list[_Finding]:
+        found = []
+        for other in self._outcomes:
+            small, large = sorted((other, outcome), key=lambda o: len(o.teammates))
+            joining = tuple(name for name in large.teammates if name not in set(small.teammates))
+            if len(joining) != len(large.teammates) - len(small.teammates) or not joining:
+                continue
+            if small.boxes is None or large.boxes is None:
+                continue
+            pair = measure(small.boxes, large.boxes)
+            if pair is not None:
+                found.append((small.teammates, joining, pair))
+        findings = []
+        for a, d, pair in found:
+            tables = self._model.pair_tables(np.array([len(a)]), np.array([len(d)]))
+            values = {"test": "pair", "loss": round(pair.loss, 4), "novelty": pair.novelty}
+            log_likelihood = np.log(tables[0, :, pair_bin(pair)])
+            findings.append(_Finding(a, d, log_likelihood, 1 / math.sqrt(len(found)), values))
+        return findings
+
+    def _apply(self, finding: _Finding) -> None:
+        a, d = self._rows([finding.a, finding.d])
+        cells = self._posterior.cells(self._posterior.masks(a[None]), self._posterior.masks(d[None]))[0]
+        attacked = float(cells[1:] @ np.exp(finding.log_likelihood[1:])) / max(float(cells[1:].sum()), _TINY)
+        sign = 1 if math.log(max(attacked, _TINY)) > finding.log_likelihood[0] else -1
+        (key,) = keys(a[None] @ self._identities, d[None] @ self._identities)
+        weight = finding.weight * float(choice.dilution(np.array([len(finding.a) + len(finding.d)]))[0])
+        weight *= self._memory.weigh(int(key), PAIR_REPEAT if finding.d else JACCARD_REPEAT, sign)
+        before = self._posterior.marginals()
+        self._posterior.update(a, d, weight * finding.log_likelihood)
+        ratios = _log_odds(self._posterior.marginals()) - _log_odds(before)
+        for index in np.flatnonzero(np.abs(ratios) >= WORTH_KEEPING):
+            name, ratio = self._members[index], float(ratios[index])
+            if ratio > 0 or name in self._memory.evidence:
+                item = {"frame": self._memory.frame, **finding.values, "teammates": list(finding.a)}
+                if finding.d:
+                    item["joining"] = list(finding.d)
+                item["log_likelihood_ratio"] = round(ratio, 3)
+                self._memory.add_evidence(name, item)
+
+    def decide(self, named_before: frozenset[str], naming_bound: float) -> Conclusion:
+        """The answer, whom to trust, and whom to name."""
+        suspicion = self._suspicion()
+        accepted, _, source = self._best_answer()
+        if not self._outcomes:
+            accepted, source = self._untested_answer()
+        named = [
+            name
+            for name, p in suspicion.items()
+            if (p > naming_bound and self._memory.subsets_against(name) >= SUBSETS_TO_NAME)
+            or (name in named_before and p >= CLEARED_BELOW)
+        ]
+        believed = set(self._trusted)
+        for outcome in self._outcomes:
+            if self._verified(outcome):
+                believed.update(outcome.teammates)
+        trusted = [name for name, p in suspicion.items() if name in believed and p <= TRUSTED_BELOW]
+        rejected = self._explain(accepted, set(named), suspicion)
+        self._memory.forget_evidence({name for name, p in suspicion.items() if p < FORGOTTEN_BELOW})
+        return Conclusion(accepted, source, rejected, suspicion, trusted, named)
+
+    def _best_answer(self) -> tuple[Hypothesis, float, Source]:
+        """Of the decoded subsets that may be answered, the most useful; the ego alone if none is of use."""
+        allowed = [o for o in self._outcomes if self._verified(o) or self._trusted.issuperset(o.teammates)]
+        if not allowed:
+            return (), 0.0, Source.EGO_ONLY
+        worth = choice.utility(self._posterior, self._rows([o.teammates for o in allowed]))
+        best = int(np.argmax(worth))
+        if worth[best] <= 0:
+            return (), 0.0, Source.EGO_ONLY
+        source = Source.CONSENSUS if self._verified(allowed[best]) else Source.TRUSTED
+        return allowed[best].teammates, float(worth[best]), source
+
+    def _untested_answer(self) -> tuple[Hypothesis, Source]:
+        """Without time for any test: all that are trusted."""
+        present = tuple(name for name in self._team if name in self._trusted)
+        if present and choice.utility(self._posterior, self._rows([present]))[0] > 0:
+            return present, Source.TRUSTED
+        return (), Source.EGO_ONLY
+
+    def _verified(self, outcome: Outcome) -> bool:
+        """In consensus with an ego that sees enough to be asked."""
+        return self._ego_sees and outcome.verdict is Verdict.CONSENSUS
+
+    def _explain(self, accepted: Hypothesis, named: set[str], suspicion: Mapping[str, float]) -> dict[str, Rejection]:
+        rejected = {}
+        for name, rejection in explain_rejections(self._team, accepted, self._outcomes).items():
+            evidence: dict[str, Any] = {**rejection.evidence, "suspicion": round(suspicion[name], 6)}
+            reason = rejection.reason
+            if name in named:
+                reason = Reason.DISTRUSTED
+                evidence["evidence"] = [dict(item) for item in self._memory.evidence.get(name, ())]
+            rejected[name] = Rejection(reason, evidence)
+        return rejected
+
+    def _suspicion(self) -> dict[str, float]:
+        return dict(zip(self._members, map(float, self._posterior.marginals()), strict=True))
+
+    def _rows(self, subsets: Sequence[Hypothesis]) -> BoolArray:
+        rows = np.zeros((len(subsets), len(self._members)), dtype=bool)
+        for row, subset in zip(rows, subsets, strict=True):
+            row[[self._index[name] for name in subset]] = True
+        return rows
+
+
+def _log_odds(p: FloatArray) -> FloatArray:
+    kept = np.clip(p, _CERTAIN, 1 - _CERTAIN)
+    odds: FloatArray = np.log(kept / (1 - kept))
+    return odds

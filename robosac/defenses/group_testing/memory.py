@@ -1,0 +1,135 @@
+"""What the defence keeps from frame to frame besides the posterior: tests made, evidence, those who left."""
+
+from __future__ import annotations
+
+import hashlib
+import math
+from collections.abc import Collection, Mapping
+from dataclasses import dataclass, field
+from typing import Any
+
+import numpy as np
+
+from robosac.boxes import FloatArray
+
+REPEAT_MEMORY = 60
+"""Frames after which a test counts as new."""
+JACCARD_REPEAT = 0.95
+PAIR_REPEAT = 0.9
+"""A test made k frames ago repeats its bias: made again, it weighs 1 - rho ** k."""
+KEPT_ITEMS = 12
+"""Pieces of evidence kept of one teammate, the strongest."""
+WORTH_KEEPING = 0.5
+"""Evidence that moves a teammate's log-odds by less is not kept."""
+FORGETTING_FRAMES = 1500.0
+"""What was known of a teammate that left fades by a factor e in this many frames: five minutes at 5 Hz."""
+MAX_LEFT = 256
+"""Teammates remembered after they left, the latest."""
+KeyArray = np.ndarray[tuple[Any, ...], np.dtype[np.uint64]]
+_SPREAD = np.uint64(0x9E3779B97F4A7C15)
+
+
+def identity(name: str) -> int:
+    """A teammate as 64 bits; a subset is the sum of its members, modulo 2 ** 64."""
+    return int.from_bytes(hashlib.blake2b(name.encode(), digest_size=8).digest(), "little")
+
+
+def keys(a: KeyArray, d: KeyArray) -> KeyArray:
+    """Keys (n,) of tests of subsets ``a`` beside which ``d`` joined (0: a test of the Jaccard index); all uint64."""
+    with np.errstate(over="ignore"):
+        return a * _SPREAD + d
+
+
+@dataclass
+class Memory:
+    """Mutable while a frame is judged.
+
+    Attributes
+    ----------
+    frame : int
+        Frames judged before this one, in this session.
+    tests : dict of key to (frame, sign)
+        When a test was made last, and whether it spoke for an attacker.
+    evidence : dict of teammate to list of dict
+        What spoke for or against those under suspicion: JSON values.
+    left : dict of teammate to (suspicion, frame)
+        Who left, and when.
+    """
+
+    frame: int = 0
+    tests: dict[int, tuple[int, int]] = field(default_factory=dict)
+    evidence: dict[str, list[dict[str, Any]]] = field(default_factory=dict)
+    left: dict[str, tuple[float, int]] = field(default_factory=dict)
+
+    def weights(self, tests: KeyArray, rho: float) -> FloatArray:
+        """What tests (n,) are expected to be worth: one made k frames ago ``1 - rho ** k``, others 1."""
+        worth = np.ones(len(tests))
+        for index, key in enumerate(tests.tolist()):
+            if key in self.tests:
+                worth[index] = 1.0 - rho ** (self.frame - self.tests[key][0])
+        return worth
+
+    def weigh(self, test: int, rho: float, sign: int) -> float:
+        """What a test is worth that was made now: a repetition little, a surprise everything.
+
+        Parameters
+        ----------
+        test : int
+            Its key.
+        rho : float
+        sign : int
+            +1 if the outcome speaks for an attacker, -1 if against.
+        """
+        frame, before = self.tests.get(test, (0, 0))
+        self.tests[test] = (self.frame, sign)
+        return 1.0 if sign != before else 1.0 - float(rho ** (self.frame - frame))
+
+    def add_evidence(self, teammate: str, item: Mapping[str, Any]) -> None:
+        """Keep a piece of evidence, if it is among the strongest."""
+        items = [*self.evidence.get(teammate, ()), dict(item)]
+        if len(items) > KEPT_ITEMS:
+            items.remove(min(items, key=lambda i: abs(i["log_likelihood_ratio"])))
+        self.evidence[teammate] = items
+
+    def forget_evidence(self, cleared: Collection[str]) -> None:
+        """Drop the evidence on those no longer under suspicion."""
+        self.evidence = {name: items for name, items in self.evidence.items() if name not in cleared}
+
+    def subsets_against(self, teammate: str) -> int:
+        """Different tested subsets that speak against a teammate."""
+        against = [i for i in self.evidence.get(teammate, ()) if i["log_likelihood_ratio"] > 0]
+        return len({tuple(sorted([*i["teammates"], *i.get("joining", ())])) for i in against})
+
+    def leave(self, teammate: str, suspicion: float) -> None:
+        """Remember who left."""
+        self.evidence.pop(teammate, None)
+        self.left.pop(teammate, None)
+        self.left[teammate] = (suspicion, self.frame)
+        while len(self.left) > MAX_LEFT:
+            del self.left[next(iter(self.left))]
+
+    def welcome(self, teammate: str, prior: float) -> float | None:
+        """Suspicion of one that joins: None if it was never here, else what is left of what was known."""
+        if teammate not in self.left:
+            return None
+        suspicion, frame = self.left.pop(teammate)
+        return prior + (suspicion - prior) * math.exp(-(self.frame - frame) / FORGETTING_FRAMES)
+
+    def to_state(self) -> dict[str, Any]:
+        """JSON values that `from_state` reads; tests too long ago are left out."""
+        return {
+            "frame": self.frame,
+            "tests": {f"{k:016x}": [f, s] for k, (f, s) in self.tests.items() if self.frame - f <= REPEAT_MEMORY},
+            "evidence": self.evidence,
+            "left": {name: [p, f] for name, (p, f) in self.left.items()},
+        }
+
+    @classmethod
+    def from_state(cls, state: Mapping[str, Any]) -> Memory:
+        """What `to_state` wrote."""
+        return cls(
+            frame=int(state["frame"]),
+            tests={int(key, 16): (int(f), int(s)) for key, (f, s) in state["tests"].items()},
+            evidence={name: [dict(item) for item in items] for name, items in state["evidence"].items()},
+            left={name: (float(p), int(f)) for name, (p, f) in state["left"].items()},
+        )

@@ -1,0 +1,194 @@
+import json
+
+import numpy as np
+import pytest
+
+from robosac.budget import DomainError
+from robosac.consensus import Verdict
+from robosac.defenses import GroupTesting, Outcome, Reason, Source
+from robosac.defenses.group_testing import OPEN, Hazards
+from robosac.defenses.group_testing.memory import FORGETTING_FRAMES
+from tests.robosac.defenses.group_testing.conversing import SEEN, TEAM, make_model, outcome, run_frame, shifted
+
+MODEL = make_model()
+DEFENSE = GroupTesting(MODEL)
+
+
+def run(defense, attackers, frames, rng, state=None, team=TEAM, **options):
+    state = defense.initial_state(team) if state is None else state
+    decision, tested = None, []
+    for _ in range(frames):
+        decision, outcomes = run_frame(defense, state, team, attackers, rng, **options)
+        state = json.loads(json.dumps(decision.state))
+        tested.append(outcomes)
+    return decision, tested
+
+
+def named(decision):
+    return {name for name, r in decision.rejected.items() if r.reason is Reason.DISTRUSTED}
+
+
+@pytest.mark.parametrize("bad", [(), ("car-3",), ("car-2", "rsu"), ("car-2", "car-4", "car-5")])
+def test_attackers_are_named_and_everybody_else_is_used(bad, rng):
+    decision, tested = run(DEFENSE, bad, 8, rng)
+    assert set(decision.accepted) == set(TEAM) - set(bad)
+    assert decision.source is Source.CONSENSUS
+    assert named(decision) == set(bad)
+    assert set(decision.suspicion) == set(TEAM)
+    assert set(decision.state["trusted"]) == set(TEAM) - set(bad)
+    assert len(tested[0]) <= 7
+    assert max(map(len, tested[1:])) <= 4
+    assert len(tested[-1]) < 4
+
+
+def test_the_evidence_on_a_named_attacker_is_given_item_by_item(rng):
+    decision, _ = run(DEFENSE, ["car-3"], 3, rng)
+    rejection = decision.rejected["car-3"]
+    items = rejection.evidence["evidence"]
+    assert rejection.evidence["suspicion"] > 0.99
+    against = [item for item in items if item["log_likelihood_ratio"] > 0]
+    assert len({tuple(sorted([*i["teammates"], *i.get("joining", [])])) for i in against}) >= 2
+    for item in items:
+        assert item["test"] in ("jaccard", "pair")
+        assert item["frame"] in range(3)
+        assert ("jaccard_index" in item) == (item["test"] == "jaccard")
+        assert ("loss" in item) == ("joining" in item) == (item["test"] == "pair")
+
+
+def test_the_same_subset_again_and_again_names_nobody():
+    defense = GroupTesting(MODEL, attack_prior=0.9, attacker_prior=0.9, first_budget=1, budget=1)
+    decision, tested = run(defense, ["solo"], 12, np.random.default_rng(0), team=("solo",))
+    assert {o.teammates for frame in tested for o in frame} <= {("solo",)}
+    assert named(decision) == set()
+    assert decision.accepted == ()
+
+
+def test_a_hijacked_teammate_is_found_and_one_that_recovers_is_used_again(rng):
+    honest, _ = run(DEFENSE, [], 6, rng)
+    hijacked, _ = run(DEFENSE, ["car-4"], 4, rng, honest.state)
+    assert named(hijacked) == {"car-4"}
+    assert "car-4" not in hijacked.state["trusted"]
+    quick = GroupTesting(MODEL, hazards=Hazards(0.003, 0.05, 0.02))
+    again, _ = run(quick, [], 40, rng, hijacked.state)
+    assert named(again) == set()
+    assert "car-4" in again.accepted
+    assert "car-4" not in again.state["memory"]["evidence"]
+
+
+def test_an_attacker_that_spoils_what_an_honest_one_joins_is_blamed_itself(rng):
+    """It agrees with the ego, and moves boxes only where others are in the fusion."""
+
+    def judge(subset, attackers):
+        spoiled = "car-2" in subset and len(subset) > 1
+        return Outcome(subset, 0.93, Verdict.CONSENSUS, shifted(subset) if spoiled else SEEN, SEEN)
+
+    state = DEFENSE.initial_state(TEAM)
+    for _ in range(15):
+        decision, _ = run_frame(DEFENSE, state, TEAM, [], rng, judge=judge)
+        state = decision.state
+        assert named(decision) <= {"car-2"}
+    assert named(decision) == {"car-2"}
+
+
+def test_an_ego_that_sees_nothing_falls_back_on_whom_it_trusts(rng):
+    def blind(subset, attackers):
+        return Outcome(subset, 0.0, Verdict.DISSENSUS, SEEN[:0], SEEN[:0])
+
+    first, _ = run(DEFENSE, [], 1, rng, judge=blind)
+    assert (first.source, first.accepted) == (Source.EGO_ONLY, ())
+    prior = DEFENSE.initial_state(TEAM)["suspicion"]
+    assert first.suspicion == pytest.approx(prior, abs=1e-4)
+    known, _ = run(DEFENSE, ["car-3"], 5, rng)
+    later, _ = run(DEFENSE, [], 1, rng, known.state, judge=blind)
+    assert later.source is Source.TRUSTED
+    assert set(later.accepted) == set(TEAM) - {"car-3"}
+    assert later.state["trusted"] == known.state["trusted"]
+
+
+def test_one_box_is_too_little_for_a_consensus(rng):
+    def nearly_blind(subset, attackers):
+        return Outcome(subset, 1.0, Verdict.CONSENSUS, SEEN[:1], SEEN[:1])
+
+    decision, _ = run(DEFENSE, [], 3, rng, judge=nearly_blind)
+    assert (decision.source, decision.accepted, decision.state["trusted"]) == (Source.EGO_ONLY, (), [])
+
+
+def test_without_time_whom_it_trusts_is_the_answer(rng):
+    known, _ = run(DEFENSE, ["car-3"], 5, rng)
+    hurried, tested = run(DEFENSE, ["car-3"], 1, rng, known.state, most=0)
+    assert tested == [[]]
+    assert (hurried.source, set(hurried.accepted)) == (Source.TRUSTED, set(TEAM) - {"car-3"})
+    fresh, _ = run(DEFENSE, [], 1, rng, most=0)
+    assert fresh.source is Source.EGO_ONLY
+
+
+def test_a_team_that_changes(rng):
+    known, _ = run(DEFENSE, ["car-3"], 5, rng)
+    without = DEFENSE.change_team(known.state, [name for name in TEAM if name != "car-3"])
+    assert "car-3" not in without["suspicion"]
+    assert without["named"] == []
+    back = DEFENSE.change_team(json.loads(json.dumps(without)), TEAM)
+    assert back["suspicion"]["car-3"] == pytest.approx(known.suspicion["car-3"], abs=1e-4)
+    assert "car-3" not in back["trusted"]
+    long_ago = {**without, "memory": {**without["memory"], "frame": int(20 * FORGETTING_FRAMES)}}
+    stranger = DEFENSE.change_team(without, [*without["suspicion"], "new"])["suspicion"]["new"]
+    assert DEFENSE.change_team(long_ago, TEAM)["suspicion"]["car-3"] == pytest.approx(stranger, abs=1e-3)
+    assert 0.05 < stranger < 0.25
+
+
+def test_an_absent_teammate_keeps_what_is_known_of_it(rng):
+    known, _ = run(DEFENSE, ["car-3"], 5, rng)
+    present = tuple(name for name in TEAM if name != "car-3")
+    decision, tested = run(DEFENSE, [], 2, rng, known.state, team=present)
+    assert all("car-3" not in o.teammates for frame in tested for o in frame)
+    assert decision.suspicion["car-3"] > 0.9
+    assert set(decision.rejected) == set(present) - set(decision.accepted)
+
+
+def test_a_calibration_with_other_kinds_begins_again_with_the_same_team(rng):
+    known, _ = run(DEFENSE, ["car-3"], 5, rng)
+    other = GroupTesting(make_model(("pgd", OPEN)))
+    decision, _ = run(other, ["car-3"], 3, rng, known.state)
+    assert named(decision) == {"car-3"}
+    assert len(decision.state["posterior"]["weights"]) == 3
+
+
+def test_fifty_teammates(rng):
+    team = tuple(f"v{i:02d}" for i in range(50))
+    bad = {"v07", "v19", "v42"}
+    state, seen = DEFENSE.initial_state(team), set()
+    for _ in range(25):
+        decision, tested = run_frame(DEFENSE, state, team, bad, rng)
+        state = json.loads(json.dumps(decision.state))
+        assert bad.isdisjoint(decision.accepted)
+        seen |= set(decision.state["named"])
+    assert len(tested) <= 4
+    assert seen == bad
+    assert len(json.dumps(state)) < 60_000
+
+
+@pytest.mark.parametrize(
+    "settings",
+    [
+        {"attack_prior": 0.0},
+        {"attacker_prior": 1.0},
+        {"hazards": Hazards(0.6, 0.001, 0.02)},
+        {"naming_bound": 1.0},
+        {"naming_bound": 0.4},
+        {"first_budget": 0},
+        {"budget": 0},
+        {"consensus_threshold": 0.0},
+    ],
+)
+def test_settings_out_of_range(settings):
+    with pytest.raises(DomainError):
+        GroupTesting(MODEL, **settings)
+
+
+def test_outcomes_without_boxes_still_count_by_their_index(rng):
+    def bare(subset, attackers):
+        full = outcome(subset, attackers)
+        return Outcome(full.teammates, full.jaccard_index, full.verdict, None, SEEN)
+
+    decision, _ = run(DEFENSE, ["car-3"], 10, rng, judge=bare)
+    assert max(decision.suspicion, key=decision.suspicion.get) == "car-3"

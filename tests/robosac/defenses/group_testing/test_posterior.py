@@ -1,0 +1,158 @@
+import json
+from itertools import combinations
+
+import numpy as np
+import pytest
+
+from robosac.defenses.group_testing import Hazards
+from robosac.defenses.group_testing.model import CELLS
+from robosac.defenses.group_testing.posterior import BLOCK, EXACT, Posterior
+
+TEAM = list("abcde")
+KINDS = 3
+HAZARDS = Hazards(0.02, 0.01, 0.1)
+
+
+class BruteForce:
+    """Every (set, kind) in a dictionary, by the definitions."""
+
+    def __init__(self, team, attack_prior=0.5, attacker_prior=0.25):
+        self.team = team
+        sets = [frozenset(c) for n in range(1, len(team) + 1) for c in combinations(team, n)]
+        weight = {s: attacker_prior ** len(s) * (1 - attacker_prior) ** (len(team) - len(s)) for s in sets}
+        total = sum(weight.values())
+        self.p = {(s, k): attack_prior / KINDS * weight[s] / total for s in sets for k in range(KINDS)}
+        self.p[frozenset(), None] = 1 - attack_prior
+
+    def row(self, attackers, kind, a, d):
+        in_a, in_d = bool(attackers & set(a)), bool(attackers & set(d))
+        return 0 if not in_a | in_d else 1 + CELLS * kind + (2 if in_a and in_d else 1 if in_a else 0)
+
+    def update(self, a, d, log_likelihood):
+        self.p = {(s, k): p * np.exp(log_likelihood[self.row(s, k, a, d)]) for (s, k), p in self.p.items()}
+        total = sum(self.p.values())
+        self.p = {key: p / total for key, p in self.p.items()}
+
+    def step(self, h):
+        after = dict.fromkeys(self.p, 0.0)
+        for (before, kind), p in self.p.items():
+            for now in {s for s, _ in self.p}:
+                flow = p if kind is not None else p / 2
+                for name in self.team:
+                    if name in before:
+                        flow *= h.recovery if name not in now else 1 - h.recovery
+                    else:
+                        flow *= h.hijack if name in now else 1 - h.hijack
+                if kind is None:
+                    flow += p / 2 * self.awaken_together(now, h)
+                if not now:
+                    after[now, None] += flow
+                elif kind is None:
+                    for k in range(KINDS):
+                        after[now, k] += flow / KINDS
+                else:
+                    for k in range(KINDS):
+                        after[now, k] += flow * ((1 - h.change) * (k == kind) + h.change / KINDS)
+        self.p = after
+
+    def awaken_together(self, now, h):
+        nobody = (1 - h.hijack) ** len(self.team)
+        if not now:
+            return nobody
+        prior = 0.25 ** len(now) * 0.75 ** (len(self.team) - len(now))
+        return (1 - nobody) * prior / (1 - 0.75 ** len(self.team))
+
+    def marginals(self, members):
+        return [sum(p for (s, _), p in self.p.items() if name in s) for name in members]
+
+    def cells(self, a, d):
+        found = np.zeros(1 + CELLS * KINDS)
+        for (s, k), p in self.p.items():
+            found[self.row(s, k, a, d)] += p
+        return found
+
+
+def rows(posterior, *subsets):
+    return np.array([[name in subset for name in posterior.members] for subset in subsets])
+
+
+def cells(posterior, a, d):
+    return posterior.cells(posterior.masks(rows(posterior, a)), posterior.masks(rows(posterior, d)))[0]
+
+
+def random_tests(rng, team, count):
+    for _ in range(count):
+        order = [str(name) for name in rng.permutation(team)]
+        split = rng.integers(1, len(team))
+        yield order[:split], order[split : split + rng.integers(0, 3)], rng.normal(0, 1.5, 1 + CELLS * KINDS)
+
+
+def test_a_small_team_is_exact(rng):
+    posterior, brute = Posterior.of(KINDS, 0.5, 0.25, TEAM), BruteForce(TEAM)
+    np.testing.assert_allclose(posterior.marginals(), brute.marginals(TEAM))
+    for a, d, log_likelihood in random_tests(rng, TEAM, 8):
+        np.testing.assert_allclose(cells(posterior, a, d), brute.cells(a, d), atol=1e-12)
+        posterior.update(*rows(posterior, a, d), log_likelihood)
+        brute.update(a, d, log_likelihood)
+        np.testing.assert_allclose(posterior.marginals(), brute.marginals(TEAM), atol=1e-12)
+        posterior.step(HAZARDS)
+        brute.step(HAZARDS)
+        np.testing.assert_allclose(posterior.marginals(), brute.marginals(TEAM), atol=1e-12)
+        assert posterior.nobody == pytest.approx(brute.p[frozenset(), None])
+
+
+def test_state_survives_json(rng):
+    posterior = Posterior.of(KINDS, 0.5, 0.25, TEAM)
+    for a, d, log_likelihood in random_tests(rng, TEAM, 4):
+        posterior.update(*rows(posterior, a, d), log_likelihood)
+    again = Posterior.from_state(json.loads(json.dumps(posterior.to_state())), 0.5, 0.25)
+    assert again.members == posterior.members
+    np.testing.assert_allclose(again.marginals(), posterior.marginals(), rtol=1e-3, atol=1e-6)
+
+
+def test_one_who_leaves_takes_only_its_own_part(rng):
+    posterior, brute = Posterior.of(KINDS, 0.5, 0.25, TEAM), BruteForce(TEAM)
+    for a, d, log_likelihood in random_tests(rng, TEAM, 4):
+        posterior.update(*rows(posterior, a, d), log_likelihood)
+        brute.update(a, d, log_likelihood)
+    posterior.remove("c")
+    assert posterior.members == list("abde")
+    np.testing.assert_allclose(posterior.marginals(), brute.marginals("abde"), atol=1e-12)
+    posterior.add("z", 0.7)
+    np.testing.assert_allclose(posterior.marginals(), [*brute.marginals("abde"), 0.7], atol=1e-12)
+
+
+def test_a_team_comes_and_goes():
+    posterior = Posterior.of(KINDS, 0.5, 0.25, [])
+    for number in range(12):
+        posterior.add(f"v{number}")
+        assert max(map(len, posterior.blocks())) <= (EXACT if number < EXACT else BLOCK)
+        assert posterior.cells(*[posterior.masks(rows(posterior, posterior.members[:1]))] * 2).sum() == pytest.approx(1)
+    for number in range(12):
+        posterior.remove(f"v{number}")
+        if len(posterior.members) <= EXACT:
+            assert len(posterior.blocks()) == 1
+    assert posterior.members == []
+
+
+@pytest.mark.parametrize("size", [6, 7, 8])
+def test_blocks_come_near_the_exact_posterior(size, monkeypatch):
+    team = [f"v{i}" for i in range(size)]
+    rng = np.random.default_rng(size)
+    apart = []
+    for _ in range(20):
+        bad = set(rng.choice(team, 2, replace=False))
+        exact = Posterior.of(1, 0.5, 0.25, team)
+        with monkeypatch.context() as patch:
+            patch.setattr("robosac.defenses.group_testing.posterior.EXACT", 3)
+            patch.setattr("robosac.defenses.group_testing.posterior.BLOCK", 4)
+            cut = Posterior.of(1, 0.5, 0.25, team)
+        assert len(cut.blocks()) > 1
+        for _ in range(12):
+            subset = rng.choice(team, rng.integers(1, 4), replace=False)
+            says = 1.5 if bad & set(subset) else -1.5
+            for posterior in (exact, cut):
+                posterior.update(*rows(posterior, subset, ()), np.array([0.0, 0.0, says, says]))
+        apart.append(np.abs(exact.marginals() - cut.marginals()))
+    assert np.mean(apart) < 0.05
+    assert np.quantile(apart, 0.95) < 0.3
