@@ -7,7 +7,7 @@ from typing import Annotated
 
 import typer
 
-from robosac.cli import audit, benign_scores, compare, convert, evaluate, reproduce, scene, train
+from robosac.cli import audit, benign_scores, calibrate, compare, convert, evaluate, reproduce, scene, train
 
 
 def _show_version(wanted: bool) -> None:
@@ -34,6 +34,7 @@ app.command("evaluate")(evaluate.run)
 app.command("benign-scores")(benign_scores.run)
 app.command("reproduce")(reproduce.run)
 app.command("compare")(compare.run)
+app.command("calibrate")(calibrate.run)
 app.command("convert-checkpoint")(convert.run)
 app.add_typer(audit.app, name="audit")
 

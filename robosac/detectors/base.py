@@ -9,6 +9,7 @@ from __future__ import annotations
 
 from collections.abc import Collection, Mapping
 from dataclasses import dataclass
+from pathlib import Path
 from typing import Any, Literal, Protocol, runtime_checkable
 
 import numpy as np
@@ -49,6 +50,8 @@ class DetectorInfo:
         SHA-256 of the weights file, hexadecimal.
     consensus_score : float
         Boxes from this score on take part in the consensus test.
+    calibration : Path or None
+        The file of likelihoods for group testing that lies beside the weights.
     """
 
     name: str
@@ -57,6 +60,13 @@ class DetectorInfo:
     cell_m: float
     weights_digest: str
     consensus_score: float
+    calibration: Path | None = None
+
+
+def calibration_beside(weights: Path) -> Path | None:
+    """``NAME.calibration.json`` beside the weights ``NAME.safetensors``, if there is one."""
+    path = weights.with_suffix(".calibration.json")
+    return path if path.is_file() else None
 
 
 @dataclass(frozen=True)

@@ -13,7 +13,7 @@ import torch
 from safetensors import safe_open
 
 from robosac.boxes import FloatArray
-from robosac.detectors.base import DetectorInfo, Message, TensorSpec
+from robosac.detectors.base import DetectorInfo, Message, TensorSpec, calibration_beside
 from robosac.detectors.decoding import cell_centres, decode_boxes
 from robosac.detectors.network import FEATURES, MAP, MeanFusionNetwork, fold_batchnorm
 from robosac.detectors.voxels import AREA_M, occupancy
@@ -104,6 +104,7 @@ class EmbeddedDetector:
             score_threshold=_number(self.recipe, "score_threshold", 1.0),
             consensus_score=_number(self.recipe, "consensus_score", 1.0),
             digest=hashlib.sha256(weights.read_bytes()).hexdigest(),
+            calibration=calibration_beside(weights),
         )
 
     @classmethod
@@ -119,7 +120,13 @@ class EmbeddedDetector:
         return detector
 
     def _configure(
-        self, network: MeanFusionNetwork, gain: float, score_threshold: float, consensus_score: float, digest: str
+        self,
+        network: MeanFusionNetwork,
+        gain: float,
+        score_threshold: float,
+        consensus_score: float,
+        digest: str,
+        calibration: Path | None = None,
     ) -> None:
         self._network = network.eval().requires_grad_(False)
         fold_batchnorm(self._network)
@@ -134,6 +141,7 @@ class EmbeddedDetector:
             cell_m=2 * AREA_M / MAP,
             weights_digest=digest,
             consensus_score=consensus_score,
+            calibration=calibration,
         )
 
     @property

@@ -18,7 +18,7 @@ import torch
 from safetensors.torch import save_file
 
 from robosac.boxes import FloatArray
-from robosac.detectors.base import DetectorInfo, Message, TensorSpec
+from robosac.detectors.base import DetectorInfo, Message, TensorSpec, calibration_beside
 from robosac.detectors.embedded import WeightsError, read_weights, tensors_digest
 from robosac.detectors.v2xsim.anchors import SCORE_THRESHOLD, detections, geometry
 from robosac.detectors.v2xsim.fusions import FUSIONS, Fusion
@@ -124,6 +124,7 @@ class V2XSimDetector:
             cell_m=2 * AREA_M / MAP,
             weights_digest=hashlib.sha256(weights.read_bytes()).hexdigest(),
             consensus_score=float(self.recipe.get("consensus_score", SCORE_THRESHOLD)),
+            calibration=calibration_beside(weights),
         )
 
     @property

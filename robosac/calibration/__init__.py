@@ -1,0 +1,18 @@
+"""How a detector is made ready for `robosac.defenses.GroupTesting`: likelihoods of what its tests show."""
+
+from robosac.calibration.fit import TooFewVerdicts, fit
+from robosac.calibration.making import Recipe, ReliabilityBin, calibrate
+from robosac.calibration.shipped import calibration_of
+from robosac.calibration.verdicts import Verdicts, collect, validation_frames
+
+__all__ = [
+    "Recipe",
+    "ReliabilityBin",
+    "TooFewVerdicts",
+    "Verdicts",
+    "calibrate",
+    "calibration_of",
+    "collect",
+    "fit",
+    "validation_frames",
+]

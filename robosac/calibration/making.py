@@ -1,0 +1,162 @@
+"""Calibrate a detector for group testing: collect verdicts, fit likelihoods, check them on scenes held out."""
+
+from __future__ import annotations
+
+from collections.abc import Callable, Iterator, Mapping, Sequence
+from dataclasses import asdict, dataclass
+from itertools import pairwise
+
+import numpy as np
+
+from robosac import attacks
+from robosac.attacks import Attack
+from robosac.calibration.fit import fit
+from robosac.calibration.verdicts import collect, validation_frames
+from robosac.defenses.group_testing import Calibration, EvidenceModel, GroupTesting
+from robosac.detectors import Detector
+from robosac.evaluation.playing import play
+from robosac.evaluation.recordings import RecordedFrame
+from robosac.scenes.splits import VALIDATION_SEEDS
+
+RELIABILITY_EDGES = (0.0, 0.01, 0.05, 0.2, 0.5, 0.8, 0.95, 0.99, 1.0)
+_STREAM = 41
+_CHECK = 1
+
+
+@dataclass(frozen=True)
+class Recipe:
+    """What a calibration is made from.
+
+    Attributes
+    ----------
+    attacks : tuple of str
+        Names of `robosac.attacks.ATTACKS`, or ``module:callable``; each is a kind.
+    attackers : tuple of int
+        Each attack comes with each of these numbers of attackers.
+    scenes, frames_per_scene : int
+        The first validation scenes, and frames of each.
+    check_scenes : int
+        The scenes after them, for the reliability.
+    pose_errors_m : tuple of float
+        Ascending; a level each.
+    seed : int
+    """
+
+    attacks: tuple[str, ...] = ("pgd", "erase")
+    attackers: tuple[int, ...] = (1, 2)
+    scenes: int = 48
+    frames_per_scene: int = 2
+    check_scenes: int = 12
+    pose_errors_m: tuple[float, ...] = (0.0, 0.2, 0.4)
+    seed: int = 0
+
+    def __post_init__(self) -> None:
+        if not self.attacks or not self.attackers or not self.pose_errors_m:
+            raise ValueError("attacks, attackers and pose errors must not be empty")
+        if min(self.attackers) < 1 or min(self.pose_errors_m) < 0:
+            raise ValueError("attackers must be at least 1, pose errors at least 0")
+        if self.scenes < 1 or self.check_scenes < 0 or self.scenes + self.check_scenes > len(VALIDATION_SEEDS):
+            raise ValueError(f"there are {len(VALIDATION_SEEDS)} validation scenes")
+
+    @property
+    def frames_per_level(self) -> int:
+        """Recorded frames of a level, those of the check among them."""
+        moments = (self.scenes + self.check_scenes) * self.frames_per_scene
+        return moments * (1 + len(self.attacks) * len(self.attackers))
+
+
+@dataclass(frozen=True)
+class ReliabilityBin:
+    """Teammates whose suspicion after one frame lay between two bounds.
+
+    Attributes
+    ----------
+    low, high : float
+    teammates : int
+    predicted : float
+        Mean suspicion.
+    observed : float
+        Share that did attack.
+    """
+
+    low: float
+    high: float
+    teammates: int
+    predicted: float
+    observed: float
+
+
+def calibrate(
+    detector: Detector, recipe: Recipe, command: str, tick: Callable[[], None] = lambda: None
+) -> tuple[Calibration, dict[float, list[ReliabilityBin]]]:
+    """Make the calibration of a detector, and its reliability by level of pose error.
+
+    The reliability is that of the suspicion after the first frame of a session, on scenes that the tables were not
+    fitted to; attacks and numbers of attackers are those of the recipe.
+
+    Parameters
+    ----------
+    detector : Detector
+    recipe : Recipe
+    command : str
+        To make it again; kept with it.
+    tick : callable
+        Called after each recorded frame.
+
+    Raises
+    ------
+    ValueError
+        If there is no such attack.
+    robosac.calibration.fit.TooFewVerdicts
+        If the scenes do not show all that is needed.
+    """
+    chosen = {name: attacks.load(name) for name in recipe.attacks}
+    levels: list[EvidenceModel] = []
+    reliability: dict[float, list[ReliabilityBin]] = {}
+    fitted = VALIDATION_SEEDS[: recipe.scenes]
+    held_out = VALIDATION_SEEDS[recipe.scenes : recipe.scenes + recipe.check_scenes]
+    for number, error in enumerate(sorted(recipe.pose_errors_m)):
+
+        def frames(
+            seeds: Sequence[int], *stream: int, error: float = error
+        ) -> Iterator[tuple[str | None, RecordedFrame]]:
+            rng = np.random.default_rng([recipe.seed, _STREAM, *stream])
+            return validation_frames(detector, seeds, recipe.frames_per_scene, chosen, recipe.attackers, error, rng)
+
+        model = fit(collect(frames(fitted, number), tick), recipe.attacks, error)
+        levels.append(model)
+        reliability[error] = check(model, frames(held_out, number, _CHECK), tick)
+    made_by = {
+        "command": command,
+        **asdict(recipe),
+        "attack_settings": {name: _settings(attack) for name, attack in chosen.items()},
+        "reliability": {f"{error:g}": [asdict(b) for b in bins] for error, bins in reliability.items()},
+    }
+    info = detector.info
+    return Calibration(info.name, info.weights_digest, made_by, tuple(levels)), reliability
+
+
+def check(
+    model: EvidenceModel, frames: Iterator[tuple[str | None, RecordedFrame]], tick: Callable[[], None] = lambda: None
+) -> list[ReliabilityBin]:
+    """Suspicion after one frame against the truth."""
+    defense = GroupTesting(model)
+    predicted: list[float] = []
+    attacked: list[bool] = []
+    for index, (_, frame) in enumerate(frames):
+        (result,) = play(defense, [frame], np.random.default_rng(index))
+        for name, suspicion in (result.suspicion or {}).items():
+            predicted.append(suspicion)
+            attacked.append(name in frame.attackers)
+        tick()
+    p, y = np.array(predicted), np.array(attacked)
+    bins = []
+    for low, high in pairwise(RELIABILITY_EDGES):
+        inside = (p >= low) & ((p < high) | (high == 1.0))
+        if inside.any():
+            bins.append(ReliabilityBin(low, high, int(inside.sum()), float(p[inside].mean()), float(y[inside].mean())))
+    return bins
+
+
+def _settings(attack: Attack) -> Mapping[str, float]:
+    return dict(vars(attack))

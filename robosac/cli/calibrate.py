@@ -1,0 +1,95 @@
+"""``robosac calibrate``: make a detector ready for group testing."""
+
+from __future__ import annotations
+
+from pathlib import Path
+from typing import Annotated
+
+import torch
+import typer
+from rich.console import Console
+from rich.progress import BarColumn, MofNCompleteColumn, Progress, TextColumn, TimeElapsedColumn, TimeRemainingColumn
+from rich.table import Table
+
+from robosac import detectors
+from robosac.attacks import ATTACKS
+from robosac.calibration import Recipe, ReliabilityBin, TooFewVerdicts, calibrate
+from robosac.detectors import DEFAULT_DETECTOR
+
+_DEFAULTS = Recipe()
+
+
+def run(
+    out: Annotated[
+        Path,
+        typer.Option(help="The file to write; NAME.calibration.json beside NAME.safetensors is found there."),
+    ],
+    detector: Annotated[str, typer.Option(help="A detector's name, its weights file, or module:callable.")] = (
+        DEFAULT_DETECTOR
+    ),
+    attack: Annotated[
+        list[str] | None, typer.Option(help=f"A kind of attack: one of {', '.join(ATTACKS)}, or module:callable.")
+    ] = None,
+    attackers: Annotated[list[int] | None, typer.Option(min=1, max=5, help="Attackers at a time.")] = None,
+    pose_error: Annotated[
+        list[float] | None, typer.Option(min=0.0, help="Standard deviation of the teammates' positions, metres.")
+    ] = None,
+    scenes: Annotated[int, typer.Option(min=1, help="Validation scenes to fit to.")] = _DEFAULTS.scenes,
+    check_scenes: Annotated[int, typer.Option(min=0, help="Further ones to check on.")] = _DEFAULTS.check_scenes,
+    frames: Annotated[int, typer.Option(min=1, help="Frames of each, 2 s apart.")] = _DEFAULTS.frames_per_scene,
+    seed: Annotated[int, typer.Option(min=0, help="Of everything random.")] = _DEFAULTS.seed,
+) -> None:
+    """Observe what tests show when it is known who attacks, write the likelihoods, and check them.
+
+    Options that may be repeated: --attack (by default pgd and erase), --attackers (1 and 2), --pose-error (0, .2, .4).
+    """
+    torch.set_num_threads(1)
+    console = Console()
+    try:
+        recipe = Recipe(
+            attacks=tuple(attack or _DEFAULTS.attacks),
+            attackers=tuple(attackers or _DEFAULTS.attackers),
+            scenes=scenes,
+            frames_per_scene=frames,
+            check_scenes=check_scenes,
+            pose_errors_m=tuple(sorted(pose_error or _DEFAULTS.pose_errors_m)),
+            seed=seed,
+        )
+        chosen = detectors.load(detector)
+        columns = (BarColumn(), MofNCompleteColumn(), TimeElapsedColumn(), TimeRemainingColumn())
+        with Progress(TextColumn("{task.description}"), *columns, console=console) as progress:
+            task = progress.add_task("frames", total=recipe.frames_per_level * len(recipe.pose_errors_m))
+            calibration, reliability = calibrate(
+                chosen, recipe, command(recipe, detector), lambda: progress.advance(task)
+            )
+        calibration.write(out)
+    except (OSError, ValueError, TooFewVerdicts) as error:
+        console.print(f"[red]{error}[/red]")
+        raise typer.Exit(1) from error
+    for error_m, bins in reliability.items():
+        _print(console, error_m, bins)
+    console.print(f"{out}: {calibration.detector}, weights {calibration.weights_digest:.12}...")
+
+
+def command(recipe: Recipe, detector: str) -> str:
+    """The command that makes this calibration."""
+    parts = ["robosac calibrate --out FILE"]
+    if detector != DEFAULT_DETECTOR:
+        parts.append(f"--detector {detector}")
+    parts += [f"--attack {name}" for name in recipe.attacks]
+    parts += [f"--attackers {count}" for count in recipe.attackers]
+    parts += [f"--pose-error {error:g}" for error in recipe.pose_errors_m]
+    parts.append(f"--scenes {recipe.scenes} --check-scenes {recipe.check_scenes}")
+    parts.append(f"--frames {recipe.frames_per_scene} --seed {recipe.seed}")
+    return " ".join(parts)
+
+
+def _print(console: Console, pose_error_m: float, bins: list[ReliabilityBin]) -> None:
+    table = Table(
+        title=f"Suspicion after one frame, pose error {pose_error_m:g} m, scenes held out", title_justify="left"
+    )
+    for heading in ("suspicion", "teammates", "predicted", "attacked"):
+        table.add_column(heading, justify="right")
+    for b in bins:
+        table.add_row(f"{b.low:g} to {b.high:g}", str(b.teammates), f"{b.predicted:.4f}", f"{b.observed:.4f}")
+    console.print(table)

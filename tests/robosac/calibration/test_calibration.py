@@ -1,0 +1,163 @@
+import json
+from dataclasses import replace
+
+import numpy as np
+import pytest
+from typer.testing import CliRunner
+
+from robosac.boxes import pose_matrix
+from robosac.calibration import Recipe, calibration_of
+from robosac.calibration.making import check
+from robosac.calibration.verdicts import Verdicts
+from robosac.cli import app
+from robosac.defenses import GroupTesting
+from robosac.defenses.group_testing import Calibration, CalibrationError
+from robosac.detectors import DetectorInfo
+from robosac.detectors.embedded import SHIPPED_WEIGHTS, EmbeddedDetector
+from robosac.evaluation.playing import play
+from robosac.evaluation.recordings import RecordedFrame
+from tests.robosac.defenses.group_testing.conversing import SEEN, make_model, shifted
+
+INFO = DetectorInfo("fake", {"ego": {}, "teammate": {}}, (-32, -32, 32, 32), 2.0, "0", 0.5)
+
+
+def recorded(attackers=()):
+    team = ("a", "b", "c")
+    subsets = [(), ("a",), ("b",), ("c",), ("a", "b"), ("a", "c"), ("b", "c"), team]
+    boxes = {frozenset(s): shifted(s) if set(attackers) & set(s) else SEEN for s in subsets}
+    return RecordedFrame(INFO, pose_matrix(0, 0, 0, 0), team, frozenset(attackers), SEEN[:, :5], boxes)
+
+
+def test_verdicts_of_an_honest_frame_are_all_counted():
+    verdicts = Verdicts()
+    verdicts.add(recorded(), None)
+    assert sum(verdicts.jaccard.values()) == 7
+    assert sum(verdicts.pairs.values()) == 12
+    assert {cell for _, cell, *_ in verdicts.pairs} == {0}
+
+
+def test_of_an_attacked_frame_what_the_attacker_is_part_of():
+    verdicts = Verdicts()
+    verdicts.add(recorded(["a"]), "pgd")
+    assert sum(verdicts.jaccard.values()) == 4
+    cells = {cell: sum(n for (_, c, *_), n in verdicts.pairs.items() if c == cell) for cell in (0, 1, 2, 3)}
+    assert cells == {0: 0, 1: 5, 2: 5, 3: 0}
+    assert {kind for kind, *_ in verdicts.pairs} == {"pgd"}
+
+
+def test_a_calibration_survives_a_file(tmp_path):
+    model = make_model()
+    calibration = Calibration("x", "0" * 64, {"command": "none"}, (model, replace(model, pose_error_m=0.2)))
+    calibration.write(tmp_path / "x.json")
+    again = Calibration.read(tmp_path / "x.json")
+    assert (again.detector, again.weights_digest, again.recipe) == ("x", "0" * 64, {"command": "none"})
+    for before, after in zip(calibration.levels, again.levels, strict=True):
+        assert after.kinds == before.kinds
+        np.testing.assert_allclose(after.pairs, before.pairs, atol=1e-5)
+        np.testing.assert_allclose(after.jaccard, before.jaccard, atol=1e-5)
+    assert again.at(0.0).pose_error_m == 0.0
+    assert again.at(0.1).pose_error_m == 0.2
+    with pytest.raises(CalibrationError, match=r"up to a pose error of 0\.2 m, 0\.3 m is asked for"):
+        again.at(0.3)
+
+
+@pytest.mark.parametrize("damage", ["not json", "{}", '{"format": 2}', "[1]", "wrong shape", "negative"])
+def test_a_damaged_calibration_is_refused(tmp_path, damage):
+    path = tmp_path / "x.json"
+    Calibration("x", "0", {}, (make_model(),)).write(path)
+    content = json.loads(path.read_text())
+    if damage == "wrong shape":
+        content["levels"][0]["kinds"].append("more")
+        damage = json.dumps(content)
+    elif damage == "negative":
+        content["levels"][0]["jaccard"][0][0][0] = -1.0
+        damage = json.dumps(content)
+    path.write_text(damage)
+    with pytest.raises(CalibrationError, match="is no calibration"):
+        Calibration.read(path)
+
+
+def test_a_detector_without_calibration_says_so(tmp_path):
+    with pytest.raises(CalibrationError, match="fake is not calibrated"):
+        calibration_of(INFO)
+    weights = tmp_path / "copy.safetensors"
+    weights.write_bytes(SHIPPED_WEIGHTS.read_bytes())
+    assert EmbeddedDetector(weights).info.calibration is None
+    beside = tmp_path / "copy.calibration.json"
+    Calibration("intersection-mean", "f" * 64, {}, (make_model(),)).write(beside)
+    info = EmbeddedDetector(weights).info
+    assert info.calibration == beside
+    with pytest.raises(CalibrationError, match="belongs to weights with the digest ffffffffffff"):
+        calibration_of(info)
+
+
+def test_the_shipped_detector_is_calibrated(detector):
+    calibration = calibration_of(detector.info)
+    assert calibration.weights_digest == detector.info.weights_digest
+    assert calibration.recipe["scenes"] >= 40
+    assert [level.pose_error_m for level in calibration.levels] == sorted(calibration.recipe["pose_errors_m"])
+    sure = [b for b in calibration.recipe["reliability"]["0"] if b["low"] >= 0.99 or b["high"] <= 0.01]
+    assert all(abs(b["predicted"] - b["observed"]) < 0.05 for b in sure)
+
+
+def test_the_shipped_detector_finds_an_attacker(detector, ego_message, attacked):
+    defense = GroupTesting.calibrated(calibration_of(detector.info))
+    frame = _Live(detector, ego_message, attacked)
+    results = play(defense, [frame] * 3, np.random.default_rng(0))
+    assert all("car-2" not in r.accepted for r in results)
+    assert results[-1].suspicion["car-2"] > 0.95
+    assert max(p for name, p in results[-1].suspicion.items() if name != "car-2") < 0.2
+
+
+class _Live:
+    """A frame that is decoded when asked for."""
+
+    def __init__(self, detector, ego, teammates):
+        self.info, self.ego, self.teammates = detector.info, ego, teammates
+        self.team = tuple(sorted(teammates))
+        self._detector = detector
+
+    def prepare(self, ego, teammates):
+        return self._detector.prepare(ego, teammates)
+
+
+def test_reliability_compares_suspicion_with_the_truth():
+    frames = [(None, recorded()), ("pgd", recorded(["a"])), ("pgd", recorded(["b", "c"]))] * 4
+    bins = check(make_model(), iter(frames))
+    assert sum(b.teammates for b in bins) == 36
+    assert bins[0].observed == 0.0
+    assert bins[-1].observed == 1.0
+    assert all(b.low <= b.predicted <= b.high for b in bins)
+
+
+@pytest.mark.parametrize(
+    "settings",
+    [
+        {"attacks": ()},
+        {"attackers": (0,)},
+        {"pose_errors_m": (-0.1,)},
+        {"scenes": 0},
+        {"scenes": 999, "check_scenes": 2},
+    ],
+)
+def test_recipes_that_cannot_be(settings):
+    with pytest.raises(ValueError, match=r"must|there are"):
+        Recipe(**settings)
+
+
+def test_the_command_writes_a_calibration(tmp_path):
+    out = tmp_path / "x.json"
+    arguments = ["--scenes", "1", "--check-scenes", "1", "--frames", "1", "--pose-error", "0", "--attack", "noise"]
+    result = CliRunner().invoke(app, ["calibrate", "--out", str(out), *arguments])
+    assert result.exit_code == 0, result.output
+    assert "scenes held out" in " ".join(result.output.split())
+    calibration = Calibration.read(out)
+    assert calibration.levels[0].kinds == ("noise", "open")
+    assert "--attack noise" in calibration.recipe["command"]
+    assert calibration.recipe["reliability"]["0"]
+
+
+def test_the_command_names_an_unknown_attack(tmp_path):
+    result = CliRunner().invoke(app, ["calibrate", "--out", str(tmp_path / "x.json"), "--attack", "nonesuch"])
+    assert result.exit_code == 1
+    assert "unknown attack 'nonesuch'" in " ".join(result.output.split())
