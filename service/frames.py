@@ -349,6 +349,7 @@ def _frame_result(
         ],
         "sampling_steps": result.sampling_steps,
         "attacker_ratio": result.attacker_ratio,
+        "suspicion": None if result.suspicion is None else dict(result.suspicion),
         "deadline_met": result.deadline_met,
         "degraded_by": degraded_by,
         "timings_ms": {stage: round(milliseconds, 3) for stage, milliseconds in timings.items()},

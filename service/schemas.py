@@ -17,10 +17,18 @@ from pydantic import (
 )
 
 from robosac.budget import DEFAULT_CONFIDENCE
+from robosac.calibration import calibration_of
 from robosac.consensus import DEFAULT_THRESHOLD
 from robosac.defenses import Defense, Reference, build
 from robosac.defenses.a2cp import DEFAULT_BUDGET as DEFAULT_A2CP_BUDGET
 from robosac.defenses.conformal import DEFAULT_RATE
+from robosac.defenses.group_testing import DEFAULT_HAZARDS
+from robosac.defenses.group_testing.defense import (
+    DEFAULT_FIRST_BUDGET,
+    DEFAULT_LATER_BUDGET,
+    DEFAULT_NAMING_BOUND,
+    DEFAULT_POSE_ERROR_M,
+)
 from robosac.defenses.static_team import DEFAULT_RECHECK
 from robosac.detectors import DetectorInfo
 from robosac.signatures import read_public_key
@@ -33,9 +41,15 @@ class _Request(BaseModel):
 
 
 class _DefenseSettings(_Request):
-    def build(self) -> Defense:
-        """The defence itself."""
-        return build(self.model_dump(mode="json"))
+    def build(self, detector: DetectorInfo) -> Defense:
+        """The defence itself, for a detector.
+
+        Raises
+        ------
+        robosac.budget.DomainError
+            If the settings contradict each other, or the detector lacks the calibration that the defence needs.
+        """
+        return build(self.model_dump(mode="json"), lambda: calibration_of(detector))
 
 
 class _SamplingSettings(_DefenseSettings):
@@ -113,17 +127,55 @@ class UndefendedSettings(_DefenseSettings):
     kind: Literal["none"]
 
 
+class GroupTestingSettings(_DefenseSettings):
+    """Bayesian group testing with memory: finds attackers of an unknown number, and names them."""
+
+    kind: Literal["group_testing"]
+    attack_prior: float = Field(0.5, gt=0, lt=1, description="Probability beforehand that anybody attacks.")
+    attacker_prior: float = Field(
+        0.25, gt=0, lt=1, description="Probability of each teammate to attack if anybody does."
+    )
+    hijack: float = Field(
+        DEFAULT_HAZARDS.hijack, ge=0, le=0.5, description="Per frame, that a benign teammate becomes an attacker."
+    )
+    recovery: float = Field(
+        DEFAULT_HAZARDS.recovery, ge=0, le=0.5, description="Per frame, that an attacker becomes benign."
+    )
+    kind_change: float = Field(
+        DEFAULT_HAZARDS.change, ge=0, le=0.5, description="Per frame, that the kind of attack changes."
+    )
+    first_budget: int = Field(DEFAULT_FIRST_BUDGET, ge=1, le=10_000, description="Most hypotheses in the first frame.")
+    budget: int = Field(DEFAULT_LATER_BUDGET, ge=1, le=10_000, description="Most hypotheses in each later frame.")
+    naming_bound: float = Field(
+        DEFAULT_NAMING_BOUND, ge=0.5, lt=1, description="Probability above which an attacker is named."
+    )
+    consensus_threshold: float = Field(DEFAULT_THRESHOLD, gt=0, le=1, description="Jaccard index of a consensus.")
+    pose_error_m: float = Field(
+        DEFAULT_POSE_ERROR_M, ge=0, description="Standard deviation of the teammates' positions to expect, metres."
+    )
+
+
 DefenseSettings = Annotated[
     SampleConsensusSettings
     | StaticTeamSettings
     | A2CPSettings
+    | GroupTestingSettings
     | HalvingSettings
     | OneByOneSettings
     | ConformalSettings
     | UndefendedSettings,
     Field(discriminator="kind"),
 ]
-DEFENSE_KINDS = ("sample_consensus", "static_team", "a2cp", "halving", "one_by_one", "conformal", "none")
+DEFENSE_KINDS = (
+    "sample_consensus",
+    "static_team",
+    "a2cp",
+    "group_testing",
+    "halving",
+    "one_by_one",
+    "conformal",
+    "none",
+)
 read_defense = TypeAdapter[DefenseSettings](DefenseSettings).validate_python
 """Settings of a defence from what a session keeps of them."""
 
@@ -275,6 +327,9 @@ class SessionState(BaseModel):
     last_frame: int | None
     frames_answered: int
     state: dict[str, Any] = Field(description="What the defence remembers between frames.")
+    suspicion: dict[str, float] | None = Field(
+        None, description="Probability that each teammate attacks, where the defence knows it."
+    )
     audit_seq: int = Field(description="Number of the latest audit record.")
     audit_head: str = Field(description="SHA-256 of the latest audit record: with it a cut-off log is found out.")
     next_seed_commitment: str = Field(description="SHA-256 of the seed of the next frame's draws.")
@@ -328,6 +383,9 @@ class FrameResult(BaseModel):
     hypotheses: list[TestedHypothesis]
     sampling_steps: int
     attacker_ratio: float | None
+    suspicion: dict[str, float] | None = Field(
+        None, description="Probability that each teammate attacks, where the defence knows it."
+    )
     deadline_met: bool
     degraded_by: Literal["deadline", "fault"] | None = Field(description="What cut the defence short, if anything.")
     timings_ms: dict[str, float]

@@ -90,7 +90,7 @@ class Sessions:
         detector = self._detector(self._settings.detector if request.detector is None else request.detector)
         self._check_size(request.teammates)
         try:
-            defense = request.defense.build()
+            defense = request.defense.build(detector.info)
             defense.check_team(len(request.teammates))
         except DomainError as error:
             raise Problem(422, "impossible-defense", str(error), "defense") from error
@@ -252,6 +252,7 @@ class Sessions:
             last_frame=record.last_frame,
             frames_answered=record.frames_answered,
             state=dict(record.state),
+            suspicion=record.state.get("suspicion"),
             audit_seq=record.audit_seq,
             audit_head=record.audit_head,
             next_seed_commitment=commitment(record.seed),
@@ -365,10 +366,10 @@ class Sessions:
 
     def _revive(self, record: SessionRecord) -> LiveSession:
         closed = -1 if record.last_frame is None else record.last_frame
-        settings = self._settings
+        settings, detector = self._settings, self._detector(record.detector)
         return LiveSession(
-            self._detector(record.detector),
-            read_defense(record.defense).build(),
+            detector,
+            read_defense(record.defense).build(detector.info),
             record.teammates,
             Gathering(record.teammates, settings.max_pending_frames, self.backlog, closed),
             Motion(settings.max_speed_mps, record.frame_period_ms / 1e3, settings.max_range_m),

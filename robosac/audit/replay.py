@@ -13,6 +13,7 @@ import numpy as np
 
 from robosac import wire
 from robosac.audit.records import FrameAnswered, RecordError, SessionOpened, TeamChanged, read
+from robosac.calibration import calibration_of
 from robosac.defenses import Conversation, Decision, Defense, Outcome, State, build
 from robosac.detectors import Message, Preparer
 from robosac.fusion import FusionResult, fuse
@@ -186,7 +187,7 @@ def _compare_digests(logged: FrameAnswered, messages: dict[str, Message]) -> lis
 
 def _fuse(decision: LoggedDecision, messages: dict[str, Message], detector: Preparer) -> FusionResult:
     try:
-        defense = _Counted(build(decision.session.defense))
+        defense = _Counted(build(decision.session.defense, lambda: calibration_of(detector.info)))
     except ValueError as error:
         raise ReplayError(f"the log's settings make no defence: {error}") from error
     logged, ego_id = decision.answer, decision.session.ego_id

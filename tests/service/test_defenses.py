@@ -1,6 +1,7 @@
 import pytest
 
 from robosac import wire
+from robosac.detectors.embedded import SHIPPED_WEIGHTS
 from tests.service.conftest import TEAM, problem, serve
 
 
@@ -83,6 +84,10 @@ async def test_without_a_defence_everybody_is_fused(served, ego_message, attacke
         ({"kind": "none", "sampling_budget": 3}, "defense.sampling_budget", "invalid-request"),
         ({"kind": "sample_consensus", "reference": "next"}, "defense.reference", "invalid-request"),
         ({"attacker_ratio": 0.2}, "defense", "invalid-request"),
+        ({"kind": "group_testing", "sampling_budget": 3}, "defense.sampling_budget", "invalid-request"),
+        ({"kind": "group_testing", "naming_bound": 1.0}, "defense.naming_bound", "invalid-request"),
+        ({"kind": "group_testing", "hijack": 0.6}, "defense.hijack", "invalid-request"),
+        ({"kind": "group_testing", "pose_error_m": 9.0}, "defense", "impossible-defense"),
     ],
 )
 async def test_settings_of_a_defence_are_checked(served, defense, field, slug):
@@ -158,3 +163,39 @@ async def test_impossible_changes_of_the_team_are_refused_and_change_nothing(ser
     problem(await dismiss(served, session, "nobody"), 404, "unknown-teammate")
     problem(await dismiss(served, session, "rsu", session.teammate_tokens["car-2"]), 403, "ego-only")
     assert (await served.ego(session).state())["teammates"] == list(TEAM)
+
+
+async def test_group_testing_names_the_attacker_and_tells_its_suspicion(served, ego_message, attacked):
+    session = await served.open(defense={"kind": "group_testing"})
+    ego = served.ego(session)
+    path = f"/v1/sessions/{session.session_id}"
+    bearer = {"Authorization": f"Bearer {session.ego_token}"}
+    answers = await run(served, session, ego_message, attacked, 4)
+    assert all("car-2" not in answer.accepted for answer in answers)
+    last = answers[-1].rejected["car-2"]
+    assert last["reason"] == "distrusted"
+    assert {item["test"] for item in last["evidence"]} <= {"jaccard", "pair"}
+    body = wire.pack_frame(9, ego_message, attacked)
+    result = (await served.post(session, "frames", body)).json()
+    state = (await served.http.get(path, headers=bearer)).json()
+    assert set(result["suspicion"]) == set(TEAM)
+    assert result["suspicion"]["car-2"] > 0.99
+    assert state["suspicion"] == pytest.approx(result["suspicion"], abs=1e-5)
+    assert state["state"]["named"] == ["car-2"]
+    assert (await ego.state())["defense"]["budget"] == 4
+
+
+async def test_other_defences_have_no_suspicion(served, ego_message, benign):
+    session = await served.open()
+    result = (await served.post(session, "frames", wire.pack_frame(0, ego_message, benign))).json()
+    assert result["suspicion"] is None
+
+
+async def test_a_detector_without_calibration_cannot_test_groups(tmp_path):
+    weights = tmp_path / "bare.safetensors"
+    weights.write_bytes(SHIPPED_WEIGHTS.read_bytes())
+    async with serve(extra_detectors=str(weights)) as served:
+        request = {"ego_id": "a", "teammates": ["b"], "defense": {"kind": "group_testing"}}
+        fields = problem(await served.http.post("/v1/sessions", json=request), 422, "impossible-defense")
+    assert "not calibrated" in fields["detail"]
+    assert fields["field"] == "defense"
