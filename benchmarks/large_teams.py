@@ -71,16 +71,18 @@ def main(teammates: int = 20, attackers: int = 4, kind: str = "pgd", runs: int =
         judging.measure = world.measure  # type: ignore[assignment]
         state, spent, done = defense.initial_state(team), 0, None
         for _ in range(frames):
-            started, before = time.process_time(), spent
+            before, deciding, tested = spent, 0.0, None
             conversation = defense.converse(team, state, rng)
             try:
-                batch = next(conversation)
                 while True:
+                    started = time.perf_counter()
+                    batch = conversation.send(tested)
+                    deciding += time.perf_counter() - started
                     spent += 1
-                    batch = conversation.send([world.outcome(batch[0])])
+                    tested = [world.outcome(batch[0])]
             except StopIteration as stop:
                 state = stop.value.state
-            seconds.append(time.process_time() - started)
+            seconds.append(deciding + time.perf_counter() - started)
             passes.append(spent - before)
             honest |= {(run, name) for name in state["named"] if name not in bad}
             if done is None and bad <= set(state["named"]):

@@ -30,7 +30,6 @@ ANSWERS = 4
 WITNESSES = 3
 """Trusted teammates that unresolved ones are added to in a larger team."""
 _CERTAIN = 1e-12
-_TINY = 1e-300
 
 
 def gain(sizes: FloatArray | IntArray) -> FloatArray:
@@ -44,23 +43,6 @@ def utility(posterior: Posterior, subsets: BoolArray) -> FloatArray:
     clean = posterior.unattacked(posterior.masks(subsets))
     worth: FloatArray = clean * gain(subsets.sum(axis=1)) - (1.0 - clean) * HARM
     return worth
-
-
-def information(tables: FloatArray, cells: FloatArray) -> FloatArray:
-    """Mutual information (n,), bits, between outcomes and what is true.
-
-    Parameters
-    ----------
-    tables : (n, rows, bins) ndarray
-        Probability of each outcome, by what is true.
-    cells : (n, rows) ndarray
-        Probability of what is true.
-    """
-    mixed = (cells[:, None] @ tables)[:, 0]
-    surprise = -(tables * np.log2(tables)).sum(axis=2)
-    expected = -(mixed * np.log2(np.maximum(mixed, _TINY))).sum(axis=1)
-    bits: FloatArray = np.maximum(expected - (cells * surprise).sum(axis=1), 0.0)
-    return bits
 
 
 def candidates(posterior: Posterior, present: BoolArray, decoded: BoolArray) -> BoolArray:
@@ -153,7 +135,7 @@ def expected_information(
     if ego_sees:
         cells = posterior.cells(masks, [np.zeros_like(mask) for mask in masks])
         once = memory.weights(keys(subset_keys, np.zeros_like(subset_keys)), JACCARD_REPEAT)
-        bits += once * information(model.jaccard_tables(sizes), cells) * dilution(sizes)
+        bits += once * model.jaccard_information(sizes, cells) * dilution(sizes)
     best = np.zeros(len(subsets))
     for other in decoded:
         above, below = (subsets >= other).all(axis=1), (subsets <= other).all(axis=1)
@@ -164,8 +146,8 @@ def expected_information(
         d = (subsets[paired] | other) & ~a
         cells = posterior.cells(posterior.masks(a), posterior.masks(d))
         once = memory.weights(keys(a @ identities, d @ identities), PAIR_REPEAT)
-        tables = model.pair_tables(a.sum(axis=1), d.sum(axis=1))
-        worth = once * information(tables, cells) * dilution((a | d).sum(axis=1))
+        told = model.pair_information(a.sum(axis=1), d.sum(axis=1), cells)
+        worth = once * told * dilution((a | d).sum(axis=1))
         best[paired] = np.maximum(best[paired], worth)
     return bits + best
 

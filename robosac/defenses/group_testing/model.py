@@ -101,21 +101,60 @@ class EvidenceModel:
 
     @cached_property
     def by_size(self) -> FloatArray:
-        """The pair tables (WITNESS_SIZES, JOINING_SIZES, 1 + 3 K, bins)."""
-        tables: FloatArray = np.ascontiguousarray(np.moveaxis(self.pairs, 0, 2))
-        return tables
+        """The pair tables (WITNESS_SIZES * JOINING_SIZES, 1 + 3 K, bins)."""
+        tables = np.moveaxis(self.pairs, 0, 2).reshape(-1, len(self.pairs), self.pairs.shape[-1])
+        return np.ascontiguousarray(tables)
+
+    @cached_property
+    def entropies(self) -> tuple[FloatArray, FloatArray]:
+        """Entropy of each row of `as_cells` and of `by_size`, bits."""
+        of_index, of_pair = (-(tables * np.log2(tables)).sum(axis=-1) for tables in (self.as_cells, self.by_size))
+        return of_index, of_pair
 
     def jaccard_tables(self, sizes: IntArray) -> FloatArray:
         """Tables (n, 1 + 3 K, JACCARD_BINS) for subsets of these sizes (n,)."""
-        tables: FloatArray = self.as_cells[np.minimum(sizes, SIZES) - 1]
+        tables: FloatArray = self.as_cells[_size_row(sizes)]
         return tables
 
     def pair_tables(self, witnesses: IntArray, joining: IntArray) -> FloatArray:
         """Tables (n, 1 + 3 K, bins) for pairs of these sizes (n,) and (n,), each at least 1."""
-        tables: FloatArray = self.by_size[
-            np.minimum(witnesses, WITNESS_SIZES) - 1, np.minimum(joining, JOINING_SIZES) - 1
-        ]
+        tables: FloatArray = self.by_size[_pair_row(witnesses, joining)]
         return tables
+
+    def jaccard_information(self, sizes: IntArray, cells: FloatArray) -> FloatArray:
+        """Bits (n,) that the Jaccard index of subsets of these sizes (n,) promises about what is true.
+
+        Parameters
+        ----------
+        sizes : (n,) int ndarray
+        cells : (n, 1 + 3 K) ndarray
+            Probability of what is true.
+        """
+        return _information(self.as_cells, self.entropies[0], _size_row(sizes), cells)
+
+    def pair_information(self, witnesses: IntArray, joining: IntArray, cells: FloatArray) -> FloatArray:
+        """The same of pairs of these sizes (n,) and (n,)."""
+        return _information(self.by_size, self.entropies[1], _pair_row(witnesses, joining), cells)
+
+
+def _size_row(sizes: IntArray) -> IntArray:
+    row: IntArray = np.minimum(sizes, SIZES) - 1
+    return row
+
+
+def _pair_row(witnesses: IntArray, joining: IntArray) -> IntArray:
+    row: IntArray = (np.minimum(witnesses, WITNESS_SIZES) - 1) * JOINING_SIZES + np.minimum(joining, JOINING_SIZES) - 1
+    return row
+
+
+def _information(tables: FloatArray, entropies: FloatArray, which: IntArray, cells: FloatArray) -> FloatArray:
+    """Mutual information (n,): the entropy of the outcome less what is left of it once the truth is known."""
+    bits = np.empty(len(which))
+    for index in np.unique(which):
+        rows = which == index
+        mixed = cells[rows] @ tables[index]
+        bits[rows] = -(mixed * np.log2(mixed)).sum(axis=1) - cells[rows] @ entropies[index]
+    return np.maximum(bits, 0.0)
 
 
 @dataclass(frozen=True)

@@ -134,7 +134,8 @@ class Posterior:
         Column 0: no attacker in either; then for each kind: one in d only, in a only, in both.
         """
         in_a, in_d = self._all_clean(a), self._all_clean(d)
-        both = self._all_clean([x | y for x, y in zip(a, d, strict=True)])
+        alone = not any(mask.any() for mask in d)
+        both = in_a if alone else self._all_clean([x | y for x, y in zip(a, d, strict=True)])
         q = self._weights[1:, None]
         n = both.shape[1]
         attacked = np.stack([in_a - both, in_d - both, 1 - in_a - in_d + both], axis=1) * q[..., None]  # (K, 3, n)
@@ -156,17 +157,16 @@ class Posterior:
         by_kind = likelihood[1:].reshape(self._kinds, CELLS)
         nothing, d_only, a_only, in_both = likelihood[0], by_kind[:, 0], by_kind[:, 1], by_kind[:, 2]
         of_a, of_d = ([int(mask[0]) for mask in self.masks(subset[None])] for subset in (a, d))
+        touched = [b for b, (x, y) in enumerate(zip(of_a, of_d, strict=True)) if x | y]
         clean = self._clean_tables()
-        a_each = [z[:, x] for z, x in zip(clean, of_a, strict=True)]
-        d_each = [z[:, y] for z, y in zip(clean, of_d, strict=True)]
-        both_each = [z[:, x | y] for z, x, y in zip(clean, of_a, of_d, strict=True)]
+        a_each = [clean[b][:, of_a[b]] for b in touched]
+        d_each = [clean[b][:, of_d[b]] for b in touched]
+        both_each = [clean[b][:, of_a[b] | of_d[b]] for b in touched]
         evidence = np.ones(self._kinds)
         tables = list(self._tables)
-        for b, table in enumerate(self._tables):
-            x, y = of_a[b], of_d[b]
-            if not x | y:
-                continue
-            a_else, d_else, both_else = (sets.product_but(each, b) for each in (a_each, d_each, both_each))
+        for index, b in enumerate(touched):
+            x, y, table = of_a[b], of_d[b], self._tables[b]
+            a_else, d_else, both_else = (sets.product_but(each, index) for each in (a_each, d_each, both_each))
             states = np.arange(table.shape[1])
             a_clean, d_clean = states & x == 0, states & y == 0
             expected = np.empty_like(table)
@@ -272,7 +272,7 @@ class Posterior:
         product = np.ones((self._kinds, len(masks[0]) if masks else 1))
         for table, mask in zip(self._clean_tables(), masks, strict=True):
             if mask.any():
-                product *= table[:, mask]
+                product *= table.take(mask, axis=1)
         return product
 
     def _clean_tables(self) -> list[FloatArray]:
