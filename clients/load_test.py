@@ -40,6 +40,8 @@ from robosac.scenes import FRAME_PERIOD_S, IntersectionScene
 
 PREPARED_FRAMES = 20
 WARM_UP_FRAMES = 3
+REFUSED_WAIT_S = 0.05
+"""How long an ego waits after a frame that was refused."""
 DEFENSE = {"kind": "sample_consensus", "attacker_ratio": 0.2, "sampling_budget": 7, "collaborators": 3}
 
 
@@ -188,6 +190,7 @@ async def _post(ego: VehicleClient, body: bytes, figures: Figures, due: float, b
         answer = await ego.post_frame_body(body)
     except GatewayError as error:
         figures.errors[type(error).__name__] += 1
+        await asyncio.sleep(REFUSED_WAIT_S)
     else:
         figures.add(answer, (time.perf_counter() - due) * 1e3, budget_ms)
 

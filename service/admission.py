@@ -11,7 +11,7 @@ from starlette.types import ASGIApp, Receive, Scope, Send
 
 from service.problems import Problem
 
-SHARE = 0.7
+SHARE = 0.6
 """Part of a frame's budget that the frames before it may take."""
 SESSION_FRAMES = 3
 """Frames of one session in hand or waiting at a time, so that no ego takes the others' share."""
@@ -23,8 +23,10 @@ _FRAMES_PATH = re.compile(r"/v1/sessions/([^/]+)/frames")
 class Admission:
     """Counts the frames in hand and estimates from the latest what one costs.
 
-    A frame is admitted if the work before it and its own are expected to end within `SHARE` of its budget. Of frames
-    that wait for their teammates the wait is not work, but they count, since they may all wake at once.
+    A frame is admitted if the work before it and its own are expected to end within `SHARE` of its budget. What a frame
+    costs is the time from the moment that it could be worked on, or from the end of the frame before it if that was
+    later, to its own end: under load, the inverse of the throughput. Frames that wait for their teammates count as
+    frames in hand, since they may all wake at once.
     """
 
     def __init__(self) -> None:
@@ -33,6 +35,7 @@ class Admission:
         self._frames = 0
         self._by_session: dict[str, int] = {}
         self._cost_s = FIRST_GUESS_S
+        self._last_end = 0.0
 
     def check(self, session_id: str, budget_s: float) -> None:
         """Refuse a frame that is not expected to be answered in time.
@@ -62,9 +65,18 @@ class Admission:
             if not self._by_session[session_id]:
                 del self._by_session[session_id]
 
-    def learn(self, cost_s: float, store_s: float) -> None:
-        """Take into account what a frame has cost in all, waiting left out, and what keeping its decision has."""
-        self._cost_s += SMOOTHING * (cost_s - self._cost_s)
+    def learn(self, start: float, end: float, store_s: float) -> None:
+        """Take a frame into account.
+
+        Parameters
+        ----------
+        start, end : float
+            When it could be worked on, and when it was done; seconds on one clock.
+        store_s : float
+            What keeping its decision cost.
+        """
+        self._cost_s += SMOOTHING * (end - max(start, self._last_end) - self._cost_s)
+        self._last_end = end
         self.store_s += SMOOTHING * (store_s - self.store_s)
 
 

@@ -44,10 +44,6 @@ _REFUSALS = {
 }
 
 
-_WORK = ("receive", "prepare", "ego_only", "hypotheses", "consensus", "store")
-"""Stages in which the gateway works on a frame, instead of waiting."""
-
-
 class _Forged(Exception):
     """A message of a vehicle that signs, without its signature."""
 
@@ -280,8 +276,9 @@ class Frames:
             unlogged=live.unlogged(),
         )
         await self._sessions.decide(record, frame, result.state, event, self._to_keep(frame, ego, present))
-        timings["store"] = (time.perf_counter() - arrived) * 1e3 - timings["total"]
-        self._admission.learn(sum(timings[stage] for stage in _WORK) / 1e3, timings["store"] / 1e3)
+        done = time.perf_counter()
+        timings["store"] = (done - arrived) * 1e3 - timings["total"]
+        self._admission.learn(arrived + timings.get("gather", 0.0) / 1e3, done, timings["store"] / 1e3)
         live.answered, live.previous, live.ego_digest = frame, result.previous, ego.digest
         for name, received in {record.ego_id: ego, **present}.items():
             live.motion.moved(name, frame, received.message.pose)

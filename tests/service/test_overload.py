@@ -1,4 +1,5 @@
 import asyncio
+from contextlib import ExitStack
 
 import pytest
 
@@ -10,8 +11,8 @@ from tests.service.conftest import EGO, problem, serve
 
 def test_frames_are_admitted_as_long_as_they_can_be_answered_in_time():
     admission = Admission()
-    for _ in range(200):
-        admission.learn(0.010, 0.001)
+    for number in range(200):
+        admission.learn(number, number + 0.010, 0.001)
     taken = []
 
     def take_on_until_refused():
@@ -22,7 +23,7 @@ def test_frames_are_admitted_as_long_as_they_can_be_answered_in_time():
 
     with pytest.raises(Problem) as refused:
         take_on_until_refused()
-    assert 10 <= len(taken) <= 14  # 0.7 x 200 ms / 10 ms
+    assert 10 <= len(taken) <= 12  # 0.6 x 200 ms / 10 ms
     assert (refused.value.status, refused.value.slug) == (503, "overloaded")
     assert int(refused.value.headers["Retry-After"]) >= 1
     with admission.frame("more time", 20.0):
@@ -32,10 +33,20 @@ def test_frames_are_admitted_as_long_as_they_can_be_answered_in_time():
         pass
 
 
+def test_frames_that_overlap_cost_what_each_adds():
+    """Each takes 40 ms from its arrival to its end, but one ends every 10 ms."""
+    admission = Admission()
+    for number in range(400):
+        admission.learn(0.01 * number, 0.01 * number + 0.04, 0.0)
+    with ExitStack() as taken:
+        for number in range(10):
+            taken.enter_context(admission.frame(f"session {number}", 0.2))
+
+
 def test_a_frame_that_cannot_be_in_time_anyway_is_admitted_if_nothing_else_is_in_hand():
     admission = Admission()
-    for _ in range(200):
-        admission.learn(1.0, 0.001)
+    for number in range(200):
+        admission.learn(2.0 * number, 2.0 * number + 1.0, 0.001)
     with admission.frame("slow", 0.1), pytest.raises(Problem):
         admission.check("other", 0.1)
 
@@ -55,8 +66,8 @@ async def test_no_ego_takes_the_share_of_the_others(served, good_frame, messages
 async def test_beyond_capacity_a_frame_is_refused_before_it_is_read(served, good_frame):
     session = await served.open(latency_budget_ms=200.0, gather_ms=0)
     admission = served.gateway.admission
-    for _ in range(200):
-        admission.learn(0.1, 0.0)
+    for number in range(200):
+        admission.learn(number - 1000, number - 1000 + 0.1, 0.0)
 
     async def unread():
         pytest.fail("the body was read")
