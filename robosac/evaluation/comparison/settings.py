@@ -6,7 +6,18 @@ from collections.abc import Callable, Mapping
 from dataclasses import dataclass
 
 from robosac.attacks import HONEST
-from robosac.defenses import A2CP, Conformal, Defense, Halving, OneByOne, SampleConsensus, StaticTeam, Undefended
+from robosac.calibration import calibration_of
+from robosac.defenses import (
+    A2CP,
+    Conformal,
+    Defense,
+    GroupTesting,
+    Halving,
+    OneByOne,
+    SampleConsensus,
+    StaticTeam,
+    Undefended,
+)
 from robosac.detectors import Detector
 
 DEFENSES: Mapping[str, Callable[[Detector], Defense]] = {
@@ -14,6 +25,8 @@ DEFENSES: Mapping[str, Callable[[Detector], Defense]] = {
     "sample_consensus": lambda _: SampleConsensus(0.2, sampling_budget=7, collaborators=3),
     "static_team": lambda _: StaticTeam(0.2, sampling_budget=7, collaborators=3),
     "a2cp": lambda _: A2CP(),
+    "group_testing": lambda detector: GroupTesting.calibrated(calibration_of(detector.info), pose_error_m=0.0),
+    "group_testing, expecting .2 m": lambda detector: GroupTesting.calibrated(calibration_of(detector.info)),
     "halving": lambda _: Halving(),
     "one_by_one": lambda _: OneByOne(),
     "conformal": lambda _: Conformal(),
