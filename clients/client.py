@@ -62,6 +62,8 @@ class FrameAnswer:
         ``teammates``, ``jaccard_index``, ``verdict``.
     sampling_steps : int
     attacker_ratio : float or None
+    suspicion : mapping of vehicle id to float, or None
+        Probability that each teammate attacks, where the defence knows it.
     deadline_met : bool
     degraded_by : str or None
         ``deadline`` or ``fault``, if the defence was cut short.
@@ -76,9 +78,15 @@ class FrameAnswer:
     hypotheses: list[Mapping[str, Any]]
     sampling_steps: int
     attacker_ratio: float | None
+    suspicion: Mapping[str, float] | None
     deadline_met: bool
     degraded_by: str | None
     timings_ms: Mapping[str, float]
+
+    @property
+    def named(self) -> tuple[str, ...]:
+        """Teammates that the defence names as attackers."""
+        return tuple(name for name, entry in self.rejected.items() if "evidence" in entry)
 
     @classmethod
     def parse(cls, fields: Mapping[str, Any]) -> FrameAnswer:
@@ -99,6 +107,7 @@ class FrameAnswer:
                 hypotheses=list(fields["hypotheses"]),
                 sampling_steps=int(fields["sampling_steps"]),
                 attacker_ratio=fields["attacker_ratio"],
+                suspicion=fields.get("suspicion"),
                 deadline_met=bool(fields["deadline_met"]),
                 degraded_by=fields["degraded_by"],
                 timings_ms=dict(fields["timings_ms"]),

@@ -60,7 +60,7 @@ async def _run(report: Path, scenes: int, frames: int, console: Console) -> tupl
             attackers=1,
             attack="pgd",
             detector=DEFAULT_DETECTOR,
-            defense={"kind": "sample_consensus", "attacker_ratio": 0.2, "sampling_budget": 7, "collaborators": 3},
+            defense={"kind": "group_testing", "pose_error_m": 0.0},
             seed=0,
             real_time=False,
             report=report,

@@ -34,6 +34,10 @@ class Example:
     answer: FrameAnswer
 
 
+Met = tuple[int, str, str]
+"""A vehicle as an ego meets it in a scene: scene, ego, vehicle."""
+
+
 @dataclass
 class FleetSummary:
     """Collects answered frames beside what the same frames give without the gateway."""
@@ -48,6 +52,9 @@ class FleetSummary:
     with_attacker: int = 0
     in_time: int = 0
     participation: dict[str, Counter[str]] = field(default_factory=dict)
+    attacked_from: dict[Met, int] = field(default_factory=dict)
+    named_in: dict[Met, int] = field(default_factory=dict)
+    names: bool = False
     example: Example | None = None
     _harm: int = -1
 
@@ -60,6 +67,20 @@ class FleetSummary:
     def clean_share(self) -> float:
         """Share of answers without any attacker's message."""
         return 1.0 - self.with_attacker / self.frames if self.frames else float("nan")
+
+    @property
+    def naming(self) -> dict[str, Any] | None:
+        """Who was named as an attacker, by scene and ego; None if the defence names nobody."""
+        if not self.names:
+            return None
+        right = self.named_in.keys() & self.attacked_from.keys()
+        delays = [self.named_in[met] - self.attacked_from[met] + 1 for met in right]
+        return {
+            "attackers": len(self.attacked_from),
+            "attackers_named": len(right),
+            "honest_named": len(self.named_in.keys() - self.attacked_from.keys()),
+            "frames_until_named": float(np.mean(delays)) if delays else None,
+        }
 
     def add(self, frame: EgoFrame, answer: FrameAnswer, latency_ms: float) -> None:
         """Count one answered frame."""
@@ -75,6 +96,11 @@ class FleetSummary:
         self.sources[answer.source] += 1
         self.with_attacker += not frame.attackers.isdisjoint(answer.accepted)
         self.in_time += answer.deadline_met
+        for vehicle in frame.attackers:
+            self.attacked_from.setdefault((frame.scene, frame.ego_id, vehicle), answer.frame)
+        for vehicle in answer.named:
+            self.named_in.setdefault((frame.scene, frame.ego_id, vehicle), answer.frame)
+        self.names |= answer.suspicion is not None
         for role, members in (("attackers", frame.attackers), ("honest", set(team) - frame.attackers)):
             tally = self.participation.setdefault(role, Counter())
             for vehicle in members:
@@ -102,6 +128,7 @@ class FleetSummary:
             "answers_with_attacker": self.with_attacker,
             "sources": dict(self.sources),
             "participation": {role: dict(tally) for role, tally in self.participation.items()},
+            "naming": self.naming,
             "sampling_steps": {"mean": float(np.mean(self.steps)), "max": int(np.max(self.steps))},
             "latency_ms": {"p50": float(p50), "p95": float(p95), "p99": float(p99)},
             "deadline_met_share": self.in_time / self.frames,
@@ -139,6 +166,13 @@ class FleetSummary:
             f"99 % {latency['p99']:.1f} ms; "
             f"{values['deadline_met_share']:.1%} within the budget."
         )
+        if (naming := values["naming"]) is not None:
+            after = naming["frames_until_named"]
+            console.print(
+                f"Named as attackers: {naming['attackers_named']} of {naming['attackers']}"
+                + (f", after {after:.1f} frames on average" if after is not None else "")
+                + f"; honest teammates named: {naming['honest_named']}."
+            )
         colour = "green" if self.clean_share >= 0.95 else "red"
         console.print(f"[{colour}]No attacker accepted in {self.clean_share:.1%} of the frames.[/{colour}]")
 

@@ -110,6 +110,9 @@ def test_the_demo_shows_a_summary(tmp_path, monkeypatch):
     result = CliRunner().invoke(command(demo_main), ["--report", str(tmp_path), "--scenes", "1", "--frames", "2"])
     assert result.exit_code == 0, result.output
     assert "No attacker accepted in" in result.output
+    assert "Named as attackers: 1 of 1" in result.output
+    naming = json.loads((tmp_path / "summary.json").read_text())["naming"]
+    assert (naming["attackers_named"], naming["honest_named"]) == (1, 0)
     assert (tmp_path / "example.png").exists()
 
 
