@@ -62,6 +62,7 @@ async def _run(report: Path, scenes: int, frames: int, console: Console) -> tupl
             detector=DEFAULT_DETECTOR,
             defense={"kind": "group_testing", "pose_error_m": 0.0},
             seed=0,
+            budget_ms=None,
             real_time=False,
             report=report,
         )

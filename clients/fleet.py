@@ -47,6 +47,8 @@ class FleetOptions:
         The ``defense`` of the sessions.
     seed : int
         Of the choice of attackers and of their random starts.
+    budget_ms : float or None
+        Latency budget of the sessions; None leaves it to the gateway.
     real_time : bool
         Hold the frames to 5 Hz of the clock, where the machine can keep up.
     report : Path or None
@@ -65,6 +67,7 @@ class FleetOptions:
     detector: str
     defense: dict[str, Any]
     seed: int
+    budget_ms: float | None
     real_time: bool
     report: Path | None
     api_key: str | None = field(default=None, repr=False)
@@ -169,7 +172,11 @@ async def _run_scene(options: FleetOptions, fleet: Fleet, summary: FleetSummary,
     try:
         for ego_id in fleet.egos:
             session = await vehicles[ego_id].gateway.open_session(
-                ego_id, fleet.teammates(ego_id), detector=fleet.detector.info.name, defense=options.defense
+                ego_id,
+                fleet.teammates(ego_id),
+                detector=fleet.detector.info.name,
+                defense=options.defense,
+                latency_budget_ms=options.budget_ms,
             )
             if session.detector["weights_digest"] != fleet.detector.info.weights_digest:
                 raise ValueError(f"the gateway's {fleet.detector.info.name} has other weights than the fleet's")
@@ -213,6 +220,7 @@ def main(
     sampling_budget: Annotated[int | None, typer.Option(help="Most hypotheses a frame.")] = None,
     collaborators: Annotated[int | None, typer.Option(help="Teammates in a hypothesis.")] = None,
     seed: Annotated[int, typer.Option(help="Of the attackers' choice and starts.")] = 0,
+    budget_ms: Annotated[float | None, typer.Option(min=1, help="Latency budget; by default the gateway's.")] = None,
     real_time: Annotated[bool, typer.Option(help="Hold frames to 5 Hz of the clock.")] = False,
     report: Annotated[Path | None, typer.Option(help="Folder for summary.json and example.png.")] = None,
     api_key: Annotated[
@@ -241,6 +249,7 @@ def main(
         detector=detector,
         defense={"kind": defense, **{name: value for name, value in chosen.items() if value is not None}},
         seed=seed,
+        budget_ms=budget_ms,
         real_time=real_time,
         report=report,
         api_key=api_key,

@@ -23,7 +23,7 @@ def options(url, **changes):
         "url": url, "scenes": 1, "frames": 3, "first_scene": 3, "egos": 1, "attackers": 1, "attack": "pgd",
         "detector": DEFAULT_DETECTOR, "seed": 0,
         "defense": {"kind": "sample_consensus", "sampling_budget": 7, "collaborators": 3},
-        "real_time": False, "report": None,
+        "budget_ms": 20_000.0, "real_time": False, "report": None,
     }  # fmt: skip
     return FleetOptions(**{**values, **changes})
 

@@ -11,7 +11,20 @@ from robosac import wire
 def test_a_short_run_measures_every_load(tmp_path):
     app = typer.Typer()
     app.command()(main)
-    arguments = ["--seconds", "0.6", "--egos", "1", "--egos", "3", "--rate", "5", "--out", str(tmp_path)]
+    arguments = [
+        "--seconds",
+        "0.6",
+        "--egos",
+        "1",
+        "--egos",
+        "3",
+        "--rate",
+        "5",
+        "--out",
+        str(tmp_path),
+        "--budget-ms",
+        "20000",
+    ]
     result = CliRunner().invoke(app, arguments)
     assert result.exit_code == 0, result.output
     report = json.loads((tmp_path / "load_test.json").read_text())
