@@ -55,7 +55,7 @@ class Journal:
             await self._append(session_id, audit.equivocation(vehicle_id, frame, first, second.proof))
 
     async def stranger(self, session_id: str, live: LiveSession | None, refused: TokenRefused) -> None:
-        """Somebody came without a token that counts; ``live`` is None for a session that has ended."""
+        """Somebody came without a token that counts; ``live`` is None for a session not served."""
         if live is None:
             self._metrics.refused(Reason.UNAUTHENTICATED.value)
         elif self._counted(live, STRANGERS, Reason.UNAUTHENTICATED):

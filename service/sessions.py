@@ -152,7 +152,7 @@ class Sessions:
         Raises
         ------
         Problem
-            404 for an unknown or ended session, 401 without a token of it.
+            404 for an unknown or ended session, 401 without a token of it, 503 if its detector is not served any more.
         """
         record = await self._store.get(session_id)
         if record is None or record.ended_at is not None:
@@ -179,11 +179,11 @@ class Sessions:
         return None if live is None else live.budget_s
 
     async def audit_log(self, session_id: str, token: str | None, after: int) -> list[str]:
-        """Lines of the log with a number above ``after``, for the ego; of an ended session, too."""
+        """Lines of the log with a number above ``after``, for the ego; of a session no longer served, too."""
         record = await self._store.get(session_id)
         if record is None:
             raise Problem(404, "unknown-session", "there is no such session; its log may have been purged")
-        if record.ended_at is None:
+        if record.ended_at is None and self._is_served(record):
             await self.authenticate_ego(session_id, token)
         elif (vehicle := await self._holder(record, token)) != record.ego_id:
             raise _ego_only(vehicle)
@@ -365,11 +365,25 @@ class Sessions:
         return self._engine.detectors[name]
 
     def _revive(self, record: SessionRecord) -> LiveSession:
+        """What this process holds of a session.
+
+        Raises
+        ------
+        Problem
+            503 if the detector that it was opened with is not served any more, or lacks what the defence needs.
+        """
         closed = -1 if record.last_frame is None else record.last_frame
-        settings, detector = self._settings, self._detector(record.detector)
+        settings, detector = self._settings, self._engine.detectors.get(record.detector)
+        if detector is None:
+            raise Problem(503, "detector-unavailable", f"the session's detector {record.detector} is not served now")
+        try:
+            defense = read_defense(record.defense).build(detector.info)
+        except DomainError as error:
+            detail = f"the session's detector {record.detector} no longer serves its defence: {error}"
+            raise Problem(503, "detector-unavailable", detail) from error
         return LiveSession(
             detector,
-            read_defense(record.defense).build(detector.info),
+            defense,
             record.teammates,
             Gathering(record.teammates, settings.max_pending_frames, self.backlog, closed),
             Motion(settings.max_speed_mps, record.frame_period_ms / 1e3, settings.max_range_m),
@@ -395,6 +409,13 @@ class Sessions:
             await self._store.end(session_id, event["time"], event)
         self._metrics.sessions.set(await self._store.count())
 
+    def _is_served(self, record: SessionRecord) -> bool:
+        try:
+            self._live_session(record)
+        except Problem:
+            return False
+        return True
+
     def _live_session(self, record: SessionRecord) -> LiveSession:
         live = self._live.get(record.session_id)
         if live is None:
@@ -406,7 +427,7 @@ class Sessions:
         try:
             return self._tokens.holder(record, token)
         except TokenRefused as refused:
-            live = None if record.ended_at is not None else self._live_session(record)
+            live = self._live_session(record) if record.ended_at is None and self._is_served(record) else None
             await self.journal.stranger(record.session_id, live, refused)
             raise refused.problem from refused
 

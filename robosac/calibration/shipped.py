@@ -22,7 +22,11 @@ def calibration_of(info: DetectorInfo) -> Calibration:
             f"the detector {info.name} is not calibrated for group testing: make a calibration beside its weights "
             "with robosac calibrate"
         )
-    calibration = _read(info.calibration, info.calibration.stat().st_mtime_ns)
+    try:
+        changed = info.calibration.stat().st_mtime_ns
+    except OSError as error:
+        raise CalibrationError(f"{info.calibration} cannot be read: {error}") from error
+    calibration = _read(info.calibration, changed)
     if calibration.weights_digest != info.weights_digest:
         raise CalibrationError(
             f"{info.calibration.name} belongs to weights with the digest {calibration.weights_digest:.12}..., not to "

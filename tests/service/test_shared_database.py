@@ -1,11 +1,18 @@
 """Gateways that come after one another, or run side by side, on one database."""
 
 import contextlib
+import dataclasses
+import shutil
+import sys
+import types
 
 import pytest
 
 from clients.errors import AccessDenied, FrameConflict, SessionNotFound
-from tests.service.conftest import EGO, TEAM, serve
+from robosac import wire
+from robosac.detectors.base import calibration_beside
+from robosac.detectors.embedded import SHIPPED_WEIGHTS, EmbeddedDetector
+from tests.service.conftest import EGO, TEAM, problem, serve
 
 
 @pytest.fixture
@@ -150,3 +157,51 @@ async def test_teams_that_change_at_both_gateways_at_once(two, monkeypatch):
     monkeypatch.undo()
     await other.ego(session).dismiss("car-2")
     assert (await one.ego(session).state())["teammates"] == ["car-3", "car-4", "car-5"]
+
+
+@pytest.fixture
+def own(tmp_path, monkeypatch):
+    """The shipped detector under the name "own", with weights and calibration that a test may take away."""
+    weights = tmp_path / "own.safetensors"
+    shutil.copy(SHIPPED_WEIGHTS, weights)
+    shutil.copy(calibration_beside(SHIPPED_WEIGHTS), weights.with_suffix(".calibration.json"))
+
+    def build():
+        detector = EmbeddedDetector(weights)
+        detector._info = dataclasses.replace(detector.info, name="own")
+        return detector
+
+    module = types.ModuleType("own")
+    module.build = build
+    monkeypatch.setitem(sys.modules, "own", module)
+    return weights
+
+
+@pytest.mark.parametrize("extra", ["", "own:build"])
+async def test_a_session_whose_detector_is_gone_is_told_so_and_costs_no_other(extra, own, url, messages, benign):
+    async with serve(database_url=url, extra_detectors="own:build") as served:
+        lost = await served.open(detector="own", defense={"kind": "group_testing"})
+        other = await served.open()
+        await served.ego(lost).post_frame(0, messages[EGO], benign)
+        own.with_suffix(".calibration.json").unlink()
+        request = {"ego_id": "a", "teammates": ["b"], "detector": "own", "defense": {"kind": "group_testing"}}
+        problem(await served.http.post("/v1/sessions", json=request), 422, "impossible-defense")
+    async with serve(database_url=url, extra_detectors=extra) as served:
+        ego = {"Authorization": f"Bearer {lost.ego_token}"}
+        path = f"/v1/sessions/{lost.session_id}"
+        whole = wire.pack_frame(1, messages[EGO], benign)
+        mine = wire.pack_message(1, "rsu", messages["rsu"])
+        for refused in (
+            await served.post(lost, "frames", whole),
+            await served.post(lost, "messages", mine, lost.teammate_tokens["rsu"]),
+            await served.http.get(path, headers=ego),
+            await served.http.post(f"{path}/token", headers=ego),
+            await served.http.delete(path, headers=ego),
+        ):
+            assert "own" in problem(refused, 503, "detector-unavailable")["detail"]
+        problem(await served.http.get(path), 401, "unauthenticated")
+        problem(await served.http.get(f"{path}/audit"), 401, "unauthenticated")
+        rsu = {"Authorization": f"Bearer {lost.teammate_tokens['rsu']}"}
+        problem(await served.http.get(f"{path}/audit", headers=rsu), 403, "ego-only")
+        assert answered(await served.ego(lost).audit()) == [0]
+        assert (await served.ego(other).post_frame(0, messages[EGO], benign)).source == "consensus"
