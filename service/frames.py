@@ -217,9 +217,10 @@ class Frames:
 
         What was worked out from a session that another process has changed by then is worked out again.
         """
+        absences: dict[str, Rejection] = {}
         for _ in range(ATTEMPTS):
             with contextlib.suppress(SessionChanged):
-                return await self._decide(caller, frame, ego, messages, unusable, arrived, timings)
+                return await self._decide(caller, frame, ego, messages, unusable, absences, arrived, timings)
         raise Problem(409, "session-changed", "the session keeps being changed elsewhere; try again")
 
     async def _decide(
@@ -229,13 +230,15 @@ class Frames:
         ego: Received,
         messages: Mapping[str, Received],
         unusable: Mapping[str, Rejection],
+        absences: dict[str, Rejection],
         arrived: float,
         timings: dict[str, float],
     ) -> dict[str, Any]:
         """As `_answer`, from the session as this process knows it.
 
         The team is the one of this moment, whoever was in it when the messages came; ``unusable`` says why parts of the
-        body are not among the messages.
+        body are not among the messages. ``absences`` holds why others sent none, as the first attempt found it, and
+        takes what this one finds: once the frame is closed, the gathering has forgotten it.
         """
         record = await self._sessions.current(caller)
         live = caller.live
@@ -243,7 +246,9 @@ class Frames:
         present: dict[str, Received] = {}
         for name in record.teammates:
             if name not in messages:
-                left_out.setdefault(name, live.gathering.absence(name, frame))
+                if name not in absences:
+                    absences[name] = live.gathering.absence(name, frame)
+                left_out.setdefault(name, absences[name])
                 continue
             doubt = live.motion.implausible(name, frame, messages[name].message.pose, ego.message.pose)
             if doubt is None:
@@ -266,16 +271,17 @@ class Frames:
         timings.update(result.timings_ms)
         timings["total"] = (time.perf_counter() - arrived) * 1e3
         answer = _frame_result(frame, result, {**left_out, **result.rejected}, timings)
-        event = audit.frame_answered(
-            answer,
-            result,
-            seed=record.seed,
-            ego_pose=ego.message.pose,
-            messages={name: received.proof for name, received in {record.ego_id: ego, **present}.items()},
-            previous_frame=None if live.previous is None else live.previous.frame,
-            unlogged=live.unlogged(),
-        )
-        await self._sessions.decide(record, frame, result.state, event, self._to_keep(frame, ego, present))
+        with live.unlogged() as unlogged:
+            event = audit.frame_answered(
+                answer,
+                result,
+                seed=record.seed,
+                ego_pose=ego.message.pose,
+                messages={name: received.proof for name, received in {record.ego_id: ego, **present}.items()},
+                previous_frame=None if live.previous is None else live.previous.frame,
+                unlogged=unlogged,
+            )
+            await self._sessions.decide(record, frame, result.state, event, self._to_keep(frame, ego, present))
         done = time.perf_counter()
         timings["store"] = (done - arrived) * 1e3 - timings["total"]
         self._admission.learn(arrived + timings.get("gather", 0.0) / 1e3, done, timings["store"] / 1e3)

@@ -5,6 +5,8 @@ from __future__ import annotations
 import asyncio
 import time
 from collections import Counter
+from collections.abc import Iterator
+from contextlib import contextmanager
 from dataclasses import dataclass, field
 
 from robosac.defenses import Defense
@@ -51,11 +53,18 @@ class LiveSession:
         if record.last_frame != self.answered:
             self.previous = self.ego_digest = None
 
-    def unlogged(self) -> dict[str, int]:
-        """Refusals by vehicle that got no record since the last call; all counts begin again."""
-        self.renewals.clear()
+    @contextmanager
+    def unlogged(self) -> Iterator[dict[str, int]]:
+        """Refusals by vehicle that got no record since the last decision; all counts begin again, unless the block that
+        keeps the decision fails.
+        """
         counted, self.refusals = self.refusals, Counter()
-        return {name: n - REFUSALS_LOGGED for name, n in counted.items() if n > REFUSALS_LOGGED}
+        try:
+            yield {name: n - REFUSALS_LOGGED for name, n in counted.items() if n > REFUSALS_LOGGED}
+        except BaseException:
+            self.refusals.update(counted)
+            raise
+        self.renewals.clear()
 
 
 @dataclass(frozen=True)

@@ -105,6 +105,30 @@ async def test_a_decision_is_worked_out_again_if_the_team_changed_elsewhere(two,
     assert [record["event"] for record in records] == ["session_opened", "team_changed", "frame_answered"]
 
 
+async def test_a_decision_that_is_worked_out_again_forgets_nothing(two, messages, benign, monkeypatch):
+    one, other = two
+    session = await one.open(defense={"kind": "none"}, gather_ms=20)
+    liar, rsu, path = (
+        other.teammate(session, "car-2"),
+        other.teammate(session, "rsu"),
+        f"/v1/sessions/{session.session_id}",
+    )
+    await liar.send(0, messages["car-2"])
+    with pytest.raises(FrameConflict, match="equivocation"):
+        await liar.send(0, messages["car-3"])
+    for _ in range(20):
+        problem(await other.post(session, "messages", b"", session.teammate_tokens["rsu"]), 400, "malformed-msgpack")
+        problem(await other.http.get(path), 401, "unauthenticated")
+    with meanwhile(other, monkeypatch, lambda: one.ego(session).dismiss("car-5")):
+        answer = await other.ego(session).ask(0, messages[EGO])
+    reasons = {name: entry["reason"] for name, entry in answer.rejected.items()}
+    assert reasons == {"car-2": "distrusted", "car-3": "missing", "car-4": "missing", "rsu": "malformed"}
+    assert (await one.ego(session).audit())[-1]["unlogged_refusals"] == {"rsu": 4, "?": 4}
+    await rsu.send(1, messages["rsu"])
+    await other.ego(session).ask(1, messages[EGO])
+    assert (await one.ego(session).audit())[-1]["unlogged_refusals"] == {}
+
+
 async def test_a_frame_that_is_decided_elsewhere_meanwhile_is_stale(two, messages, benign, monkeypatch):
     one, other = two
     session = await one.open()
