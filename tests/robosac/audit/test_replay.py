@@ -57,6 +57,7 @@ DEFENSES = {
     "a2cp": {"kind": "a2cp"},
     "previous": {"kind": "sample_consensus", "reference": "previous", **SAMPLING},
     "none": {"kind": "none"},
+    "group_testing": {"kind": "group_testing"},
 }
 
 
@@ -71,6 +72,23 @@ async def test_every_decision_comes_out_the_same(name, detector, ego_message, at
     previous = [replay.find(got.lines, number).previous for number, *_ in frames]
     assert [p and p.frame for p in previous] == [None, 0, 1, 2]
     assert [bool(p.motion.any()) for p in previous[1:]] == [False, True, True]
+
+
+async def test_group_testing_comes_out_the_same_with_who_is_missing_and_who_is_named(
+    detector, ego_message, benign, attacked
+):
+    silent = {name: message for name, message in attacked.items() if name != "car-4"}
+    parts = (benign, attacked, attacked, silent, attacked, attacked)
+    frames = [(i, moved(ego_message, 0.3 * i), others) for i, others in enumerate(parts)]
+    got = await drive(frames, change=(4, "car-3"), defense={"kind": "group_testing"})
+    assert verify(got.lines, got.head) == []
+    assert [got.differences(number, detector) for number, *_ in frames] == [[]] * 6
+    answers = [replay.find(got.lines, number).answer for number, *_ in frames]
+    assert answers[3].rejected["car-4"] == "missing"
+    assert answers[2].rejected["car-2"] == "distrusted"
+    lie = {**answers[2].state, "suspicion": {**answers[2].state["suspicion"], "car-2": 0.5}}
+    index = next(i for i, line in enumerate(got.lines) if json.loads(line).get("frame") == 2)
+    assert "state" in told(got, detector, frame=2, index=index, state=lie)
 
 
 @pytest.mark.parametrize("after", [0, 2])
