@@ -9,6 +9,7 @@ from typing import Any
 
 from robosac.audit import commitment
 from robosac.boxes import FloatArray
+from robosac.calibration import calibration_digest
 from robosac.defenses import Reason, State
 from robosac.detectors import DetectorInfo
 from robosac.fusion import FusionResult
@@ -30,6 +31,7 @@ def session_opened(record: SessionRecord, info: DetectorInfo) -> AuditEvent:
         "teammates": list(record.teammates),
         "detector": record.detector,
         "weights_digest": info.weights_digest,
+        "calibration_digest": calibration_digest(info),
         "defense": dict(record.defense),
         "latency_budget_ms": record.latency_budget_ms,
         "gather_ms": record.gather_ms,

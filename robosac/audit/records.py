@@ -75,6 +75,7 @@ class SessionOpened:
     ego_id: str
     detector: str
     weights_digest: str
+    calibration_digest: str | None
     defense: Mapping[str, Any]
     public_keys: Mapping[str, str]
     state: State
@@ -87,6 +88,9 @@ class SessionOpened:
             ego_id=_get(record, "ego_id", str),
             detector=_get(record, "detector", str),
             weights_digest=_get(record, "weights_digest", str),
+            calibration_digest=None
+            if record.get("calibration_digest") is None
+            else _get(record, "calibration_digest", str),
             defense=_get(record, "defense", dict),
             public_keys=_strings(record, "public_keys"),
             state=_state(record),

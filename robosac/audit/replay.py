@@ -13,8 +13,8 @@ import numpy as np
 
 from robosac import wire
 from robosac.audit.records import FrameAnswered, RecordError, SessionOpened, TeamChanged, read
-from robosac.calibration import calibration_of
-from robosac.defenses import Conversation, Decision, Defense, Outcome, State, build
+from robosac.calibration import calibration_digest, calibration_of
+from robosac.defenses import Conversation, Decision, Defense, GroupTesting, Outcome, State, build
 from robosac.detectors import Message, Preparer
 from robosac.fusion import FusionResult, fuse
 from robosac.previous import PreviousAnswer
@@ -138,6 +138,10 @@ def replay(decision: LoggedDecision, body: bytes, detector: Preparer) -> list[Di
     logged = decision.answer
     if detector.info.weights_digest != decision.session.weights_digest:
         detail = f"the weights' digest is {detector.info.weights_digest}, logged {decision.session.weights_digest}"
+        return [Difference("detector", detail)]
+    calibration = calibration_digest(detector.info)
+    if decision.session.defense.get("kind") == GroupTesting.kind and calibration != decision.session.calibration_digest:
+        detail = f"the calibration's digest is {calibration}, logged {decision.session.calibration_digest}"
         return [Difference("detector", detail)]
     messages = _read_messages(decision, body, detector)
     wrong = _compare_digests(logged, messages)

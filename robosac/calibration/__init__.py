@@ -2,7 +2,7 @@
 
 from robosac.calibration.fit import TooFewVerdicts, fit
 from robosac.calibration.making import Recipe, ReliabilityBin, calibrate
-from robosac.calibration.shipped import calibration_of
+from robosac.calibration.shipped import calibration_digest, calibration_of
 from robosac.calibration.verdicts import Verdicts, collect, validation_frames
 
 __all__ = [
@@ -11,6 +11,7 @@ __all__ = [
     "TooFewVerdicts",
     "Verdicts",
     "calibrate",
+    "calibration_digest",
     "calibration_of",
     "collect",
     "fit",

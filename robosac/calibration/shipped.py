@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import hashlib
 from functools import lru_cache
 from pathlib import Path
 
@@ -33,6 +34,14 @@ def calibration_of(info: DetectorInfo) -> Calibration:
             f"{info.name} with {info.weights_digest:.12}...: calibrate again"
         )
     return calibration
+
+
+def calibration_digest(info: DetectorInfo) -> str | None:
+    """SHA-256 (hexadecimal) of the file beside a detector's weights; None if there is none to be read."""
+    try:
+        return None if info.calibration is None else hashlib.sha256(info.calibration.read_bytes()).hexdigest()
+    except OSError:
+        return None
 
 
 @lru_cache(maxsize=16)

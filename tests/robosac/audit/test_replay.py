@@ -165,6 +165,10 @@ def test_other_inputs_are_told_and_nothing_is_recomputed(got, detector, ego_mess
     other = dataclasses.replace(decision.session, weights_digest="0" * 64)
     (difference,) = replay.replay(dataclasses.replace(decision, session=other), got.bodies[2], detector)
     assert difference.what == "detector"
+    testing = {"defense": {"kind": "group_testing"}, "calibration_digest": "0" * 64}
+    other = dataclasses.replace(decision.session, **testing)
+    (difference,) = replay.replay(dataclasses.replace(decision, session=other), got.bodies[2], detector)
+    assert "calibration" in str(difference)
 
 
 def test_what_cannot_be_replayed_is_explained(got, detector):
