@@ -29,6 +29,7 @@ from service.sessions import Sessions  # noqa: E402
 from service.settings import Settings  # noqa: E402
 from service.sql_store import SqlStore  # noqa: E402
 from service.store import new_seed  # noqa: E402
+from service.teams import Teams  # noqa: E402
 from service.tracing import Traced, Tracing, provider_from_environment  # noqa: E402
 
 if TYPE_CHECKING:
@@ -60,10 +61,11 @@ def create_app(
     store = SqlStore(settings.database_url)
     api_keys, tokens = ApiKeys.configured(settings), Tokens.configured(settings)
     sessions = Sessions(settings, store, engine, metrics, tokens, seeds)
+    teams = Teams(settings, sessions, store, tokens)
     admission = Admission()
     tracing = Tracing(provider_from_environment() if spans is None else spans)
     frames = Frames(settings, sessions, engine, metrics, admission, tracing)
-    gateway = Gateway(admission, engine, metrics, sessions, frames, api_keys)
+    gateway = Gateway(admission, engine, metrics, sessions, teams, frames, api_keys)
 
     @contextlib.asynccontextmanager
     async def lifespan(_: FastAPI) -> AsyncIterator[None]:

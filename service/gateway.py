@@ -10,15 +10,17 @@ from service.frames import Frames
 from service.identity import ApiKeys
 from service.metrics import Metrics
 from service.sessions import Sessions
+from service.teams import Teams
 
 
 @dataclass(frozen=True)
 class Gateway:
-    """One gateway: the detectors and their thread, its sessions, what answers their frames, and who may open one."""
+    """One gateway: detectors and their thread, sessions and teams, what answers frames, and who may open a session."""
 
     admission: Admission
     engine: Engine
     metrics: Metrics
     sessions: Sessions
+    teams: Teams
     frames: Frames
     api_keys: ApiKeys

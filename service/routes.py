@@ -100,19 +100,19 @@ async def delete_session(caller: Ego, gateway: GatewayDep, response: Response) -
 @v1.post("/sessions/{sid}/token", status_code=201, responses=documented(401, 404, 429))
 async def renew_token(caller: Vehicle, gateway: GatewayDep) -> TokenRenewed:
     """A fresh token for the vehicle that asks; the one it asks with is worth nothing any more."""
-    return await gateway.sessions.renew(caller)
+    return await gateway.teams.renew(caller)
 
 
 @v1.post("/sessions/{sid}/teammates", status_code=201, responses={**_EGO_PROBLEMS, **documented(400, 409)})
 async def enrol_teammates(request: EnrolmentRequest, caller: Ego, gateway: GatewayDep) -> TeamChanged:
     """Let teammates join from the next frame on. Their tokens are shown only in this answer."""
-    return await gateway.sessions.enrol(caller, request.teammates, request.public_keys)
+    return await gateway.teams.enrol(caller, request.teammates, request.public_keys)
 
 
 @v1.delete("/sessions/{sid}/teammates/{vehicle_id}", status_code=204, responses=_EGO_PROBLEMS)
 async def dismiss_teammate(vehicle_id: str, caller: Ego, gateway: GatewayDep) -> None:
     """Let a teammate leave from the next frame on; its token is worth nothing any more."""
-    await gateway.sessions.dismiss(caller, vehicle_id)
+    await gateway.teams.dismiss(caller, vehicle_id)
 
 
 @v1.get(

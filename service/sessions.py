@@ -1,4 +1,4 @@
-"""Sessions: opening and ending them, who speaks in them, who belongs to them."""
+"""Sessions: opening and ending them, who speaks in them, and the decisions that they are left with."""
 
 from __future__ import annotations
 
@@ -18,7 +18,7 @@ from robosac.detectors import Detector
 from service import audit
 from service.engine import Engine
 from service.gathering import Backlog, Gathering
-from service.identity import TokenRefused, Tokens, unauthenticated
+from service.identity import TokenRefused, Tokens
 from service.journal import Journal
 from service.live import Caller, LiveSession
 from service.metrics import Metrics
@@ -29,15 +29,12 @@ from service.schemas import (
     SessionCreated,
     SessionRequest,
     SessionState,
-    TeamChanged,
-    TokenRenewed,
     read_defense,
 )
 from service.settings import Settings
 from service.store import (
     AuditEvent,
     FrameDecided,
-    SessionChanged,
     SessionOver,
     SessionRecord,
     Store,
@@ -48,8 +45,6 @@ from service.store import (
 logger = structlog.stdlib.get_logger(__name__)
 
 SWEEP_EVERY_S = 30.0
-MAX_RENEWALS = 16
-"""Tokens that a vehicle may take between two frames: each leaves a record."""
 
 
 class Sessions:
@@ -88,7 +83,7 @@ class Sessions:
     async def open(self, request: SessionRequest) -> SessionCreated:
         """Begin a session; the answer is the only place where its tokens are shown."""
         detector = self._detector(self._settings.detector if request.detector is None else request.detector)
-        self._check_size(request.teammates)
+        check_size(request.teammates, self._settings.max_teammates)
         try:
             defense = request.defense.build(detector.info)
             defense.check_team(len(request.teammates))
@@ -189,53 +184,6 @@ class Sessions:
             raise _ego_only(vehicle)
         return await self._store.audit(session_id, after)
 
-    async def enrol(self, caller: Caller, newcomers: Sequence[str], public_keys: Mapping[str, str]) -> TeamChanged:
-        """Let teammates join, from the next frame on; the answer is the only place where their tokens are shown."""
-        async with caller.live.lock:
-            record = await self.current(caller)
-            for name in newcomers:
-                if name == record.ego_id or name in record.teammates:
-                    raise Problem(409, "already-enrolled", f"{name} is in the session already", "teammates")
-            tokens = {name: self._tokens.issue(record.session_id, name, is_ego=False) for name in newcomers}
-            token_ids = {**record.token_ids, **{name: token.token_id for name, token in tokens.items()}}
-            keys = {**record.public_keys, **public_keys}
-            await self._change_team(caller, record, (*record.teammates, *newcomers), token_ids, keys)
-            return TeamChanged(
-                teammates=[*record.teammates, *newcomers],
-                teammate_tokens={name: token.text for name, token in tokens.items()},
-                tokens_expire_at=min(token.expires_at for token in tokens.values()),
-            )
-
-    async def dismiss(self, caller: Caller, leaver: str) -> None:
-        """Let a teammate leave, from the next frame on; its token is worth nothing any more."""
-        async with caller.live.lock:
-            record = await self.current(caller)
-            if leaver not in record.teammates:
-                raise Problem(404, "unknown-teammate", "there is no such teammate in the session")
-            token_ids = {name: token_id for name, token_id in record.token_ids.items() if name != leaver}
-            keys = {name: key for name, key in record.public_keys.items() if name != leaver}
-            team = tuple(name for name in record.teammates if name != leaver)
-            await self._change_team(caller, record, team, token_ids, keys)
-
-    async def renew(self, caller: Caller) -> TokenRenewed:
-        """A fresh token of the caller; the one it came with is worth nothing any more."""
-        vehicle = caller.vehicle_id
-        async with caller.live.lock:  # else a team that changes meanwhile would bring the old token back
-            record = await self.current(caller)
-            if record.token_ids.get(vehicle) != caller.record.token_ids[vehicle]:
-                raise unauthenticated("the token was renewed, or its vehicle has left")
-            if caller.live.renewals[vehicle] >= MAX_RENEWALS:
-                detail = f"a vehicle may have {MAX_RENEWALS} tokens between two frames"
-                raise Problem(429, "too-many-renewals", detail, headers={"Retry-After": "1"})
-            caller.live.renewals[vehicle] += 1
-            token = self._tokens.issue(record.session_id, vehicle, is_ego=caller.is_ego)
-            event = audit.token_renewed(vehicle, token.expires_at)
-            try:
-                await self._store.renew_token(record.session_id, vehicle, token.token_id, event)
-            except SessionOver as error:
-                raise _over() from error
-            return TokenRenewed(token=token.text, expires_at=token.expires_at)
-
     async def describe(self, caller: Caller) -> SessionState:
         """The session's state."""
         record = await self.current(caller)
@@ -264,7 +212,7 @@ class Sessions:
             await self._end(caller.record.session_id, "closed")
         record = await self._store.get(caller.record.session_id)
         if record is None:
-            raise _over()
+            raise over()
         return record.audit_head
 
     async def expire_idle(self) -> None:
@@ -291,7 +239,7 @@ class Sessions:
         session_id = caller.record.session_id
         record = self._store.seen(session_id) or await self._store.get(session_id)
         if record is None or record.ended_at is not None:
-            raise _over()
+            raise over()
         caller.live.follow(record)
         return record
 
@@ -315,7 +263,7 @@ class Sessions:
         try:
             await self._store.decide(record.session_id, record.revision, frame, state, next_seed, event, messages)
         except SessionOver as error:
-            raise _over() from error
+            raise over() from error
         except FrameDecided as error:
             raise Problem(409, "stale-frame", f"frame {frame} or a later one is answered already", "frame") from error
         if messages is not None:
@@ -325,36 +273,6 @@ class Sessions:
     async def messages(self, caller: Caller, frame: int) -> bytes | None:
         """The messages kept of a decided frame."""
         return await self._store.messages(caller.record.session_id, frame)
-
-    async def _change_team(
-        self,
-        caller: Caller,
-        record: SessionRecord,
-        team: Sequence[str],
-        token_ids: Mapping[str, str],
-        keys: Mapping[str, str],
-    ) -> None:
-        """Keep a new team of the session ``record``. The session's lock is held."""
-        self._check_size(team)
-        try:
-            state = caller.live.defense.change_team(record.state, team)
-        except DomainError as error:
-            raise Problem(422, "impossible-defense", str(error), "teammates") from error
-        event = audit.team_changed(record.teammates, team, keys, state)
-        try:
-            await self._store.change_team(
-                record.session_id, record.revision, tuple(team), token_ids, keys, state, event
-            )
-        except SessionChanged as error:
-            raise Problem(409, "session-changed", "the session was changed at the same time; try again") from error
-        except SessionOver as error:
-            raise _over() from error
-        caller.live.follow(await self.current(caller))
-
-    def _check_size(self, team: Sequence[str]) -> None:
-        most = self._settings.max_teammates
-        if len(team) > most:
-            raise Problem(422, "too-many-teammates", f"at most {most} teammates are allowed", "teammates")
 
     def _detector(self, name: str) -> Detector:
         if not self._engine.ready:
@@ -436,5 +354,12 @@ def _ego_only(vehicle_id: str) -> Problem:
     return Problem(403, "ego-only", f"only the ego of the session may do this, not {vehicle_id}")
 
 
-def _over() -> Problem:
+def over() -> Problem:
+    """The refusal of a call to a session that has ended meanwhile."""
     return Problem(404, "unknown-session", "the session has ended")
+
+
+def check_size(team: Sequence[str], most: int) -> None:
+    """Refuse a team of more than so many."""
+    if len(team) > most:
+        raise Problem(422, "too-many-teammates", f"at most {most} teammates are allowed", "teammates")

@@ -29,10 +29,10 @@ def derivation(context: Context) -> Section:
         q = clean_probability(TEAM_SIZE, attackers, s)
         steps = _steps_until_consensus(context, defense, attackers, number)
         agreed = steps < NEVER
-        means = (1 / q, oracle.mean(), steps[agreed].mean() if agreed.any() else np.nan)
+        means = (1 / q, oracle.mean(), steps[agreed].mean() if agreed.any() else None)
         shares = (1 - (1 - q) ** n, (oracle <= n).mean(), (steps <= n).mean())
         never = round(float(1 - agreed.mean()), 3)
-        steps_rows.append((eta, s, paper_steps, *(round(float(value), 2) for value in means), never))
+        steps_rows.append((eta, s, paper_steps, *(None if v is None else round(float(v), 2) for v in means), never))
         success_rows.append((eta, s, n, paper_success, *(round(float(value), 3) for value in shares)))
     sources = ("paper", "exact", "oracle", "detector")
     return Section(

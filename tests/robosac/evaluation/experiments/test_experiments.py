@@ -1,9 +1,10 @@
 import csv
 
+import numpy as np
 import pytest
 from matplotlib.image import imread
 
-from robosac.evaluation.experiments import EXPERIMENTS, Context, Scale, write_report
+from robosac.evaluation.experiments import EXPERIMENTS, Context, Scale, theory, write_report
 
 TINY = Scale(scenes=2, frames_per_scene=1, sequences=1, sequence_frames=7, repeats=2, oracle_runs=200)
 
@@ -29,6 +30,15 @@ def test_the_derivation_follows_the_exact_law(sections):
         assert row["detector"] >= 1.0
     for row in rows(sections["derivation"], 1):
         assert row["oracle"] == pytest.approx(row["exact"], abs=0.1)
+
+
+@pytest.mark.parametrize(
+    ("steps", "mean", "never"), [([2, theory.NEVER, 4, 3], 3.0, 0.25), ([theory.NEVER], None, 1.0)]
+)
+def test_runs_that_never_agree_are_not_in_the_mean(context, monkeypatch, steps, mean, never):
+    monkeypatch.setattr(theory, "_steps_until_consensus", lambda *_: np.array(steps))
+    for row in rows(theory.derivation(context)):
+        assert (row["detector"], row["detector: never"]) == (mean, never)
 
 
 def test_budgets_stand_between_the_bounds(sections):
