@@ -11,7 +11,7 @@ from starlette.types import ASGIApp, Receive, Scope, Send
 
 from service.problems import Problem
 
-SHARE = 0.6
+SHARE = 0.5
 """Part of a frame's budget that the frames before it may take."""
 SESSION_FRAMES = 3
 """Frames of one session in hand or waiting at a time, so that no ego takes the others' share."""
