@@ -144,8 +144,8 @@ def check(
     predicted: list[float] = []
     attacked: list[bool] = []
     for index, (_, frame) in enumerate(frames):
-        (result,) = play(defense, [frame], np.random.default_rng(index))
-        for name, suspicion in (result.suspicion or {}).items():
+        (answer,) = play(defense, [frame], np.random.default_rng(index))
+        for name, suspicion in (answer.result.suspicion or {}).items():
             predicted.append(suspicion)
             attacked.append(name in frame.attackers)
         tick()

@@ -2,7 +2,10 @@
 
 from __future__ import annotations
 
+import shlex
 import time
+from collections.abc import Mapping
+from dataclasses import replace
 from pathlib import Path
 from typing import Annotated
 
@@ -14,13 +17,38 @@ from rich.progress import BarColumn, MofNCompleteColumn, Progress, TextColumn, T
 from robosac import detectors
 from robosac.attacks import NoGeometry
 from robosac.detectors import DEFAULT_DETECTOR
-from robosac.evaluation.comparison import DEFENSES, FULL, QUICK, compare_defenses, write_comparison
+from robosac.evaluation.comparison import (
+    DEFENSES,
+    FULL,
+    QUICK,
+    Extent,
+    Plan,
+    Setting,
+    compare_defenses,
+    write_comparison,
+)
+from robosac.evaluation.comparison.rows import EARLY
+from robosac.scenes.splits import TEST_SEEDS
 
 
 def run(
     out: Annotated[Path, typer.Option(help="Folder for comparison.md, comparison.csv and two pictures.")],
     quick: Annotated[bool, typer.Option(help="Fewer attacks and frames, in a few minutes.")] = False,
     only: Annotated[list[str] | None, typer.Option(help=f"One of {', '.join(DEFENSES)}; may be repeated.")] = None,
+    setting: Annotated[
+        list[str] | None,
+        typer.Option(help="CAMPAIGN:NUMBER of attackers, as in erase@asleep:2; may be repeated."),
+    ] = None,
+    scenes: Annotated[int | None, typer.Option(min=1, max=len(TEST_SEEDS), help="Test sequences.")] = None,
+    frames: Annotated[int | None, typer.Option(min=EARLY + 1, help="Of each sequence, at 5 Hz.")] = None,
+    recordings: Annotated[
+        Path | None, typer.Option(help="Folder in which recorded frames are kept, to be used again.")
+    ] = None,
+    pose_error: Annotated[
+        float, typer.Option(min=0.0, help="Standard deviation of the teammates' positions, metres.")
+    ] = 0.0,
+    live: Annotated[bool, typer.Option(help="Record nothing: each defence decodes for itself, and is timed.")] = False,
+    jobs: Annotated[int, typer.Option(min=1, help="Processes that share the sequences.")] = 1,
     seed: Annotated[int, typer.Option(min=0, help="Of everything random.")] = 0,
     detector: Annotated[
         str, typer.Option("--detector", "--weights", help="A detector's name, its weights file, or module:callable.")
@@ -30,28 +58,72 @@ def run(
     unknown = sorted(set(only or ()) - set(DEFENSES))
     if unknown:
         raise typer.BadParameter(f"unknown {', '.join(unknown)}; known: {', '.join(DEFENSES)}", param_hint="--only")
+    if live and recordings is not None:
+        raise typer.BadParameter("nothing is recorded live", param_hint="--recordings")
+    extent = _extent(QUICK if quick else FULL, setting or (), scenes, frames)
     torch.set_num_threads(1)
     console = Console()
-    try:
-        out.mkdir(parents=True, exist_ok=True)
-    except OSError as error:
-        raise typer.BadParameter(str(error), param_hint="--out") from error
+    _make_folder(out, "--out")
+    if recordings is not None:
+        _make_folder(recordings, "--recordings")
     try:
         chosen = detectors.load(detector)
     except ValueError as error:
         raise typer.BadParameter(str(error), param_hint="--detector") from error
-    extent = QUICK if quick else FULL
+    defenses = {name: make(chosen) for name, make in DEFENSES.items() if not only or name in only}
+    plan = Plan(chosen, defenses, extent, seed, recordings, pose_error, live)
     started = time.monotonic()
     columns = (TextColumn("{task.description}"), BarColumn(), MofNCompleteColumn())
     with Progress(*columns, TimeElapsedColumn(), TimeRemainingColumn(), console=console) as progress:
         task = progress.add_task("frames", total=len(extent.settings) * extent.scenes * extent.frames)
-        defenses = {name: make(chosen) for name, make in DEFENSES.items() if not only or name in only}
         try:
-            rows = compare_defenses(chosen, defenses, extent, seed, lambda: progress.advance(task))
+            rows = compare_defenses(plan, jobs, lambda: progress.advance(task))
         except NoGeometry as error:
             raise typer.BadParameter(str(error), param_hint="--detector") from error
-    options = "".join(f" --only {name}" for name in only or ()) + (" --quick" if quick else "")
-    if detector != DEFAULT_DETECTOR:
-        options += f" --detector {detector}"
-    path = write_comparison(rows, extent, out, f"robosac compare --out DIR --seed {seed}{options}")
+    given = {
+        "--seed": [str(seed)],
+        "--only": only,
+        "--quick": quick,
+        "--setting": setting,
+        "--scenes": scenes,
+        "--frames": frames,
+        "--recordings": None if recordings is None else "DIR",
+        "--pose-error": f"{pose_error:g}" if pose_error else None,
+        "--live": live,
+        "--jobs": jobs if jobs > 1 else None,
+        "--detector": detector if detector != DEFAULT_DETECTOR else None,
+    }
+    path = write_comparison(rows, plan, out, command(given))
     console.print(f"{path}: {len(rows)} rows in {(time.monotonic() - started) / 60:.1f} minutes")
+
+
+def command(given: Mapping[str, object]) -> str:
+    """The command with these options: lists are repeated, True is a flag, None and False are left out."""
+    words = ["robosac", "compare", "--out", "DIR"]
+    for option, value in given.items():
+        if value is True:
+            words.append(option)
+        elif value is not None and value is not False:
+            for each in value if isinstance(value, list) else [value]:
+                words += [option, str(each)]
+    return shlex.join(words)
+
+
+def _extent(extent: Extent, settings: list[str] | tuple[()], scenes: int | None, frames: int | None) -> Extent:
+    try:
+        chosen = tuple(dict.fromkeys(Setting.parse(text) for text in settings))
+    except ValueError as error:
+        raise typer.BadParameter(str(error), param_hint="--setting") from error
+    return replace(
+        extent,
+        settings=chosen or extent.settings,
+        scenes=scenes or extent.scenes,
+        frames=frames or extent.frames,
+    )
+
+
+def _make_folder(path: Path, option: str) -> None:
+    try:
+        path.mkdir(parents=True, exist_ok=True)
+    except OSError as error:
+        raise typer.BadParameter(str(error), param_hint=option) from error

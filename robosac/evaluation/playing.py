@@ -1,96 +1,92 @@
-"""Defences on recorded sequences: what they answer, what it costs, whom they name."""
+"""Defences on sequences of frames, recorded or live: what they answer, and what it costs."""
 
 from __future__ import annotations
 
-from collections.abc import Sequence
-from dataclasses import dataclass, field
+import time
+from collections.abc import Mapping, Sequence
+from dataclasses import dataclass
+from typing import Protocol
 
 import numpy as np
 
 from robosac.boxes import FloatArray
-from robosac.defenses import Defense, Reason, State
-from robosac.evaluation.average_precision import AveragePrecision
-from robosac.evaluation.recordings import RecordedFrame
+from robosac.defenses import Defense, State
+from robosac.detectors import Message
+from robosac.detectors.base import Preparer
 from robosac.fusion import FusionResult, fuse
 from robosac.previous import PreviousAnswer
 
 
-def play(defense: Defense, sequence: Sequence[RecordedFrame], rng: np.random.Generator) -> list[FusionResult]:
+class FaultyDefense(RuntimeError):
+    """A defence failed on a frame; an evaluation must not answer over that."""
+
+
+class PlayableFrame(Preparer, Protocol):
+    """A frame that can be played: what was met, posing as the detector that decodes it."""
+
+    @property
+    def ego(self) -> Message:
+        """The ego's message."""
+        ...
+
+    @property
+    def teammates(self) -> Mapping[str, Message]:
+        """The teammates' messages, as received."""
+        ...
+
+    @property
+    def team(self) -> tuple[str, ...]:
+        """Teammates, sorted."""
+        ...
+
+    @property
+    def attackers(self) -> frozenset[str]:
+        """Those whose message of this frame is not honest."""
+        ...
+
+    @property
+    def truth(self) -> FloatArray:
+        """True boxes (G, 5), ego frame."""
+        ...
+
+
+@dataclass(frozen=True)
+class Answer:
+    """What a defence made of one frame.
+
+    Attributes
+    ----------
+    result : FusionResult
+    milliseconds : float
+        For all of it.
+    """
+
+    result: FusionResult
+    milliseconds: float
+
+    @property
+    def passes(self) -> int:
+        """Fused subsets that were decoded, those of the answer among them; a subset is decoded once a frame."""
+        decoded = {outcome.teammates for outcome in self.result.hypotheses} | {self.result.accepted}
+        return len(decoded - {()})
+
+
+def play(defense: Defense, sequence: Sequence[PlayableFrame], rng: np.random.Generator) -> list[Answer]:
     """Answer a sequence frame by frame, the defence remembering what it remembers.
 
     Raises
     ------
-    RuntimeError
-        If a fusion failed: in an evaluation a fault is not answered over.
+    FaultyDefense
+        If a fusion failed.
     """
     state: State = defense.initial_state(list(sequence[0].team))
     previous: PreviousAnswer | None = None
-    results = []
+    answers = []
     for index, frame in enumerate(sequence):
+        started = time.perf_counter()
         result = fuse(frame, defense, frame.ego, frame.teammates, rng=rng, state=state, frame=index, previous=previous)
+        answers.append(Answer(result, (time.perf_counter() - started) * 1e3))
         if result.fault is not None:
-            raise RuntimeError(f"frame {index}: {result.fault}")
+            raise FaultyDefense(f"frame {index}: {result.fault}")
         state, previous = result.state, result.previous
-        results.append(result)
-    return results
-
-
-@dataclass
-class Tally:
-    """Collects played sequences.
-
-    Attributes
-    ----------
-    steady_from : int
-        Frames before are counted apart, and not by the average precision.
-    ap, oracle, undefended : AveragePrecision
-        Of the answers; of the fusion of all that do not attack; of the fusion of everybody.
-    first, early, steady : list of int
-        Passes of first frames, of the others before ``steady_from``, and of those from there on.
-    infiltrated : list of bool
-        Whether an attacker is in the answer, from ``steady_from`` on.
-    honest_named, honest : int
-        Honest teammates of a sequence that were named at any time, and all of them.
-    unnamed, attackers : int
-        Attackers of a sequence that were never named, and all of them.
-    frames_to_name : list of int
-        Of each named attacker, frames since the sequence began, at least 1.
-    """
-
-    steady_from: int = 5
-    ap: AveragePrecision = field(default_factory=AveragePrecision)
-    oracle: AveragePrecision = field(default_factory=AveragePrecision)
-    undefended: AveragePrecision = field(default_factory=AveragePrecision)
-    first: list[int] = field(default_factory=list)
-    early: list[int] = field(default_factory=list)
-    steady: list[int] = field(default_factory=list)
-    infiltrated: list[bool] = field(default_factory=list)
-    honest_named: int = 0
-    honest: int = 0
-    unnamed: int = 0
-    attackers: int = 0
-    frames_to_name: list[int] = field(default_factory=list)
-
-    def add(self, sequence: Sequence[RecordedFrame], results: Sequence[FusionResult]) -> None:
-        """Add a sequence and what was answered to it."""
-        named: dict[str, int] = {}
-        for index, (frame, result) in enumerate(zip(sequence, results, strict=True)):
-            for name, rejection in result.rejected.items():
-                if rejection.reason is Reason.DISTRUSTED:
-                    named.setdefault(name, index + 1)
-            passes = self.first if index == 0 else self.early if index < self.steady_from else self.steady
-            passes.append(result.sampling_steps)
-            if index >= self.steady_from:
-                self._precision(frame, result.boxes)
-                self.infiltrated.append(not frame.attackers.isdisjoint(result.accepted))
-        bad = frozenset().union(*(frame.attackers for frame in sequence))
-        self.honest += len(set(sequence[0].team) - bad)
-        self.honest_named += len(set(named) - bad)
-        self.attackers += len(bad)
-        self.unnamed += len(bad - set(named))
-        self.frames_to_name += [named[name] for name in sorted(bad & set(named))]
-
-    def _precision(self, frame: RecordedFrame, boxes: FloatArray) -> None:
-        self.ap.add(boxes, frame.truth)
-        self.oracle.add(frame.detect(frame.benign), frame.truth)
-        self.undefended.add(frame.detect(frame.team), frame.truth)
+    return answers

@@ -2,22 +2,25 @@
 
 from __future__ import annotations
 
+import hashlib
 import json
-from collections.abc import Collection, Iterator, Mapping, Sequence
+import os
+import re
+from collections.abc import Callable, Collection, Mapping, Sequence
 from dataclasses import dataclass
 from itertools import combinations
 from pathlib import Path
 
 import numpy as np
 
-from robosac.attacks import Attack
+from robosac.attacks import HONEST
 from robosac.boxes import FloatArray
 from robosac.detectors import Detector, DetectorInfo, Message, PreparedFrame
-from robosac.evaluation.frames import EvaluationFrame, encode_all, misplaced, under_attack
-from robosac.scenes import IntersectionScene
+from robosac.evaluation.encounters import NOBODY_ACTS, Act, Encounters, acts
+from robosac.evaluation.frames import EvaluationFrame
 
 Subset = frozenset[str]
-_POSES = 53
+FORMAT = 1
 
 
 @dataclass(frozen=True)
@@ -71,7 +74,7 @@ class RecordedFrame:
 
 
 def record(detector: Detector, frame: EvaluationFrame, unattacked: RecordedFrame | None = None) -> RecordedFrame:
-    """Decode all subsets of a frame's teammates, ``2 ** S`` of them.
+    """Decode all subsets of a frame's teammates, ``2 ** S`` of them; boxes are rounded to float32, as files hold them.
 
     Parameters
     ----------
@@ -85,78 +88,130 @@ def record(detector: Detector, frame: EvaluationFrame, unattacked: RecordedFrame
     boxes: dict[Subset, FloatArray] = {}
     for size in range(len(team) + 1):
         for subset in combinations(team, size):
-            same = unattacked is not None and frame.attackers.isdisjoint(subset)
-            boxes[frozenset(subset)] = unattacked.detect(subset) if unattacked and same else prepared.detect(subset)
+            if unattacked is not None and frame.attackers.isdisjoint(subset):
+                boxes[frozenset(subset)] = unattacked.detect(subset)
+            else:
+                boxes[frozenset(subset)] = prepared.detect(subset).astype(np.float32).astype(np.float64)
     return RecordedFrame(detector.info, frame.ego.pose, team, frame.attackers, frame.truth, boxes)
 
 
-def record_sequence(
-    detector: Detector,
-    seed: int,
-    frames: int,
-    attack: Attack,
-    attackers: Collection[str],
-    rng: np.random.Generator,
-    *,
-    unattacked: Sequence[RecordedFrame] | None = None,
-    stride: int = 1,
-    ego_id: str = "car-1",
-    pose_error_m: float = 0.0,
-) -> Iterator[RecordedFrame]:
-    """A scene's frames as one ego meets them, the attackers staying the same.
+class Recordings:
+    """Recorded frames of test sequences: as one ego meets them, under any campaign.
+
+    A frame is determined by the scene, its number, the attack, who acts in it, and the seed, whatever else is recorded:
+    a campaign's schedule only chooses among such frames, so campaigns share them.
 
     Parameters
     ----------
     detector : Detector
+    folder : Path, optional
+        Where they are kept and looked for; by default nowhere.
     seed : int
-        The scene.
-    frames, stride : int
-        How many, and every how many frames of 0.2 s.
-    attack : Attack
-    attackers : collection of str
-        None of them: an honest team.
-    rng : numpy.random.Generator
-        The attack's.
-    unattacked : sequence of RecordedFrame, optional
-        The same frames of the honest team, recorded before.
-    ego_id : str
+        Of attacks.
     pose_error_m : float
-        Standard deviation of the error of each teammate's position, metres; the same errors whatever the attack.
+        Standard deviation of the error of each teammate's position along either axis, metres; the same errors whatever
+        the attack.
     """
-    poses = np.random.default_rng([seed, _POSES])
-    for index, frame in enumerate(IntersectionScene(seed).frames(frames, stride=stride)):
-        encoded = encode_all(detector, frame)
-        messages = {n: m if n == ego_id else misplaced(m, pose_error_m, poses) for n, m in encoded.items()}
-        met = under_attack(detector, messages, frame.truth(ego_id), ego_id, attackers, attack, rng)
-        yield record(detector, met, None if unattacked is None else unattacked[index])
+
+    def __init__(
+        self, detector: Detector, folder: Path | None = None, *, seed: int = 0, pose_error_m: float = 0.0
+    ) -> None:
+        self._detector = detector
+        self._folder = folder
+        self._seed = seed
+        self._pose_error_m = pose_error_m
+        self._encounters = Encounters(detector, seed=seed, pose_error_m=pose_error_m)
+        self._scene: int | None = None
+        self._recorded: dict[Act, dict[int, RecordedFrame]] = {}
+
+    def sequence(
+        self,
+        scene: int,
+        frames: int,
+        campaign: str = HONEST,
+        attackers: Collection[str] = (),
+        tick: Callable[[], None] = lambda: None,
+    ) -> list[RecordedFrame]:
+        """A scene's first frames at 5 Hz as `robosac.evaluation.encounters.EGO` meets them.
+
+        Parameters
+        ----------
+        scene : int
+            Its seed. What was recorded of one scene is held until the next one is asked for.
+        frames : int
+        campaign : str
+            As `robosac.attacks.load_campaign` takes it.
+        attackers : collection of str
+            Under the adversary's control.
+        tick : callable
+            Called after each frame.
+        """
+        if scene != self._scene:
+            self._scene, self._recorded = scene, {}
+        chosen = acts(campaign, attackers, frames)
+        needed: dict[Act, list[int]] = {NOBODY_ACTS: list(range(frames))}
+        for index, act in enumerate(chosen):
+            if act != NOBODY_ACTS:
+                needed.setdefault(act, []).append(index)
+        for act, indices in needed.items():
+            self._complete(scene, frames, act, indices)
+        sequence = []
+        for index, act in enumerate(chosen):
+            sequence.append(self._recorded[act][index])
+            tick()
+        return sequence
+
+    def _complete(self, scene: int, frames: int, act: Act, indices: Sequence[int]) -> None:
+        """Read or record the frames of these numbers."""
+        path = None if self._folder is None else self._folder / self._file(scene, act)
+        known = self._recorded.setdefault(act, {})
+        if not known and path is not None and path.exists():
+            known.update(load(path, self._detector.info))
+        missing = [index for index in indices if index not in known]
+        if not missing:
+            return
+        for index, met in zip(missing, self._encounters.met(scene, frames, act, missing), strict=True):
+            honest = self._recorded[NOBODY_ACTS][index] if act.acting else None
+            known[index] = record(self._detector, met, honest)
+        if path is not None:
+            save(path, known)
+
+    def _file(self, scene: int, act: Act) -> str:
+        info = self._detector.info
+        identity = [FORMAT, info.name, info.weights_digest, scene, act.attack, *act.acting]
+        digest = hashlib.sha256(json.dumps([*identity, self._seed, self._pose_error_m]).encode()).hexdigest()
+        return f"{scene}-{re.sub('[^A-Za-z0-9-]', '-', act.attack)}-{len(act.acting)}-{digest[:16]}.npz"
 
 
-def save(path: Path, frames: Sequence[RecordedFrame]) -> None:
-    """Write frames of one team to an ``.npz`` file; boxes are rounded to float32."""
-    head = [{"attackers": sorted(f.attackers), "team": list(f.team)} for f in frames]
-    subsets = [(f, boxes) for f in frames for _, boxes in _in_order(f)]
+def save(path: Path, frames: Mapping[int, RecordedFrame]) -> None:
+    """Write frames of one team, by their numbers, to an ``.npz`` file, which takes its place at once."""
+    ordered = sorted(frames.items())
+    head = [{"index": i, "attackers": sorted(f.attackers), "team": list(f.team)} for i, f in ordered]
+    subsets = [(f, boxes) for _, f in ordered for _, boxes in _in_order(f)]
+    partial = path.with_name(f"{path.stem}.{os.getpid()}.npz")
     np.savez_compressed(
-        path,
+        partial,
         head=np.array(json.dumps(head)),
-        pose=np.stack([f.pose for f in frames]),
-        truth=np.concatenate([f.truth for f in frames]),
-        truths=np.array([len(f.truth) for f in frames]),
+        pose=np.stack([f.pose for _, f in ordered]),
+        truth=np.concatenate([f.truth for _, f in ordered]),
+        truths=np.array([len(f.truth) for _, f in ordered]),
         boxes=np.concatenate([boxes for _, boxes in subsets]).astype(np.float32),
         counts=np.array([len(boxes) for _, boxes in subsets]),
     )
+    partial.replace(path)
 
 
-def load(path: Path, info: DetectorInfo) -> list[RecordedFrame]:
+def load(path: Path, info: DetectorInfo) -> dict[int, RecordedFrame]:
     """Frames that `save` wrote; ``info`` is the detector's that decoded them."""
     with np.load(path) as file:
         head = json.loads(str(file["head"]))
         poses, truths = file["pose"], np.split(file["truth"], np.cumsum(file["truths"])[:-1])
         boxes = iter(np.split(file["boxes"].astype(np.float64), np.cumsum(file["counts"])[:-1]))
-    frames = []
+    frames = {}
     for entry, pose, truth in zip(head, poses, truths, strict=True):
         team = tuple(entry["team"])
         decoded = {subset: next(boxes) for subset in _subsets(team)}
-        frames.append(RecordedFrame(info, pose, team, frozenset(entry["attackers"]), truth, decoded))
+        frames[entry["index"]] = RecordedFrame(info, pose, team, frozenset(entry["attackers"]), truth, decoded)
     return frames
 
 

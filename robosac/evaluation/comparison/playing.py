@@ -1,269 +1,235 @@
-"""Plays every defence on the same recorded sequences, and sums up what it did."""
+"""Plays every defence on the same test sequences."""
 
 from __future__ import annotations
 
 import zlib
-from collections.abc import Callable, Collection, Iterator, Mapping, Sequence
+from collections.abc import Callable, Collection, Mapping, Sequence
 from dataclasses import dataclass, field
+from pathlib import Path
 
 import numpy as np
 
-from robosac.attacks import Campaign, load_campaign
 from robosac.boxes import FloatArray
 from robosac.defenses import Defense
-from robosac.detectors import Detector, Message
-from robosac.detectors.base import for_role
-from robosac.evaluation.average_precision import AveragePrecision
+from robosac.detectors import Detector
+from robosac.evaluation.average_precision import Matched, match
 from robosac.evaluation.comparison.settings import Extent, Setting
-from robosac.evaluation.frames import DecodedOnce, EvaluationFrame, encode_all, under_attack
-from robosac.fusion import fuse
-from robosac.previous import PreviousAnswer
-from robosac.scenes import IntersectionScene, SceneFrame
-from robosac.scenes.splits import TEST_SEEDS
+from robosac.evaluation.encounters import EGO, Live
+from robosac.evaluation.playing import FaultyDefense, PlayableFrame, play
+from robosac.evaluation.recordings import Recordings
+from robosac.scenes import IntersectionScene
 
-EGO = "car-1"
-EARLY = 5
-"""The frames after these count as steady."""
 ORACLE = "oracle"
 EGO_ONLY = "ego only"
 
 
-class FaultyDefense(RuntimeError):
-    """A defence failed on a frame; an evaluation must not answer over that."""
-
-
 @dataclass(frozen=True)
-class Row:
-    """What one defence did in one setting, over all frames.
+class Plan:
+    """What is played.
 
     Attributes
-    ----------
-    setting : Setting
-    defense : str
-        Or `ORACLE`, the fusion of everybody who is honest in the frame, or `EGO_ONLY`.
-    ap50, ap70 : float
-    passes_first, passes_early, passes_steady : float
-        Fused passes a frame: in the first, in frames 2 to 5, and afterwards.
-    infiltrated : float
-        Share of frames with an attacking message in the answer.
-    honest_refused : float or None
-        Share of honest messages left out of the answers; None where there are none.
-    named_all : float or None
-        Share of sequences in which all attackers were named; None where the defence names nobody or nobody attacks.
-    frames_to_name : float or None
-        Frames from the first strike until all attackers are named, the mean over those sequences.
-    honest_named : float or None
-        Share of honest teammates that were ever named; None where the defence names nobody.
-    """
-
-    setting: Setting
-    defense: str
-    ap50: float
-    ap70: float
-    passes_first: float
-    passes_early: float
-    passes_steady: float
-    infiltrated: float
-    honest_refused: float | None
-    named_all: float | None = None
-    frames_to_name: float | None = None
-    honest_named: float | None = None
-
-
-class CountedFrame(DecodedOnce):
-    """A test frame in which each subset is decoded once, whoever asks, and fused passes are counted for each who does.
-
-    Parameters
-    ----------
-    detector : Detector
-    met : EvaluationFrame
-    honest : DecodedOnce
-        The same frame without an attack, shared by all settings.
-
-    Attributes
-    ----------
-    passes : int
-        Fused subsets asked for since it was set to 0.
-    """
-
-    def __init__(self, detector: Detector, met: EvaluationFrame, honest: DecodedOnce) -> None:
-        super().__init__(detector, met.ego, met.received)
-        self.met = met
-        self.passes = 0
-        self._honest = honest
-
-    def detect(self, teammates: Collection[str] = ()) -> FloatArray:
-        """Boxes of a subset; a fused one is a pass. Subsets without an attacker are those of the honest frame."""
-        self.passes += bool(teammates)
-        return self._honest.detect(teammates) if self.met.attackers.isdisjoint(teammates) else super().detect(teammates)
-
-
-@dataclass(frozen=True)
-class _Sensed:
-    """A frame before anybody attacks."""
-
-    messages: Mapping[str, Message]
-    truth: FloatArray
-    honest: DecodedOnce
-
-    @classmethod
-    def of(cls, detector: Detector, frame: SceneFrame) -> _Sensed:
-        messages = encode_all(detector, frame)
-        teammates = {n: for_role(m, detector.info, "teammate") for n, m in messages.items() if n != EGO}
-        return cls(messages, frame.truth(EGO), DecodedOnce(detector, messages[EGO], teammates))
-
-
-@dataclass
-class _Tally:
-    """One row in the making."""
-
-    ap: AveragePrecision = field(default_factory=AveragePrecision)
-    passes: list[list[int]] = field(default_factory=lambda: [[], [], []])
-    infiltrated: list[bool] = field(default_factory=list)
-    refused: list[bool] = field(default_factory=list)
-    names: bool = False
-    all_named_after: list[int | None] = field(default_factory=list)
-    honest_named: list[bool] = field(default_factory=list)
-
-    def add(self, index: int, frame: CountedFrame, boxes: FloatArray, accepted: Collection[str], passes: int) -> None:
-        met = frame.met
-        self.ap.add(boxes, met.truth)
-        self.passes[0 if index == 0 else 1 if index < EARLY else 2].append(passes)
-        self.infiltrated.append(not met.attackers.isdisjoint(accepted))
-        self.refused += [name not in accepted for name in met.received if name not in met.attackers]
-
-    def row(self, setting: Setting, defense: str) -> Row:
-        first, early, steady = (float(np.mean(values)) if values else float("nan") for values in self.passes)
-        found = [after for after in self.all_named_after if after is not None]
-        return Row(
-            setting,
-            defense,
-            self.ap.at(0.5),
-            self.ap.at(0.7),
-            first,
-            early,
-            steady,
-            infiltrated=float(np.mean(self.infiltrated)),
-            honest_refused=float(np.mean(self.refused)) if self.refused else None,
-            named_all=len(found) / len(self.all_named_after) if self.names and self.all_named_after else None,
-            frames_to_name=float(np.mean(found)) if self.names and found else None,
-            honest_named=float(np.mean(self.honest_named)) if self.names and self.honest_named else None,
-        )
-
-
-def compare_defenses(
-    detector: Detector,
-    defenses: Mapping[str, Defense],
-    extent: Extent,
-    seed: int = 0,
-    tick: Callable[[], None] = lambda: None,
-) -> list[Row]:
-    """Every defence in every setting.
-
-    A frame's subsets are decoded once, whichever defence asks first, so a further defence costs little. The rows of a
-    defence depend neither on the other defences nor on the other settings. A defence that names attackers lists them
-    under ``named`` in its state.
-
-    Parameters
     ----------
     detector : Detector
     defenses : mapping of name to Defense
     extent : Extent
     seed : int
         Of attackers, attacks and draws.
+    recordings : Path, optional
+        Folder in which recorded frames are kept and looked for.
+    pose_error_m : float
+        Of the teammates, as `Recordings` takes it.
+    live : bool
+        Record nothing: each defence decodes for itself, and is timed.
+    """
+
+    detector: Detector
+    defenses: Mapping[str, Defense]
+    extent: Extent
+    seed: int = 0
+    recordings: Path | None = None
+    pose_error_m: float = 0.0
+    live: bool = False
+
+    @property
+    def rows(self) -> tuple[str, ...]:
+        """Names of what has a row in each setting."""
+        return (ORACLE, *self.defenses, EGO_ONLY)
+
+
+@dataclass(frozen=True)
+class Naming:
+    """Whom a defence named in a sequence.
+
+    Attributes
+    ----------
+    struck : int
+        Attackers that acted in it.
+    after : tuple of int
+        Of each of them that was named: frames since its first strike, at least 1.
+    all_after : int or None
+        Frames since the first strike of all until all attackers were named together; None if they never were.
+    honest_named, honest : int
+        Honest teammates that were ever named, and all of them.
+    """
+
+    struck: int
+    after: tuple[int, ...]
+    all_after: int | None
+    honest_named: int
+    honest: int
+
+
+@dataclass
+class Played:
+    """What one defence did in one sequence; lists are by frame.
+
+    Attributes
+    ----------
+    matched : list of Matched
+        Its answers.
+    infiltrated : list of bool
+        Whether an attacking message is in the answer.
+    refused, honest : list of int
+        Honest messages that are not in the answer, and all of them.
+    passes : list of int
+        Fused.
+    milliseconds : list of float
+        Empty unless live.
+    naming : Naming or None
+        None where the defence names nobody.
+    """
+
+    matched: list[Matched] = field(default_factory=list)
+    infiltrated: list[bool] = field(default_factory=list)
+    refused: list[int] = field(default_factory=list)
+    honest: list[int] = field(default_factory=list)
+    passes: list[int] = field(default_factory=list)
+    milliseconds: list[float] = field(default_factory=list)
+    naming: Naming | None = None
+
+    def add(self, frame: PlayableFrame, matched: Matched, accepted: Collection[str], passes: int) -> None:
+        """Add a frame."""
+        honest = _honest(frame)
+        self.matched.append(matched)
+        self.infiltrated.append(not frame.attackers.isdisjoint(accepted))
+        self.refused.append(sum(name not in accepted for name in honest))
+        self.honest.append(len(honest))
+        self.passes.append(passes)
+
+
+def play_scene(
+    plan: Plan, scene_seed: int, tick: Callable[[], None] = lambda: None
+) -> dict[tuple[Setting, str], Played]:
+    """Every defence in every setting, in one test scene.
+
+    Parameters
+    ----------
+    plan : Plan
+    scene_seed : int
     tick : callable
         Called after each frame of each setting.
-
-    Returns
-    -------
-    list of Row
-        For each setting: oracle, the defences, ego only.
 
     Raises
     ------
     FaultyDefense
         If a defence fails.
     """
-    rows = [ORACLE, *defenses, EGO_ONLY]
-    tallies = {(setting, name): _Tally() for setting in extent.settings for name in rows}
-    for scene_seed in TEST_SEEDS[: extent.scenes]:
-        scene = IntersectionScene(scene_seed)
-        sensed = [_Sensed.of(detector, frame) for frame in scene.frames(extent.frames)]
-        for setting in extent.settings:
-            chosen = _attackers(scene, setting.attackers, seed)
-            sequence = []
-            for frame in _attacked(detector, sensed, chosen, setting, [seed, scene_seed]):
-                sequence.append(frame)
-                tick()
-            _add_references(sequence, tallies[setting, ORACLE], tallies[setting, EGO_ONLY])
-            for name, defense in defenses.items():
-                rng = np.random.default_rng([seed, scene_seed, _stream(name)])
-                _play(name, defense, sequence, chosen, tallies[setting, name], rng)
-    return [tallies[setting, name].row(setting, name) for setting in extent.settings for name in rows]
+    source: Live | Recordings
+    if plan.live:
+        source = Live(plan.detector, seed=plan.seed, pose_error_m=plan.pose_error_m)
+    else:
+        source = Recordings(plan.detector, plan.recordings, seed=plan.seed, pose_error_m=plan.pose_error_m)
+    played: dict[tuple[Setting, str], Played] = {}
+    for setting in plan.extent.settings:
+        chosen = attackers(scene_seed, setting.attackers, plan.seed)
+        sequence = source.sequence(scene_seed, plan.extent.frames, setting.campaign, chosen, tick)
+        matcher = _Matcher(sequence)
+        played[setting, ORACLE] = _reference(sequence, matcher, _honest)
+        for name, defense in plan.defenses.items():
+            rng = np.random.default_rng([plan.seed, scene_seed, zlib.crc32(name.encode())])
+            try:
+                played[setting, name] = _play(defense, sequence, matcher, chosen, rng)
+            except FaultyDefense as fault:
+                raise FaultyDefense(f"{name}, {fault}") from fault
+        played[setting, EGO_ONLY] = _reference(sequence, matcher, lambda _: ())
+    return played
 
 
-def _stream(name: str) -> int:
-    """A stream of random numbers of its own for each name."""
-    return zlib.crc32(name.encode())
-
-
-def _attackers(scene: IntersectionScene, count: int, seed: int) -> list[str]:
-    """Of the scene's teammates; the same ones and more with a higher count."""
-    team = sorted(set(scene.agents) - {EGO})
-    order = np.random.default_rng([seed, scene.seed]).permutation(len(team))
+def attackers(scene_seed: int, count: int, seed: int) -> list[str]:
+    """Teammates of the scene that are under the adversary's control; the same ones and more with a higher count."""
+    team = sorted(set(IntersectionScene(scene_seed).agents) - {EGO})
+    order = np.random.default_rng([seed, scene_seed]).permutation(len(team))
     return [team[i] for i in order[:count]]
 
 
-def _attacked(
-    detector: Detector,
-    sensed: Sequence[_Sensed],
-    chosen: Sequence[str],
-    setting: Setting,
-    seed: Sequence[int],
-) -> Iterator[CountedFrame]:
-    campaign: Campaign = load_campaign(setting.campaign)
-    rng = np.random.default_rng([*seed, _stream(setting.label)])
-    for index, frame in enumerate(sensed):
-        met = under_attack(detector, frame.messages, frame.truth, EGO, chosen, campaign, rng, index)
-        yield CountedFrame(detector, met, frame.honest)
+def _honest(frame: PlayableFrame) -> tuple[str, ...]:
+    return tuple(name for name in frame.team if name not in frame.attackers)
 
 
-def _add_references(sequence: Sequence[CountedFrame], oracle: _Tally, ego_only: _Tally) -> None:
+class _Matcher:
+    """Matches each answer to a frame of a sequence once, however many defences give it."""
+
+    def __init__(self, sequence: Sequence[PlayableFrame]) -> None:
+        self._sequence = sequence
+        self._known: dict[tuple[int, bytes], Matched] = {}
+
+    def __call__(self, index: int, boxes: FloatArray) -> Matched:
+        key = (index, boxes.tobytes())
+        if key not in self._known:
+            self._known[key] = match(boxes, self._sequence[index].truth)
+        return self._known[key]
+
+
+def _reference(
+    sequence: Sequence[PlayableFrame], matcher: _Matcher, choose: Callable[[PlayableFrame], tuple[str, ...]]
+) -> Played:
+    """Fuse what is chosen in each frame, whatever it looks like."""
+    played = Played()
     for index, frame in enumerate(sequence):
-        honest = [name for name in frame.met.received if name not in frame.met.attackers]
-        oracle.add(index, frame, frame.detect(honest), honest, int(bool(honest)))
-        ego_only.add(index, frame, frame.detect(), (), 0)
+        accepted = choose(frame)
+        boxes = frame.prepare(frame.ego, frame.teammates).detect(accepted)
+        played.add(frame, matcher(index, boxes), accepted, int(bool(accepted)))
+    return played
 
 
 def _play(
-    name: str,
     defense: Defense,
-    sequence: Sequence[CountedFrame],
-    chosen: Sequence[str],
-    tally: _Tally,
+    sequence: Sequence[PlayableFrame],
+    matcher: _Matcher,
+    chosen: Collection[str],
     rng: np.random.Generator,
-) -> None:
+) -> Played:
     """One sequence as a session, with the defence's memory."""
-    team = sorted(sequence[0].met.received)
-    state = defense.initial_state(team)
-    previous: PreviousAnswer | None = None
-    ever_named: set[str] = set()
-    struck: int | None = None
-    after: int | None = None
+    played = Played()
+    named: list[frozenset[str]] = []
+    names = False
+    for index, (frame, answer) in enumerate(zip(sequence, play(defense, sequence, rng), strict=True)):
+        result = answer.result
+        played.add(frame, matcher(index, result.boxes), result.accepted, answer.passes)
+        played.milliseconds.append(answer.milliseconds)
+        names |= "named" in result.state
+        named.append(frozenset(result.state.get("named", ())))
+    if names:
+        played.naming = _naming(sequence, named, chosen)
+    return played
+
+
+def _naming(sequence: Sequence[PlayableFrame], named: Sequence[frozenset[str]], chosen: Collection[str]) -> Naming:
+    strikes: dict[str, int] = {}
+    after: dict[str, int] = {}
+    all_after: int | None = None
     for index, frame in enumerate(sequence):
-        met = frame.met
-        frame.passes = 0
-        result = fuse(frame, defense, met.ego, met.received, rng=rng, state=state, frame=index, previous=previous)
-        if result.fault is not None:
-            raise FaultyDefense(f"{name}, frame {index}: {result.fault}")
-        state, previous = result.state, result.previous
-        tally.add(index, frame, result.boxes, result.accepted, frame.passes)
-        tally.names |= "named" in state
-        ever_named |= set(state.get("named", ()))
-        if struck is None and met.attackers:
-            struck = index
-        if struck is not None and after is None and set(chosen) <= set(state.get("named", ())):
-            after = index - struck + 1
-    if struck is not None:
-        tally.all_named_after.append(after)
-    tally.honest_named += [teammate in ever_named for teammate in team if teammate not in chosen]
+        for name in frame.attackers:
+            strikes.setdefault(name, index)
+        for name in named[index] & set(strikes):
+            after.setdefault(name, index - strikes[name] + 1)
+        if strikes and all_after is None and named[index].issuperset(chosen):
+            all_after = index - min(strikes.values()) + 1
+    honest = set(sequence[0].team) - set(chosen)
+    return Naming(
+        struck=len(strikes),
+        after=tuple(after[name] for name in sorted(after)),
+        all_after=all_after,
+        honest_named=len(honest & frozenset[str]().union(*named)),
+        honest=len(honest),
+    )

@@ -5,7 +5,7 @@ from __future__ import annotations
 from collections.abc import Callable, Mapping
 from dataclasses import dataclass
 
-from robosac.attacks import HONEST
+from robosac.attacks import HONEST, load_campaign
 from robosac.calibration import calibration_of
 from robosac.defenses import (
     A2CP,
@@ -19,6 +19,9 @@ from robosac.defenses import (
     Undefended,
 )
 from robosac.detectors import Detector
+
+TEAMMATES = 5
+"""Of the ego, in every test scene."""
 
 DEFENSES: Mapping[str, Callable[[Detector], Defense]] = {
     "no defence": lambda _: Undefended(),
@@ -48,6 +51,21 @@ class Setting:
 
     campaign: str
     attackers: int
+
+    @classmethod
+    def parse(cls, text: str) -> Setting:
+        """Read ``CAMPAIGN:NUMBER``; a campaign may hold colons itself.
+
+        Raises
+        ------
+        ValueError
+            If there is no such campaign, or no number from 0 to `TEAMMATES`.
+        """
+        campaign, _, number = text.rpartition(":")
+        if not campaign or not number.isdecimal() or int(number) > TEAMMATES:
+            raise ValueError(f"{text!r} is not CAMPAIGN:NUMBER with a number from 0 to {TEAMMATES}")
+        load_campaign(campaign)
+        return cls(campaign, int(number)) if int(number) else NOBODY
 
     @property
     def label(self) -> str:
@@ -80,7 +98,7 @@ def _settings(*numbers: tuple[str, int]) -> tuple[Setting, ...]:
 
 FULL = Extent(
     settings=_settings(
-        *(("pgd", n) for n in (1, 2, 3, 4)),
+        *((attack, n) for attack in ("pgd", "bim", "cw") for n in (1, 2, 3, 4)),
         *(("erase", n) for n in (1, 2, 3)),
         *(("invent", n) for n in (1, 2)),
         *(("shift", n) for n in (1, 2)),
@@ -94,10 +112,11 @@ FULL = Extent(
         ("erase@flicker", 1),
         ("erase@turns", 2),
         ("pgd@covering", 2),
+        ("pgd@covering@asleep", 2),
         ("pgd@framing", 1),
         ("honest@false-pose", 1),
     ),
-    scenes=10,
+    scenes=40,
     frames=25,
 )
 QUICK = Extent(

@@ -14,6 +14,8 @@ from robosac.defenses import GroupTesting
 from robosac.defenses.group_testing import Calibration, CalibrationError
 from robosac.detectors import DetectorInfo
 from robosac.detectors.embedded import SHIPPED_WEIGHTS, EmbeddedDetector
+from robosac.evaluation.encounters import LiveFrame
+from robosac.evaluation.frames import EvaluationFrame
 from robosac.evaluation.playing import play
 from robosac.evaluation.recordings import RecordedFrame
 from tests.robosac.defenses.group_testing.conversing import SEEN, make_model, shifted
@@ -102,23 +104,11 @@ def test_the_shipped_detector_is_calibrated(detector):
 
 def test_the_shipped_detector_finds_an_attacker(detector, ego_message, attacked):
     defense = GroupTesting.calibrated(calibration_of(detector.info))
-    frame = _Live(detector, ego_message, attacked)
-    results = play(defense, [frame] * 3, np.random.default_rng(0))
+    frame = LiveFrame(detector, EvaluationFrame(ego_message, {}, attacked, frozenset({"car-2"}), np.empty((0, 5))))
+    results = [answer.result for answer in play(defense, [frame] * 3, np.random.default_rng(0))]
     assert all("car-2" not in r.accepted for r in results)
     assert results[-1].suspicion["car-2"] > 0.95
     assert max(p for name, p in results[-1].suspicion.items() if name != "car-2") < 0.2
-
-
-class _Live:
-    """A frame that is decoded when asked for."""
-
-    def __init__(self, detector, ego, teammates):
-        self.info, self.ego, self.teammates = detector.info, ego, teammates
-        self.team = tuple(sorted(teammates))
-        self._detector = detector
-
-    def prepare(self, ego, teammates):
-        return self._detector.prepare(ego, teammates)
 
 
 def test_reliability_compares_suspicion_with_the_truth():

@@ -74,3 +74,29 @@ def test_scores_rank_across_frames():
 
 def test_without_any_truth_there_is_no_average_precision():
     assert math.isnan(AveragePrecision().at(0.5))
+
+
+@pytest.mark.parametrize("threshold", [0.5, 0.7])
+def test_groups_are_left_out_in_turn(threshold, rng):
+    frames = []
+    for group in (0, 1, 2, 2, 7):
+        moved = TRUTH[rng.integers(0, 4, 9)] + rng.normal(0, 0.4, (9, 5)) * [1, 1, 0, 0, 0.1]
+        frames.append((group, scored(moved, rng.random(9).round(1)), TRUTH[: 1 + group % 4]))
+    frames.append((1, NONE, TRUTH))
+
+    def precision(without=None):
+        ap = AveragePrecision()
+        for group, found, truth in frames:
+            if group != without:
+                ap.add(found, truth, group)
+        return ap
+
+    (left_out,) = precision().leaving_out(threshold)
+    assert left_out == pytest.approx([precision(group).at(threshold) for group in (0, 1, 2, 7)], abs=1e-12)
+    assert len(set(left_out)) == 4
+
+
+def test_nothing_is_left_of_a_single_group():
+    ap = AveragePrecision()
+    ap.add(scored(TRUTH, [0.9] * 4), TRUTH)
+    assert np.isnan(ap.leaving_out(0.5, 0.7)).tolist() == [[True], [True]]

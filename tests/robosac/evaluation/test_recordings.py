@@ -3,13 +3,13 @@ from dataclasses import replace
 import numpy as np
 import pytest
 
-from robosac.attacks import PGD
 from robosac.boxes import pose_matrix
-from robosac.defenses import SampleConsensus, StaticTeam, Undefended
+from robosac.defenses import A2CP, Halving, OneByOne, SampleConsensus, StaticTeam, Undefended
 from robosac.detectors import Message
+from robosac.evaluation.encounters import acts
 from robosac.evaluation.frames import EvaluationFrame, misplaced
-from robosac.evaluation.playing import Tally, play
-from robosac.evaluation.recordings import load, record, record_sequence, save
+from robosac.evaluation.playing import FaultyDefense, play
+from robosac.evaluation.recordings import Recordings, load, record, save
 
 TEAM = ("car-2", "car-3", "rsu")
 
@@ -30,7 +30,7 @@ def test_every_subset_is_as_it_is_decoded(detector, recorded):
     assert len(frame.boxes) == 8
     prepared = detector.prepare(met.ego, met.received)
     for subset in ((), ("rsu",), ("car-2", "rsu"), TEAM):
-        np.testing.assert_array_equal(frame.detect(subset), prepared.detect(subset))
+        np.testing.assert_array_equal(frame.detect(subset), prepared.detect(subset).astype(np.float32))
 
 
 def test_what_no_attacker_touches_is_taken_from_the_honest_frame(recorded):
@@ -42,46 +42,155 @@ def test_what_no_attacker_touches_is_taken_from_the_honest_frame(recorded):
 
 def test_frames_survive_a_file(recorded, tmp_path):
     honest, frame, _ = recorded
-    save(tmp_path / "x.npz", [honest, frame])
+    save(tmp_path / "x.npz", {7: frame, 3: honest})
     again = load(tmp_path / "x.npz", frame.info)
-    assert [f.attackers for f in again] == [frozenset(), {"car-2"}]
-    for before, after in zip((honest, frame), again, strict=True):
+    assert {index: f.attackers for index, f in again.items()} == {3: frozenset(), 7: {"car-2"}}
+    for before, after in ((honest, again[3]), (frame, again[7])):
         assert after.team == TEAM
         np.testing.assert_array_equal(after.pose, before.pose)
         np.testing.assert_array_equal(after.truth, before.truth)
         for subset, boxes in before.boxes.items():
-            np.testing.assert_allclose(after.detect(subset), boxes, rtol=1e-6, atol=1e-5)
+            np.testing.assert_array_equal(after.detect(subset), boxes)
 
 
-def test_a_sequence_keeps_its_attackers(detector):
-    frames = list(record_sequence(detector, 4, 1, PGD(steps=1), ["car-3"], np.random.default_rng(0)))
-    assert [f.attackers for f in frames] == [{"car-3"}]
-    assert len(frames[0].boxes) == 32
+def same(one, other):
+    """Whether two recorded frames are equal to the last bit."""
+    return (one.team, one.attackers) == (other.team, other.attackers) and all(
+        np.array_equal(boxes, other.boxes[subset]) for subset, boxes in one.boxes.items()
+    )
 
 
-def test_playing_counts_passes_infiltration_and_precision(recorded):
-    honest, frame, _ = recorded
-    sequence = [honest, frame, frame]
-    tally = Tally(steady_from=1)
-    tally.add(sequence, play(Undefended(), sequence, np.random.default_rng(0)))
-    assert tally.infiltrated == [True, True]
-    assert tally.ap.at(0.5) == tally.undefended.at(0.5) < tally.oracle.at(0.5)
-    assert (tally.first, tally.early, tally.steady) == ([0], [], [0, 0])
-    assert (tally.honest, tally.honest_named, tally.attackers, tally.unnamed) == (2, 0, 1, 1)
-    tally.add(sequence, play(SampleConsensus(), sequence, np.random.default_rng(0)))
-    assert tally.first[1] >= 1
+class Counting:
+    """The detector, counting what it prepares."""
+
+    def __init__(self, detector, **info):
+        self.info = replace(detector.info, **info)
+        self.prepared = 0
+        self._detector = detector
+
+    def prepare(self, ego, teammates):
+        self.prepared += 1
+        return self._detector.prepare(ego, teammates)
+
+    def __getattr__(self, name):
+        return getattr(self._detector, name)
+
+
+@pytest.fixture
+def counting(detector):
+    return Counting(detector)
+
+
+def test_a_sequence_is_as_the_ego_meets_it(detector):
+    ticks = []
+    (first, last) = Recordings(detector).sequence(4, 2, "noise", ["car-3"], lambda: ticks.append(1))
+    assert (first.attackers, last.attackers) == ({"car-3"}, {"car-3"})
+    assert first.team == ("car-2", "car-3", "car-4", "car-5", "rsu")
+    assert len(first.boxes) == 32
+    assert not np.array_equal(first.pose, last.pose)
+    assert len(ticks) == 2
+
+
+def test_a_kept_frame_is_not_recorded_again(counting, tmp_path):
+    once = Recordings(counting, tmp_path).sequence(4, 2, "noise", ["car-3"])
+    assert counting.prepared == 4  # two honest ones and two under attack
+    again = Recordings(counting, tmp_path).sequence(4, 2, "noise", ["car-3"])
+    assert counting.prepared == 4
+    assert all(map(same, once, again))
+    more = Recordings(counting, tmp_path).sequence(4, 3, "noise", ["car-3"])
+    assert counting.prepared == 6
+    assert all(map(same, once, more))
+    assert len(list(tmp_path.iterdir())) == 2
+
+
+def test_a_frame_does_not_depend_on_what_else_is_recorded(detector, tmp_path):
+    recordings = Recordings(detector, tmp_path)
+    recordings.sequence(4, 1)
+    recordings.sequence(4, 2, "noise", ["rsu"])
+    later = recordings.sequence(4, 2, "noise", ["car-3"])
+    assert all(map(same, Recordings(detector).sequence(4, 2, "noise", ["car-3"]), later))
+
+
+def test_campaigns_that_differ_in_their_schedule_share_frames(counting, tmp_path):
+    recordings = Recordings(counting, tmp_path)
+    always = recordings.sequence(4, 12, "noise", ["car-3"])
+    honest = recordings.sequence(4, 12)
+    before = counting.prepared
+    asleep = recordings.sequence(4, 12, "noise@asleep", ["car-3"])
+    assert counting.prepared == before
+    assert all(one is other for one, other in zip(asleep, [*honest[:10], *always[10:]], strict=True))
+    flicker = recordings.sequence(4, 12, "noise@flicker", ["car-3"])
+    assert counting.prepared == before
+    struck = [frame is at_all_times for frame, at_all_times in zip(flicker, always, strict=True)]
+    assert 0 < sum(struck) < 12
+
+
+def test_turns_are_taken_by_one_at_a_time(detector):
+    frames = Recordings(detector).sequence(4, 6, "noise@turns", ["car-3", "car-2"])
+    assert [sorted(frame.attackers) for frame in frames] == [["car-2"]] * 5 + [["car-3"]]
+
+
+def test_a_pretence_is_no_schedule():
+    assert acts("honest@false-pose", ["rsu"], 1) == [("honest@false-pose", ("rsu",))]
+    assert acts("pgd@covering@asleep", ["b", "a"], 11)[9:] == [("honest", ()), ("pgd@covering", ("a", "b"))]
+    assert acts("erase@asleep@flicker", ["a"], 3)[1] == ("erase", ("a",))
+    assert acts("erase", [], 1) == [("honest", ())]
+
+
+def test_other_weights_seeds_and_poses_are_not_mixed_up(detector, tmp_path):
+    others = [
+        Recordings(detector, tmp_path),
+        Recordings(Counting(detector, weights_digest="1" * 64), tmp_path),
+        Recordings(detector, tmp_path, seed=1),
+        Recordings(detector, tmp_path, pose_error_m=0.2),
+    ]
+    plain, _, seeded, misled = (recordings.sequence(4, 1, "noise", ["car-3"])[0] for recordings in others)
+    assert len(list(tmp_path.iterdir())) == 8
+    assert not same(plain, seeded)
+    np.testing.assert_array_equal(plain.detect(("rsu",)), seeded.detect(("rsu",)))
+    assert not np.array_equal(plain.detect(("rsu",)), misled.detect(("rsu",)))
+    np.testing.assert_array_equal(plain.detect(), misled.detect())
+
+
+def test_passes_are_fused_subsets_each_counted_once(recorded):
+    _, frame, _ = recorded
+
+    def passes(defense):
+        return [answer.passes for answer in play(defense, [frame] * 3, np.random.default_rng(0))]
+
+    assert passes(Undefended()) == [1, 1, 1]
+    assert passes(StaticTeam(collaborators=2))[1:] == [1, 1]  # trusted, and not tested
+    assert passes(OneByOne()) == [4, 4, 4]
+    asked = []
+    spied = replace(frame, boxes=_Spied(frame.boxes, asked))
+    for defense in (A2CP(), Halving(), SampleConsensus(distinct=False)):
+        for seed in range(5):
+            asked.clear()
+            (answer,) = play(defense, [spied], np.random.default_rng(seed))
+            assert answer.passes == sum(map(bool, asked))
+
+
+class _Spied(dict):
+    def __init__(self, boxes, asked):
+        super().__init__(boxes)
+        self._asked = asked
+
+    def __getitem__(self, subset):
+        self._asked.append(subset)
+        return super().__getitem__(subset)
 
 
 def test_state_goes_from_frame_to_frame(recorded):
     honest, _, _ = recorded
-    results = play(StaticTeam(collaborators=2), [honest] * 3, np.random.default_rng(0))
-    assert [r.source.value for r in results] == ["consensus", "trusted", "trusted"]
+    answers = play(StaticTeam(collaborators=2), [honest] * 3, np.random.default_rng(0))
+    assert [answer.result.source.value for answer in answers] == ["consensus", "trusted", "trusted"]
+    assert all(answer.milliseconds > 0.0 for answer in answers)
 
 
 def test_a_fault_is_no_answer(recorded):
     honest, _, _ = recorded
     broken = replace(honest, boxes={frozenset(): honest.detect()})
-    with pytest.raises(RuntimeError, match="frame 0: KeyError"):
+    with pytest.raises(FaultyDefense, match="frame 0: KeyError"):
         play(SampleConsensus(collaborators=1), [broken], np.random.default_rng(0))
 
 

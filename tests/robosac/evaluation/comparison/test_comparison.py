@@ -9,9 +9,19 @@ from typer.testing import CliRunner
 from robosac.attacks import load_campaign
 from robosac.cli import app, compare
 from robosac.defenses import Decision, OneByOne, Reason, Rejection, SampleConsensus, Source, Undefended
-from robosac.evaluation.comparison import DEFENSES, FULL, QUICK, Extent, Setting, compare_defenses, write_comparison
-from robosac.evaluation.comparison.playing import FaultyDefense
+from robosac.evaluation.comparison import (
+    DEFENSES,
+    FULL,
+    QUICK,
+    Extent,
+    Plan,
+    Setting,
+    compare_defenses,
+    write_comparison,
+)
+from robosac.evaluation.comparison.rows import NamingFigures
 from robosac.evaluation.comparison.settings import NOBODY
+from robosac.evaluation.playing import FaultyDefense
 
 ERASED = Setting("erase", 1)
 LATE = Setting("noise@asleep", 2)
@@ -43,14 +53,24 @@ class Broken(Undefended):
 
 
 SMALL = Extent((NOBODY, ERASED), scenes=1, frames=6)
+TRIO = {"no defence": Undefended(), "one_by_one": OneByOne(), "sampling": SampleConsensus()}
 
 
 @pytest.fixture(scope="module")
-def rows(request):
-    detector = request.getfixturevalue("detector")
+def plan(detector, tmp_path_factory):
+    """Make a plan; recordings are shared."""
+    folder = tmp_path_factory.mktemp("recordings")
+
+    def make(defenses, extent):
+        return Plan(detector, defenses, extent, recordings=folder)
+
+    return make
+
+
+@pytest.fixture(scope="module")
+def rows(plan):
     ticks = []
-    defenses = {"no defence": Undefended(), "one_by_one": OneByOne(), "sampling": SampleConsensus()}
-    rows = compare_defenses(detector, defenses, SMALL, tick=lambda: ticks.append(1))
+    rows = compare_defenses(plan(TRIO, SMALL), tick=lambda: ticks.append(1))
     assert len(ticks) == 12
     return rows
 
@@ -63,12 +83,13 @@ def test_every_defence_meets_every_setting_between_oracle_and_ego_alone(rows):
 def test_what_was_answered_is_scored(rows):
     at = {(row.setting, row.defense): row for row in rows}
     quiet, ideal = at[NOBODY, "no defence"], at[NOBODY, "oracle"]
-    assert (quiet.ap50, quiet.ap70, quiet.infiltrated, quiet.honest_refused) == (ideal.ap50, ideal.ap70, 0.0, 0.0)
-    assert at[ERASED, "no defence"].ap70 < at[ERASED, "oracle"].ap70 - 0.05
-    assert at[ERASED, "no defence"].infiltrated == 1.0
-    assert at[ERASED, "oracle"].infiltrated == 0.0
+    assert (quiet.windows, quiet.whole.infiltrated, quiet.honest_refused) == (ideal.windows, 0.0, 0.0)
+    erased, ideal = at[ERASED, "no defence"].whole, at[ERASED, "oracle"].whole
+    assert erased.ap70.value < ideal.ap70.value - 0.05
+    assert (erased.infiltrated, ideal.infiltrated) == (1.0, 0.0)
+    assert ideal.ap70_ratio.value == 1.0
     alone = at[ERASED, "ego only"]
-    assert (alone.ap50, alone.honest_refused) == (at[NOBODY, "ego only"].ap50, 1.0)
+    assert (alone.whole.ap50, alone.honest_refused) == (at[NOBODY, "ego only"].whole.ap50, 1.0)
 
 
 def test_fused_passes_are_counted_for_each_defence_by_itself(rows):
@@ -84,43 +105,43 @@ def test_fused_passes_are_counted_for_each_defence_by_itself(rows):
 
 
 def test_a_row_depends_on_nothing_else_that_is_compared(rows, detector):
-    alone = compare_defenses(detector, {"sampling": SampleConsensus()}, Extent((ERASED,), 1, 6))
+    alone = compare_defenses(Plan(detector, {"sampling": SampleConsensus()}, Extent((ERASED,), 1, 6)))
     assert alone == [row for row in rows if row.setting == ERASED and row.defense in ("oracle", "sampling", "ego only")]
 
 
-def test_who_names_whom_and_when(detector):
+def test_who_names_whom_and_when(plan):
     late = Extent((Setting("noise@asleep", 1),), scenes=1, frames=13)  # strikes in frames 10, 11 and 12
-    (team_row,) = (r for r in compare_defenses(detector, {"mute": Undefended()}, late) if r.defense == "mute")
-    assert (team_row.named_all, team_row.honest_named) == (None, None)
+    assert [row.naming for row in compare_defenses(plan({"mute": Undefended()}, late))] == [None] * 3
     team = ("car-2", "car-3", "car-4", "car-5", "rsu")
     accusers = {
         "everybody": Accuser(accused=team, patience=11),  # from frame 11 on, the second strike
         "at once": Accuser(accused=team, patience=0),
         "nobody": Accuser(),
     }
-    at = {row.defense: row for row in compare_defenses(detector, accusers, late)}
-    assert (at["everybody"].named_all, at["everybody"].frames_to_name, at["everybody"].honest_named) == (1.0, 2.0, 1.0)
-    assert at["at once"].frames_to_name == 1.0
-    assert (at["nobody"].named_all, at["nobody"].frames_to_name, at["nobody"].honest_named) == (0.0, None, 0.0)
+    at = {row.defense: row.naming for row in compare_defenses(plan(accusers, late))}
+    assert at["everybody"] == NamingFigures(1.0, 2.0, 1, 1, 2.0, 2, 4, 4)
+    assert (at["at once"].frames_to_name, at["at once"].frames_to_name_each) == (1.0, 1.0)
+    assert at["nobody"] == NamingFigures(0.0, None, 0, 1, None, None, 0, 4)
     quiet = Extent((NOBODY,), scenes=1, frames=6)
-    (calm,) = (r for r in compare_defenses(detector, {"a": Accuser(accused=team[:2])}, quiet) if r.defense == "a")
-    assert (calm.named_all, calm.honest_named) == (None, 0.4)
+    (_, calm, _) = compare_defenses(plan({"a": Accuser(accused=team[:2])}, quiet))
+    assert calm.naming == NamingFigures(None, None, 0, 0, None, None, 2, 5)
 
 
-def test_a_sleeping_attacker_counts_as_honest_until_it_strikes(detector):
-    rows = compare_defenses(detector, {"no defence": Undefended()}, Extent((LATE,), scenes=1, frames=11))
+def test_a_sleeping_attacker_counts_as_honest_until_it_strikes(plan):
+    rows = compare_defenses(plan({"no defence": Undefended()}, Extent((LATE,), scenes=1, frames=11)))
     at = {row.defense: row for row in rows}
-    assert at["no defence"].infiltrated == pytest.approx(1 / 11)
+    infiltrated = {first: figures.infiltrated for first, figures in at["no defence"].windows.items()}
+    assert infiltrated == {0: pytest.approx(1 / 11), 5: pytest.approx(1 / 6), 10: 1.0}
     assert at["ego only"].honest_refused == 1.0
 
 
-def test_a_defence_that_fails_stops_the_comparison(detector):
+def test_a_defence_that_fails_stops_the_comparison(plan):
     with pytest.raises(FaultyDefense, match="worse, frame 0: RuntimeError: broken"):
-        compare_defenses(detector, {"worse": Broken()}, SMALL)
+        compare_defenses(plan({"worse": Broken()}, SMALL))
 
 
-def test_the_report_holds_tables_and_pictures(rows, tmp_path):
-    path = write_comparison(rows, SMALL, tmp_path, "the command")
+def test_the_report_holds_tables_and_pictures(rows, plan, tmp_path):
+    path = write_comparison(rows, plan(TRIO, SMALL), tmp_path, "the command")
     text = path.read_text()
     assert "`the command`: 1 test sequences of 6 frames" in text
     assert "| nobody attacks | " in text
@@ -139,15 +160,32 @@ def test_the_report_holds_tables_and_pictures(rows, tmp_path):
             row.setting.attackers,
             row.defense,
         )
-        assert float(line["ap70"]) == round(row.ap70, 4)
-        assert line["named_all"] == ""
+        assert float(line["ap70"]) == round(row.whole.ap70.value, 5)
+        assert float(line["ap70_difference_from_5"]) == round(row.windows[5].ap70_difference.value, 5)
+        assert float(line["infiltrated_from_5"]) == row.windows[5].infiltrated
+        empty = ("ap70_se", "ap50_from_10", "infiltrated_from_10", "named_all", "honest", "milliseconds")
+        assert [line[name] for name in empty] == [""] * len(empty)
 
 
-def test_naming_has_its_own_table(detector, tmp_path):
-    rows = compare_defenses(detector, {"a": Accuser()}, Extent((ERASED,), 1, 6))
-    text = write_comparison(rows, SMALL, tmp_path, "").read_text()
-    assert "| erase x 1 | 0.00 / - / 0.00 |" in text
-    assert "when nobody attacks" not in text
+def test_naming_has_its_own_tables(plan, tmp_path):
+    defenses = {"a": Accuser(accused=("car-2", "car-3", "car-4", "car-5", "rsu"), patience=1)}
+    extent = Extent((ERASED, NOBODY), 1, 6)
+    rows = compare_defenses(plan(defenses, extent))
+    text = write_comparison(rows, plan(defenses, extent), tmp_path, "").read_text()
+    assert "| erase x 1 | 1.00 / 2.00 / 4 of 4 |" in text
+    assert "## a in detail" in text
+    ideal, own = rows[0].windows[5], rows[1].windows[5]
+    assert (
+        f"| erase x 1 | {ideal.ap50.value:.3f} / {ideal.ap70.value:.3f} | "
+        f"{own.ap50.value:.3f} / {own.ap70.value:.3f} | "
+        f"{own.ap50.value - ideal.ap50.value:+.3f} / {own.ap70.value - ideal.ap70.value:+.3f} | - | - | "
+        f"{rows[1].whole.ap70.value / rows[0].whole.ap70.value:.3f} | {rows[2].whole.ap70.value:.3f} | "
+        "0.0 / 0.0 / 0.00 | 1 of 1 | 2.0, 2 | 4 of 4 |"
+    ) in text
+    assert "Honest teammates named, over all attacks: 9 of 9." in text
+    with (tmp_path / "comparison.csv").open() as file:
+        lines = [line for line in csv.DictReader(file) if line["defense"] == "a"]
+    assert [(line["honest_named"], line["honest"]) for line in lines] == [("4", "4"), ("5", "5")]
 
 
 def test_all_settings_can_be_made_and_attackers_leave_somebody_honest():
@@ -168,18 +206,58 @@ def test_the_command(tmp_path, monkeypatch):
     assert result.exit_code == 0, result.output
     text = (tmp_path / "out" / "comparison.md").read_text()
     assert "| attack | oracle | no defence | halving | ego only |" in text
-    assert "robosac compare --out DIR --seed 0 --only halving --only no defence --quick" in text
+    assert "`robosac compare --out DIR --seed 0 --only halving --only 'no defence' --quick`: 1 test sequence" in text
     unknown = CliRunner().invoke(app, ["compare", "--only", "nonesuch", "--out", str(tmp_path)])
     assert unknown.exit_code == 2
     assert "known: no defence" in unknown.output
 
 
-def test_every_defence_of_the_table_has_a_row_and_answers(detector):
+def test_the_command_with_all_its_options(tmp_path):
+    options = "--setting noise:1 --setting noise@asleep:1 --scenes 2 --frames 6 --pose-error 0.2"
+    kept = tmp_path / "kept"
+    arguments = ["compare", "--only", "halving", *options.split(), "--recordings", str(kept), "--out", str(tmp_path)]
+    result = CliRunner().invoke(app, arguments)
+    assert result.exit_code == 0, result.output
+    text = (tmp_path / "comparison.md").read_text()
+    assert "| noise@asleep x 1 |" in text
+    assert "wrong about their positions by 0.2 m" in text
+    repeated = options.replace("--pose-error", "--recordings DIR --pose-error")
+    assert f"`robosac compare --out DIR --seed 0 --only halving {repeated}`: 2 test sequences of 6 frames" in text
+    assert len(list(kept.iterdir())) == 4  # honest and noise, of two scenes
+    assert "+-" in text
+    assert compare.command({"--live": True, "--jobs": 2, "--detector": None}).endswith("DIR --live --jobs 2")
+
+
+@pytest.mark.parametrize(
+    ("arguments", "complaint"),
+    [
+        (["--setting", "nonesuch:1"], "unknown attack"),
+        (["--setting", "erase@nonesuch:1"], "unknown behaviour"),
+        (["--setting", "erase"], "CAMPAIGN:NUMBER"),
+        (["--setting", "erase:6"], "from 0 to 5"),
+        (["--frames", "5"], "Invalid value for '--frames'"),
+        (["--live", "--recordings", "x"], "nothing is recorded live"),
+    ],
+)
+def test_options_that_make_no_sense_are_refused(arguments, complaint, tmp_path):
+    result = CliRunner().invoke(app, ["compare", *arguments, "--out", str(tmp_path)], env={"COLUMNS": "200"})
+    assert result.exit_code == 2
+    assert complaint in result.output
+
+
+def test_settings_are_read_from_text():
+    assert Setting.parse("erase@asleep:2") == Setting("erase@asleep", 2)
+    assert Setting.parse("robosac.attacks:PGD@asleep:1") == Setting("robosac.attacks:PGD@asleep", 1)
+    assert Setting.parse("pgd:0") == Setting.parse("honest:0") == NOBODY
+
+
+def test_every_defence_of_the_table_has_a_row_and_answers(detector, plan):
     defenses = {name: make(detector) for name, make in DEFENSES.items()}
-    rows = compare_defenses(detector, defenses, Extent((Setting("pgd", 1),), scenes=1, frames=6))
+    rows = compare_defenses(plan(defenses, Extent((Setting("pgd", 1),), scenes=1, frames=6)))
     at = {row.defense: row for row in rows}
     assert set(at) == {"oracle", "ego only", *DEFENSES}
     for name in ("halving", "one_by_one", "conformal"):
-        assert at[name].infiltrated == 0.0
-        assert at[name].ap50 > at["ego only"].ap50 + 0.1
+        assert at[name].whole.infiltrated == 0.0
+        assert at[name].whole.ap50.value > at["ego only"].whole.ap50.value + 0.1
+    assert {name for name in DEFENSES if at[name].naming} == {name for name in DEFENSES if name.startswith("group")}
     assert np.isfinite([row.passes_steady for row in rows]).all()

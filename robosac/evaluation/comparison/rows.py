@@ -1,0 +1,214 @@
+"""Sums up what a defence did over all sequences of a setting, and how far that can be relied on."""
+
+from __future__ import annotations
+
+from collections.abc import Mapping, Sequence
+from dataclasses import dataclass
+from typing import Any
+
+import numpy as np
+
+from robosac.boxes import FloatArray
+from robosac.evaluation.average_precision import AveragePrecision
+from robosac.evaluation.comparison.playing import Naming, Played
+from robosac.evaluation.comparison.settings import Setting
+
+EARLY = 5
+"""The frames after these count as steady."""
+WINDOWS = (0, EARLY, 10)
+"""Figures are given for the frames from each of these numbers on."""
+
+
+@dataclass(frozen=True)
+class Estimate:
+    """A figure and its standard error over sequences; None with a single sequence."""
+
+    value: float
+    error: float | None
+
+    @classmethod
+    def of(cls, value: float, left_out: FloatArray) -> Estimate:
+        """By the jackknife: ``sqrt((n - 1) / n * sum((x_i - mean(x))^2))``, x_i the figure without sequence i.
+
+        Source: Efron and Tibshirani, An Introduction to the Bootstrap (1993), chapter 11.
+        """
+        n = len(left_out)
+        return cls(value, float(np.sqrt((n - 1) * left_out.var())) if n > 1 else None)
+
+
+@dataclass(frozen=True)
+class Figures:
+    """What the answers of some frames are worth.
+
+    Attributes
+    ----------
+    ap50, ap70 : Estimate
+    ap50_difference, ap70_difference : Estimate
+        To the oracle on the same sequences; negative where something is lost.
+    ap70_ratio : Estimate or None
+        To the oracle; None where that has 0.
+    infiltrated : float
+        Share of frames with an attacking message in the answer.
+    """
+
+    ap50: Estimate
+    ap70: Estimate
+    ap50_difference: Estimate
+    ap70_difference: Estimate
+    ap70_ratio: Estimate | None
+    infiltrated: float
+
+
+@dataclass(frozen=True)
+class NamingFigures:
+    """Whom a defence named.
+
+    Attributes
+    ----------
+    named_all : float or None
+        Share of attacked sequences in which all attackers were named; None where nobody attacks.
+    frames_to_name : float or None
+        Frames from the first strike until all attackers are named, the mean over those sequences.
+    attackers_named, attackers_struck : int
+        Attackers that were named after they struck, and all that struck.
+    frames_to_name_each, frames_to_name_most : float or None
+        Frames from the first strike of each of the former until it is named, the mean and the most.
+    honest_named, honest : int
+        Honest teammates that were ever named, and all of them.
+    """
+
+    named_all: float | None
+    frames_to_name: float | None
+    attackers_named: int
+    attackers_struck: int
+    frames_to_name_each: float | None
+    frames_to_name_most: int | None
+    honest_named: int
+    honest: int
+
+
+@dataclass(frozen=True)
+class Row:
+    """What one defence did in one setting.
+
+    Attributes
+    ----------
+    setting : Setting
+    defense : str
+        Or `ORACLE`, the fusion of everybody who is honest in the frame, or `EGO_ONLY`.
+    windows : mapping of first frame to Figures
+        Those of `WINDOWS` that there are frames for.
+    passes_first, passes_early, passes_steady : float
+        Fused passes a frame: in the first, in frames 2 to 5, and afterwards.
+    honest_refused : float or None
+        Share of honest messages left out of the answers; None where there are none.
+    milliseconds : float or None
+        Median time of a frame; None unless live.
+    naming : NamingFigures or None
+        None where the defence names nobody.
+    """
+
+    setting: Setting
+    defense: str
+    windows: Mapping[int, Figures]
+    passes_first: float
+    passes_early: float
+    passes_steady: float
+    honest_refused: float | None
+    milliseconds: float | None = None
+    naming: NamingFigures | None = None
+
+    @property
+    def whole(self) -> Figures:
+        """Of all frames."""
+        return self.windows[0]
+
+
+@dataclass(frozen=True)
+class Precision:
+    """Average precision at an IoU of 0.5 and 0.7, of all sequences and without each in turn: (2,) and (2, n)."""
+
+    of_all: FloatArray
+    left_out: FloatArray
+
+    @classmethod
+    def over(cls, sequences: Sequence[Played], first: int) -> Precision:
+        """Of the answers from a frame on."""
+        ap = AveragePrecision()
+        for number, played in enumerate(sequences):
+            for frame in played.matched[first:]:
+                ap.add_matched(frame, number)
+        thresholds = (0.5, 0.7)
+        return cls(np.array([ap.at(t) for t in thresholds]), ap.leaving_out(*thresholds))
+
+
+def precisions(sequences: Sequence[Played]) -> dict[int, Precision]:
+    """In each window that there are frames for."""
+    frames = len(sequences[0].matched)
+    return {first: Precision.over(sequences, first) for first in WINDOWS if first < frames}
+
+
+def sum_up(
+    setting: Setting, defense: str, sequences: Sequence[Played], oracle: Mapping[int, Precision], live: bool = False
+) -> Row:
+    """The row of a defence.
+
+    Parameters
+    ----------
+    setting : Setting
+    defense : str
+    sequences : sequence of Played
+        All of the same length.
+    oracle : mapping of first frame to Precision
+        The oracle's, on the same sequences.
+    live : bool
+        Whether its times mean something.
+    """
+    own = precisions(sequences)
+    passes = np.array([played.passes for played in sequences])
+    refused, honest = (np.array([getattr(p, of) for p in sequences]).sum() for of in ("refused", "honest"))
+    times = [ms for played in sequences for ms in played.milliseconds]
+    naming = [played.naming for played in sequences if played.naming is not None]
+    return Row(
+        setting,
+        defense,
+        windows={first: _figures(own[first], oracle[first], sequences, first) for first in own},
+        passes_first=float(passes[:, 0].mean()),
+        passes_early=float(passes[:, 1:EARLY].mean()),
+        passes_steady=float(passes[:, EARLY:].mean()),
+        honest_refused=float(refused / honest) if honest else None,
+        milliseconds=float(np.median(times)) if live and times else None,
+        naming=_naming(naming) if naming else None,
+    )
+
+
+def _figures(own: Precision, oracle: Precision, sequences: Sequence[Played], first: int) -> Figures:
+    ap50, ap70 = (Estimate.of(float(own.of_all[i]), own.left_out[i]) for i in (0, 1))
+    lost50, lost70 = (
+        Estimate.of(float(own.of_all[i] - oracle.of_all[i]), own.left_out[i] - oracle.left_out[i]) for i in (0, 1)
+    )
+    ratio = None
+    if oracle.of_all[1] and oracle.left_out[1].all():
+        ratio = Estimate.of(float(own.of_all[1] / oracle.of_all[1]), own.left_out[1] / oracle.left_out[1])
+    infiltrated = float(np.mean([played.infiltrated[first:] for played in sequences]))
+    return Figures(ap50, ap70, lost50, lost70, ratio, infiltrated)
+
+
+def _naming(sequences: Sequence[Naming]) -> NamingFigures:
+    attacked = [naming for naming in sequences if naming.struck]
+    all_after = [naming.all_after for naming in attacked if naming.all_after is not None]
+    after = [frames for naming in attacked for frames in naming.after]
+    return NamingFigures(
+        named_all=len(all_after) / len(attacked) if attacked else None,
+        frames_to_name=_mean(all_after),
+        attackers_named=len(after),
+        attackers_struck=sum(naming.struck for naming in attacked),
+        frames_to_name_each=_mean(after),
+        frames_to_name_most=max(after, default=None),
+        honest_named=sum(naming.honest_named for naming in sequences),
+        honest=sum(naming.honest for naming in sequences),
+    )
+
+
+def _mean(values: Sequence[Any]) -> float | None:
+    return float(np.mean(values)) if values else None

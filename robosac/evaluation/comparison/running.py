@@ -1,0 +1,100 @@
+"""Plays all scenes of a comparison, in one process or several, and sums them up."""
+
+from __future__ import annotations
+
+from collections.abc import Callable, Sequence
+from concurrent.futures import FIRST_EXCEPTION, ProcessPoolExecutor, wait
+from multiprocessing import get_context
+from multiprocessing.sharedctypes import Synchronized
+
+import torch
+
+from robosac.evaluation.comparison.playing import ORACLE, Plan, Played, play_scene
+from robosac.evaluation.comparison.rows import Row, precisions, sum_up
+from robosac.evaluation.comparison.settings import Setting
+from robosac.scenes.splits import TEST_SEEDS
+
+_POLL_S = 0.5
+
+Scene = dict[tuple[Setting, str], Played]
+
+
+def compare_defenses(plan: Plan, jobs: int = 1, tick: Callable[[], None] = lambda: None) -> list[Row]:
+    """Every defence in every setting.
+
+    The rows of a defence depend neither on the other defences, nor on the other settings, nor on the number of jobs. A
+    defence that names attackers lists them under ``named`` in its state.
+
+    Parameters
+    ----------
+    plan : Plan
+    jobs : int
+        Processes that share the scenes; with more than one, detector and defences must be such that can be pickled.
+    tick : callable
+        Called after each frame of each setting.
+
+    Returns
+    -------
+    list of Row
+        For each setting: oracle, the defences, ego only.
+
+    Raises
+    ------
+    FaultyDefense
+        If a defence fails.
+    """
+    seeds = TEST_SEEDS[: plan.extent.scenes]
+    scenes = [play_scene(plan, seed, tick) for seed in seeds] if jobs == 1 else _in_processes(plan, seeds, jobs, tick)
+    rows = []
+    for setting in plan.extent.settings:
+        oracle = precisions([scene[setting, ORACLE] for scene in scenes])
+        for name in plan.rows:
+            rows.append(sum_up(setting, name, [scene[setting, name] for scene in scenes], oracle, plan.live))
+    return rows
+
+
+def _in_processes(plan: Plan, seeds: Sequence[int], jobs: int, tick: Callable[[], None]) -> list[Scene]:
+    # spawned, as a process with threads (of the progress bar, of torch) must not be forked
+    context = get_context("spawn")
+    done: Synchronized[int] = context.Value("L", 0)
+    told = 0
+    with ProcessPoolExecutor(min(jobs, len(seeds)), context, _begin, (plan, done)) as pool:
+        futures = [pool.submit(_play_scene, seed) for seed in seeds]
+        try:
+            while wait(futures, _POLL_S, FIRST_EXCEPTION).not_done:
+                told = _tell(tick, told, done.value)
+                for future in futures:
+                    if future.done():
+                        future.result()
+        finally:
+            pool.shutdown(wait=False, cancel_futures=True)
+    _tell(tick, told, done.value)
+    return [future.result() for future in futures]
+
+
+def _tell(tick: Callable[[], None], told: int, done: int) -> int:
+    for _ in range(done - told):
+        tick()
+    return done
+
+
+_worker: tuple[Plan, Synchronized[int]] | None = None
+"""In a worker process, what it was begun with: a shared counter cannot be sent along with a scene."""
+
+
+def _begin(plan: Plan, done: Synchronized[int]) -> None:
+    global _worker  # noqa: PLW0603
+    torch.set_num_threads(1)
+    _worker = plan, done
+
+
+def _play_scene(seed: int) -> Scene:
+    if _worker is None:
+        raise RuntimeError("only in a process of the pool")
+    plan, done = _worker
+
+    def tick() -> None:
+        with done.get_lock():
+            done.value += 1
+
+    return play_scene(plan, seed, tick)

@@ -1,0 +1,52 @@
+from dataclasses import replace
+
+import numpy as np
+import pytest
+
+from robosac.defenses import OneByOne, SampleConsensus
+from robosac.evaluation.comparison import Extent, Plan, Setting, compare_defenses
+from robosac.evaluation.comparison.playing import play_scene
+from robosac.evaluation.playing import FaultyDefense
+from tests.robosac.evaluation.comparison.test_comparison import Broken
+
+DEFENSES = {"sampling": SampleConsensus(), "one_by_one": OneByOne()}
+
+
+@pytest.fixture(scope="module")
+def plan(detector, tmp_path_factory):
+    extent = Extent((Setting("noise", 1), Setting("noise@turns", 2)), scenes=2, frames=6)
+    return Plan(detector, DEFENSES, extent, recordings=tmp_path_factory.mktemp("recordings"))
+
+
+def test_the_number_of_jobs_changes_nothing(plan):
+    ticks = []
+    together = compare_defenses(plan, 2, lambda: ticks.append(1))
+    assert len(ticks) == 24
+    assert together == compare_defenses(plan)
+
+
+def test_a_defence_that_fails_in_another_process_stops_the_comparison(plan):
+    with pytest.raises(FaultyDefense, match="worse, frame 0: RuntimeError: broken"):
+        compare_defenses(replace(plan, defenses={"worse": Broken()}), 2)
+
+
+def test_live_and_recorded_answers_are_the_same(plan):
+    live = play_scene(replace(plan, live=True, recordings=None), 1)
+    recorded = play_scene(plan, 1)
+    assert live.keys() == recorded.keys()
+    for row, one in live.items():
+        other = recorded[row]
+        assert (one.passes, one.infiltrated, one.refused) == (other.passes, other.infiltrated, other.refused)
+        for mine, its in zip(one.matched, other.matched, strict=True):
+            np.testing.assert_allclose(mine.scores, its.scores, atol=1e-6)
+            np.testing.assert_allclose(mine.iou, its.iou, atol=1e-4)
+
+
+def test_only_live_defences_are_timed(plan):
+    live = replace(plan, live=True, recordings=None, extent=Extent((Setting("noise", 1),), scenes=1, frames=6))
+    oracle, sampling, one_by_one, alone = compare_defenses(live)
+    assert oracle.milliseconds is alone.milliseconds is None
+    assert sampling.milliseconds > 0.0
+    assert one_by_one.milliseconds > 0.0
+    recorded = compare_defenses(replace(plan, extent=live.extent))
+    assert [row.milliseconds for row in recorded] == [None] * 4
