@@ -22,10 +22,11 @@ def draw_precision(rows: Sequence[Row], path: Path) -> None:
     loss = np.array([[ap[s, ORACLE] - ap[s, n] for n in names] for s in settings])
     figure = Figure(figsize=(1.8 + 1.15 * len(names), 1.6 + 0.34 * len(settings)), layout="constrained")
     axes = figure.add_subplot()
-    image = axes.imshow(loss, cmap="OrRd", vmin=0.0, vmax=max(0.5, float(loss.max())), aspect="auto")
+    most = max(0.5, float(loss.max()))
+    image = axes.imshow(loss, cmap="OrRd", vmin=0.0, vmax=most, aspect="auto")
     for i, setting in enumerate(settings):
         for j, name in enumerate(names):
-            colour = "white" if loss[i, j] > 0.3 else "black"
+            colour = "white" if loss[i, j] > 0.6 * most else "black"
             axes.text(j, i, f"{ap[setting, name]:.2f}", ha="center", va="center", fontsize=8, color=colour)
     axes.set_xticks(range(len(names)), names, rotation=30, ha="right", fontsize=8)
     axes.set_yticks(range(len(settings)), [setting.label for setting in settings], fontsize=8)

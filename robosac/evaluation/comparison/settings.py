@@ -108,6 +108,7 @@ FULL = Extent(
         ("pgd@asleep", 1),
         ("erase@asleep", 1),
         ("erase@asleep", 2),
+        ("invent@asleep", 1),
         ("pgd@flicker", 1),
         ("erase@flicker", 1),
         ("erase@turns", 2),
