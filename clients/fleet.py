@@ -18,7 +18,7 @@ from rich.progress import BarColumn, MofNCompleteColumn, Progress, TextColumn, T
 from rich.table import Table
 
 from clients.client import API_KEY_VARIABLE, FrameAnswer, GatewayClient, OpenedSession
-from clients.errors import GatewayError
+from clients.errors import FrameConflict, GatewayError
 from clients.simulation import EgoFrame, Fleet, make_folder
 from clients.summary import FleetSummary
 from robosac import attacks, detectors
@@ -43,8 +43,8 @@ class FleetOptions:
     egos, attackers : int
     attack, detector : str
         As `robosac.attacks.load_campaign` and `robosac.detectors.load` take them.
-    defense : mapping
-        The ``defense`` of the sessions.
+    defense : mapping or None
+        The ``defense`` of the sessions; None leaves it to the gateway.
     seed : int
         Of the choice of attackers and of their random starts.
     budget_ms : float or None
@@ -65,7 +65,7 @@ class FleetOptions:
     attackers: int
     attack: str
     detector: str
-    defense: dict[str, Any]
+    defense: dict[str, Any] | None
     seed: int
     budget_ms: float | None
     real_time: bool
@@ -136,8 +136,13 @@ class _Vehicle:
         await self.gateway.vehicle(session_id, self.vehicle_id, token).close()
 
     async def send(self, frame: EgoFrame, index: int) -> None:
+        """Send to an ego; if it did not wait so long, its answer tells who is missing."""
         session_id, token = self._tokens[frame.ego_id]
-        await self.gateway.vehicle(session_id, self.vehicle_id, token).send(index, frame.sent[self.vehicle_id])
+        try:
+            await self.gateway.vehicle(session_id, self.vehicle_id, token).send(index, frame.sent[self.vehicle_id])
+        except FrameConflict as conflict:
+            if not conflict.type.endswith("stale-frame"):
+                raise
 
     async def ask(self, frame: EgoFrame, index: int) -> tuple[FrameAnswer, float]:
         session_id, token = self._tokens[frame.ego_id]
@@ -152,7 +157,7 @@ async def run_fleet(options: FleetOptions, console: Console) -> FleetSummary:
     Raises
     ------
     clients.errors.GatewayError
-        If any message or frame is not accepted as it should be.
+        If any message or frame is not accepted as it should be; that a teammate's message comes too late is no error.
     ValueError
         If there is no such attack or detector, or the gateway's has other weights.
     """
@@ -215,7 +220,7 @@ def main(
     detector: Annotated[
         str, typer.Option(help="The vehicles' own copy: a name, a weights file, or module:callable.")
     ] = DEFAULT_DETECTOR,
-    defense: Annotated[str, typer.Option(help="Kind of defence.")] = "sample_consensus",
+    defense: Annotated[str | None, typer.Option(help="Kind of defence; by default the gateway's choice.")] = None,
     attacker_ratio: Annotated[float | None, typer.Option(help="Ratio the defence assumes.")] = None,
     sampling_budget: Annotated[int | None, typer.Option(help="Most hypotheses a frame.")] = None,
     collaborators: Annotated[int | None, typer.Option(help="Teammates in a hypothesis.")] = None,
@@ -238,6 +243,9 @@ def main(
         except ValueError as error:
             raise typer.BadParameter(str(error), param_hint=option) from error
     chosen = {"attacker_ratio": attacker_ratio, "sampling_budget": sampling_budget, "collaborators": collaborators}
+    given = {name: value for name, value in chosen.items() if value is not None}
+    if given and defense is None:
+        raise typer.BadParameter("its settings need to know the kind of defence", param_hint="--defense")
     options = FleetOptions(
         url=url,
         scenes=scenes,
@@ -247,7 +255,7 @@ def main(
         attackers=attackers,
         attack=attack,
         detector=detector,
-        defense={"kind": defense, **{name: value for name, value in chosen.items() if value is not None}},
+        defense=None if defense is None else {"kind": defense, **given},
         seed=seed,
         budget_ms=budget_ms,
         real_time=real_time,

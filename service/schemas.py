@@ -130,7 +130,7 @@ class UndefendedSettings(_DefenseSettings):
 class GroupTestingSettings(_DefenseSettings):
     """Bayesian group testing with memory: finds attackers of an unknown number, and names them."""
 
-    kind: Literal["group_testing"]
+    kind: Literal["group_testing"] = "group_testing"
     attack_prior: float = Field(0.5, gt=0, lt=1, description="Probability beforehand that anybody attacks.")
     attacker_prior: float = Field(
         0.25, gt=0, lt=1, description="Probability of each teammate to attack if anybody does."
@@ -176,6 +176,13 @@ DEFENSE_KINDS = (
     "conformal",
     "none",
 )
+
+
+def default_defense(info: DetectorInfo) -> DefenseSettings:
+    """The defence of a session that asks for none."""
+    return GroupTestingSettings() if info.calibration is not None else SampleConsensusSettings()
+
+
 read_defense = TypeAdapter[DefenseSettings](DefenseSettings).validate_python
 """Settings of a defence from what a session keeps of them."""
 
@@ -222,7 +229,9 @@ class SessionRequest(_Request):
     ego_id: VehicleId
     teammates: list[VehicleId] = Field(max_length=1024)
     detector: str | None = None
-    defense: DefenseSettings = SampleConsensusSettings()
+    defense: DefenseSettings | None = Field(
+        None, description="By default group_testing where the detector is calibrated for it, else sample_consensus."
+    )
     latency_budget_ms: float | None = Field(None, gt=0, le=60_000)
     gather_ms: float | None = Field(None, ge=0, le=60_000, description="At most the latency budget.")
     public_keys: PublicKeys = {}

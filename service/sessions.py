@@ -29,6 +29,7 @@ from service.schemas import (
     SessionCreated,
     SessionRequest,
     SessionState,
+    default_defense,
     read_defense,
 )
 from service.settings import Settings
@@ -84,8 +85,9 @@ class Sessions:
         """Begin a session; the answer is the only place where its tokens are shown."""
         detector = self._detector(self._settings.detector if request.detector is None else request.detector)
         check_size(request.teammates, self._settings.max_teammates)
+        settings = request.defense or default_defense(detector.info)
         try:
-            defense = request.defense.build(detector.info)
+            defense = settings.build(detector.info)
             defense.check_team(len(request.teammates))
         except DomainError as error:
             raise Problem(422, "impossible-defense", str(error), "defense") from error
@@ -108,7 +110,7 @@ class Sessions:
             ego_id=request.ego_id,
             teammates=tuple(request.teammates),
             detector=detector.info.name,
-            defense=request.defense.model_dump(mode="json"),
+            defense=settings.model_dump(mode="json"),
             latency_budget_ms=budget_ms,
             gather_ms=gather_ms,
             frame_period_ms=request.frame_period_ms,
@@ -127,7 +129,7 @@ class Sessions:
             ego_id=record.ego_id,
             teammates=len(record.teammates),
             detector=record.detector,
-            defense=request.defense.kind,
+            defense=settings.kind,
         )
         return SessionCreated(
             session_id=record.session_id,
@@ -135,7 +137,7 @@ class Sessions:
             teammate_tokens={name: token.text for name, token in others.items()},
             tokens_expire_at=own.expires_at,
             detector=DetectorEntry.of(detector.info),
-            defense=request.defense,
+            defense=settings,
             latency_budget_ms=record.latency_budget_ms,
             gather_ms=record.gather_ms,
             frame_period_ms=record.frame_period_ms,

@@ -1,15 +1,19 @@
 import io
 import json
+from contextlib import nullcontext
+from types import SimpleNamespace
 
+import httpx
 import numpy as np
 import pytest
 from matplotlib.image import imread
 from rich.console import Console
 from typer.testing import CliRunner
 
+from clients.client import GatewayClient, OpenedSession
 from clients.demo import main as demo_main
-from clients.errors import GatewayUnreachable
-from clients.fleet import FleetOptions, close_run, main, run_fleet
+from clients.errors import FrameConflict, GatewayUnreachable
+from clients.fleet import FleetOptions, _Vehicle, close_run, main, run_fleet
 from clients.local_gateway import local_gateway
 from clients.simulation import Fleet
 from robosac.attacks import PGD, load_campaign
@@ -129,3 +133,21 @@ async def test_a_gateway_that_does_not_start_shows_its_log(tmp_path, monkeypatch
     with pytest.raises(GatewayUnreachable, match="torch_threads"):
         async with local_gateway(tmp_path / "gateway.log"):
             pytest.fail("it started")
+
+
+@pytest.mark.parametrize(("slug", "raised"), [("stale-frame", False), ("equivocation", True)])
+async def test_a_teammate_that_is_too_late_goes_on(slug, raised, ego_message):
+    problem = {"type": f"urn:robosac:problem:{slug}", "detail": "it said so", "field": "frame"}
+    transport = httpx.MockTransport(lambda _: httpx.Response(409, json=problem))
+    vehicle = _Vehicle("rsu", "http://gateway", None)
+    vehicle.gateway = GatewayClient("http://gateway", transport=transport)
+    vehicle.enrol("car-1", OpenedSession("s", "e", {"rsu": "t"}, "", {}, {}))
+    frame = SimpleNamespace(ego_id="car-1", sent={"rsu": ego_message})
+    with pytest.raises(FrameConflict) if raised else nullcontext():
+        await vehicle.send(frame, 0)
+
+
+def test_settings_of_a_defence_need_its_kind():
+    result = CliRunner().invoke(command(main), ["--attacker-ratio", "0.4"])
+    assert result.exit_code == 2
+    assert "--defense" in result.output

@@ -186,7 +186,7 @@ async def test_group_testing_names_the_attacker_and_tells_its_suspicion(served, 
 
 
 async def test_other_defences_have_no_suspicion(served, ego_message, benign):
-    session = await served.open()
+    session = await served.open(defense={"kind": "sample_consensus"})
     result = (await served.post(session, "frames", wire.pack_frame(0, ego_message, benign))).json()
     assert result["suspicion"] is None
 
@@ -199,3 +199,14 @@ async def test_a_detector_without_calibration_cannot_test_groups(tmp_path):
         fields = problem(await served.http.post("/v1/sessions", json=request), 422, "impossible-defense")
     assert "not calibrated" in fields["detail"]
     assert fields["field"] == "defense"
+
+
+async def test_a_session_that_asks_for_no_defence_gets_group_testing_where_it_is_calibrated(served, tmp_path):
+    body = {"ego_id": "a", "teammates": ["b"]}
+    opened = (await served.http.post("/v1/sessions", json=body)).json()
+    assert opened["defense"]["kind"] == "group_testing"
+    weights = tmp_path / "bare.safetensors"
+    weights.write_bytes(SHIPPED_WEIGHTS.read_bytes())
+    async with serve(extra_detectors=str(weights)) as bare:
+        opened = (await bare.http.post("/v1/sessions", json=body)).json()
+    assert opened["defense"]["kind"] == "sample_consensus"

@@ -65,7 +65,8 @@ async def test_a_frame_result_has_the_fields_of_the_contract(served, good_frame)
     assert set(result["accepted"]) | {entry["vehicle_id"] for entry in result["rejected"]} == set(TEAM)
     assert result["sampling_steps"] == len(result["hypotheses"]) >= 1
     assert set(result["hypotheses"][0]) == {"teammates", "jaccard_index", "verdict"}
-    assert result["attacker_ratio"] == 0.2
+    assert set(result["suspicion"]) == set(TEAM)
+    assert result["attacker_ratio"] == pytest.approx(sum(result["suspicion"].values()) / len(TEAM))
     assert result["deadline_met"] is True
     assert result["degraded_by"] is None
     assert {"receive", "queue", "prepare", "ego_only", "hypotheses", "consensus", "total"} <= set(result["timings_ms"])
