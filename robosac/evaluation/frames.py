@@ -14,7 +14,7 @@ from robosac.detectors import Detector, Message, PreparedFrame, V2XSimDetector
 from robosac.detectors.base import for_role
 from robosac.scenes import FRAMES_PER_SECOND, IntersectionScene, SceneFrame, v2xsim
 
-YAW_PER_METRE = np.deg2rad(1.0)
+YAW_PER_METRE = np.deg2rad(2.0)
 """Standard deviation of the heading's error for each metre of the position's."""
 
 
