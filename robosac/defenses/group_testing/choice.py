@@ -1,4 +1,4 @@
-"""Which subset to test next, and which to answer with. Subsets are rows (n, S) of booleans over the members."""
+"""What a subset is worth: as an answer, and for what it tells. Subsets are rows (n, S) of booleans over the members."""
 
 from __future__ import annotations
 
@@ -7,7 +7,7 @@ import numpy as np
 from robosac.boxes import FloatArray, IntArray
 from robosac.defenses.group_testing.memory import JACCARD_REPEAT, PAIR_REPEAT, KeyArray, Memory, keys
 from robosac.defenses.group_testing.model import EvidenceModel
-from robosac.defenses.group_testing.posterior import EXACT, BoolArray, Posterior
+from robosac.defenses.group_testing.posterior import BoolArray, Posterior
 
 GAIN = 0.26
 GAIN_SCALE = 2.0
@@ -19,17 +19,6 @@ TEST_COST = 0.004
 """What a pass must bring, in the unit of utility."""
 UNDILUTED_SIZE = 8
 """Largest subset whose evidence counts in full."""
-SUSPECTS_AT_ONCE = 4
-"""Most unresolved teammates in a test of a larger team."""
-BLOCKS_AT_ONCE = 2
-"""Blocks of a larger team that tests are chosen in: those with the most to learn."""
-UNRESOLVED = (0.02, 0.995)
-"""A teammate with a suspicion between these is unresolved."""
-ANSWERS = 4
-"""Answers considered in a larger team."""
-WITNESSES = 3
-"""Trusted teammates that unresolved ones are added to in a larger team."""
-_CERTAIN = 1e-12
 
 
 def gain(sizes: FloatArray | IntArray) -> FloatArray:
@@ -43,67 +32,6 @@ def utility(posterior: Posterior, subsets: BoolArray) -> FloatArray:
     clean = posterior.unattacked(posterior.masks(subsets))
     worth: FloatArray = clean * gain(subsets.sum(axis=1)) - (1.0 - clean) * HARM
     return worth
-
-
-def candidates(posterior: Posterior, present: BoolArray, decoded: BoolArray) -> BoolArray:
-    """Subsets worth considering, without those decoded: all in a small team; in a larger one the best answers, and up
-    to four unresolved teammates of one block, alone or beside trusted ones.
-
-    Parameters
-    ----------
-    posterior : Posterior
-    present : (S,) bool ndarray
-    decoded : (m, S) bool ndarray
-    """
-    here = np.flatnonzero(present)
-    found = _all_of(here, len(present)) if len(here) <= EXACT else _some_of(posterior, here, decoded)
-    unique = {row.tobytes(): index for index, row in reversed(list(enumerate(np.packbits(found, axis=1))))}
-    for row in np.packbits(decoded, axis=1):
-        unique.pop(row.tobytes(), None)
-    return found[sorted(unique.values())]
-
-
-def _all_of(members: IntArray, size: int) -> BoolArray:
-    """All subsets but the empty one of these members, (2 ** m - 1, size)."""
-    codes = np.arange(1, 1 << len(members))
-    rows = np.zeros((len(codes), size), dtype=bool)
-    rows[:, members] = (codes[:, None] >> np.arange(len(members))) & 1
-    return rows
-
-
-def _some_of(posterior: Posterior, here: IntArray, decoded: BoolArray) -> BoolArray:
-    suspicion = posterior.marginals()
-    size = len(suspicion)
-    low, high = UNRESOLVED
-    ranked = here[np.argsort(suspicion[here], kind="stable")]
-    answers = np.zeros((ANSWERS, size), dtype=bool)
-    for row, count in zip(answers, _answer_sizes(suspicion[ranked]), strict=True):
-        row[ranked[:count]] = True
-    cleared = np.zeros((1, size), dtype=bool)
-    cleared[0, ranked[suspicion[ranked] < low][:WITNESSES]] = True
-    witnesses = decoded[(decoded.sum(axis=1) <= WITNESSES) & ~decoded[:, suspicion >= low].any(axis=1)]
-    bases = np.concatenate([np.zeros_like(cleared), cleared, witnesses])
-    found = [answers]
-    for suspects in _most_open(posterior.blocks(), suspicion, here, low, high)[:BLOCKS_AT_ONCE]:
-        groups = _all_of(suspects, size)
-        groups = groups[groups.sum(axis=1) <= SUSPECTS_AT_ONCE]
-        found.append((bases[:, None] | groups[None]).reshape(-1, size))
-    return np.concatenate(found)
-
-
-def _most_open(
-    blocks: list[list[str]], suspicion: FloatArray, here: IntArray, low: float, high: float
-) -> list[IntArray]:
-    """The unresolved teammates of each block, those of most entropy first."""
-    unresolved = np.zeros(len(suspicion), dtype=bool)
-    unresolved[here] = True
-    unresolved &= (suspicion >= low) & (suspicion <= high)
-    kept = np.clip(suspicion, _CERTAIN, 1 - _CERTAIN)
-    entropy = -(kept * np.log2(kept) + (1 - kept) * np.log2(1 - kept)) * unresolved
-    ends = np.cumsum([len(block) for block in blocks])
-    parts = [np.arange(end - len(block), end) for block, end in zip(blocks, ends, strict=True)]
-    parts.sort(key=lambda part: -float(entropy[part].sum()))
-    return [part[unresolved[part]] for part in parts]
 
 
 def expected_information(
@@ -132,23 +60,30 @@ def expected_information(
     """
     bits = np.zeros(len(subsets))
     masks, subset_keys, sizes = posterior.masks(subsets), subsets @ identities, subsets.sum(axis=1)
+    clean = posterior.clean(masks)
     if ego_sees:
-        cells = posterior.cells(masks, [np.zeros_like(mask) for mask in masks])
+        cells = posterior.joint(clean, np.ones_like(clean), clean)
         once = memory.weights(keys(subset_keys, np.zeros_like(subset_keys)), JACCARD_REPEAT)
         bits += once * model.jaccard_information(sizes, cells) * dilution(sizes)
+    shared = subsets.astype(np.float64) @ decoded.T  # exact as floats, whose products are the fast ones
+    other_sizes = decoded.sum(axis=1)
+    above = shared == other_sizes
+    index, other = np.nonzero(above | (shared == sizes[:, None]))
+    if not len(index):
+        return bits
+    other_masks, other_keys = posterior.masks(decoded), decoded @ identities
+    other_clean = posterior.clean(other_masks)
+    grows = above[index, other]
+    a_keys = np.where(grows, other_keys[other], subset_keys[index])
+    d_keys = np.where(grows, subset_keys[index], other_keys[other]) - a_keys
+    a_sizes, together = np.minimum(sizes[index], other_sizes[other]), np.maximum(sizes[index], other_sizes[other])
+    in_a = np.where(grows, other_clean[:, other], clean[:, index])
+    in_both = np.where(grows, clean[:, index], other_clean[:, other])
+    in_d = posterior.clean(masks[:, index] ^ other_masks[:, other])
+    told = model.pair_information(a_sizes, together - a_sizes, posterior.joint(in_a, in_d, in_both))
+    once = memory.weights(keys(a_keys, d_keys), PAIR_REPEAT)
     best = np.zeros(len(subsets))
-    for other in decoded:
-        above, below = (subsets >= other).all(axis=1), (subsets <= other).all(axis=1)
-        paired = np.flatnonzero(above | below)
-        if not len(paired):
-            continue
-        a = np.where(above[paired, None], other, subsets[paired])
-        d = (subsets[paired] | other) & ~a
-        cells = posterior.cells(posterior.masks(a), posterior.masks(d))
-        once = memory.weights(keys(a @ identities, d @ identities), PAIR_REPEAT)
-        told = model.pair_information(a.sum(axis=1), d.sum(axis=1), cells)
-        worth = once * told * dilution((a | d).sum(axis=1))
-        best[paired] = np.maximum(best[paired], worth)
+    np.maximum.at(best, index, once * told * dilution(together))
     return bits + best
 
 
@@ -158,11 +93,3 @@ def dilution(sizes: IntArray) -> FloatArray:
     """
     worth: FloatArray = np.minimum(1.0, UNDILUTED_SIZE / sizes)
     return worth
-
-
-def _answer_sizes(ascending: FloatArray) -> IntArray:
-    """How many of the least suspected make the best answers, as if teammates were independent."""
-    clean = np.cumprod(1.0 - ascending)
-    worth = clean * gain(np.arange(1, len(clean) + 1)) - (1.0 - clean) * HARM
-    best: IntArray = np.argsort(-worth, kind="stable")[:ANSWERS] + 1
-    return best

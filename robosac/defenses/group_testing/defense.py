@@ -10,6 +10,7 @@ import numpy as np
 
 from robosac.budget import DomainError
 from robosac.consensus import DEFAULT_THRESHOLD
+from robosac.defenses.group_testing.candidates import unresolved
 from robosac.defenses.group_testing.frame import JudgedFrame
 from robosac.defenses.group_testing.memory import Memory
 from robosac.defenses.group_testing.model import Calibration, EvidenceModel
@@ -135,9 +136,10 @@ class GroupTesting:
         first = memory.frame == 0
         if not first:
             posterior.step(self.hazards)
+        posterior.regroup(unresolved(posterior.marginals()))
         judged = JudgedFrame(self.model, posterior, memory, tuple(team), frozenset(state["trusted"]))
-        for _ in range(self.first_budget if first else self.budget):
-            subset = judged.next_test(rng)
+        for passes in range(self.first_budget if first else self.budget, 0, -1):
+            subset = judged.next_test(rng, passes)
             if subset is None:
                 break
             tested = yield [subset]
@@ -157,6 +159,8 @@ class GroupTesting:
 
     def _sync(self, posterior: Posterior, memory: Memory, joined: Sequence[str], kept: Sequence[str] | None) -> None:
         known = set(posterior.members)
+        if known == set(joined):
+            return
         suspicion = dict(zip(posterior.members, map(float, posterior.marginals()), strict=True))
         for name in sorted(known - set(joined if kept is None else kept)) if kept is not None else ():
             memory.leave(name, suspicion[name])

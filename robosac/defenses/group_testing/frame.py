@@ -12,6 +12,7 @@ import numpy as np
 from robosac.boxes import FloatArray
 from robosac.consensus import Verdict
 from robosac.defenses.group_testing import choice
+from robosac.defenses.group_testing.candidates import WITNESSES, candidates, cleared
 from robosac.defenses.group_testing.geometry import MIN_WITNESSES, measure
 from robosac.defenses.group_testing.memory import (
     JACCARD_REPEAT,
@@ -22,7 +23,7 @@ from robosac.defenses.group_testing.memory import (
     keys,
 )
 from robosac.defenses.group_testing.model import EvidenceModel, jaccard_bin, pair_bin
-from robosac.defenses.group_testing.posterior import BoolArray, Posterior
+from robosac.defenses.group_testing.posterior import EXACT, BoolArray, Posterior
 from robosac.defenses.protocol import (
     Decision,
     Hypothesis,
@@ -42,6 +43,8 @@ FORGOTTEN_BELOW = 0.05
 """Evidence about a teammate less suspected is dropped."""
 SUBSETS_TO_NAME = 2
 """Different subsets that must speak against a teammate before it is named."""
+WORTH_WAITING = 0.4
+"""Bits that a test must promise for a larger team's answer to wait for it."""
 _CERTAIN = 1e-9
 _TIE = 1e-9
 _TINY = 1e-300
@@ -104,12 +107,22 @@ class JudgedFrame:
         self._index = {name: i for i, name in enumerate(self._members)}
         self._identities = np.array([identity(name) for name in self._members], dtype=np.uint64)
 
-    def next_test(self, rng: np.random.Generator) -> Hypothesis | None:
-        """The subset most worth decoding, ties broken at random; None if none is worth its pass."""
+    def next_test(self, rng: np.random.Generator, passes: int) -> Hypothesis | None:
+        """The subset most worth decoding, ties broken at random; None if none is worth its pass.
+
+        A larger team's frame begins with a test of doubtful teammates beside trusted ones where it promises much: it
+        may be the answer itself, and else the answer is decoded next.
+
+        Parameters
+        ----------
+        rng : numpy.random.Generator
+        passes : int
+            Left in this frame, at least 1.
+        """
         if not self._team:
             return None
         decoded = self._rows([o.teammates for o in self._outcomes])
-        options = choice.candidates(self._posterior, self._rows([self._team])[0], decoded)
+        options = candidates(self._posterior, self._rows([self._team])[0], decoded)
         if not len(options):
             return None
         bits = choice.expected_information(
@@ -117,6 +130,10 @@ class JudgedFrame:
         )
         worth = choice.utility(self._posterior, options) - max(0.0, self._best_answer()[1])
         value = np.maximum(0.0, worth) + choice.INFORMATION_VALUE * bits - choice.TEST_COST
+        if len(self._team) > EXACT and not self._outcomes and passes > 1:
+            beside = (options & cleared(self._posterior.marginals())).sum(axis=1) >= WITNESSES
+            if (beside & (bits >= WORTH_WAITING)).any():
+                value = np.where(beside, bits, 0.0)
         best = np.flatnonzero(value >= value.max() - _TIE)
         chosen = int(best[rng.integers(len(best))])
         if value[chosen] <= 0:
@@ -180,7 +197,7 @@ class JudgedFrame:
         """The answer, whom to trust, and whom to name."""
         suspicion = self._suspicion()
         accepted, _, source = self._best_answer()
-        if not self._outcomes:
+        if not self._outcomes or (not accepted and len(self._team) > EXACT):
             accepted, source = self._untested_answer()
         named = [
             name
@@ -242,6 +259,6 @@ class JudgedFrame:
 
 
 def _log_odds(p: FloatArray) -> FloatArray:
-    kept = np.clip(p, _CERTAIN, 1 - _CERTAIN)
+    kept = np.minimum(np.maximum(p, _CERTAIN), 1 - _CERTAIN)
     odds: FloatArray = np.log(kept / (1 - kept))
     return odds

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
+from functools import reduce
 from typing import Any
 
 import numpy as np
@@ -65,6 +66,7 @@ class Posterior:
         self._blocks: list[list[str]] = []
         self._tables: list[FloatArray] = []  # (K, 2 ** n) each
         self._clean: list[FloatArray | None] = []
+        self._stale = True  # some of the clean tables are to be computed
         self._marginals: FloatArray | None = None
         self._powers: FloatArray | None = None
 
@@ -110,37 +112,65 @@ class Posterior:
                 sets.bits(len(block)) @ (self._weights[1:] @ table)
                 for block, table in zip(self._blocks, self._tables, strict=True)
             ]
-            self._marginals = np.clip(np.concatenate([*attacking, np.empty(0)]), 0.0, 1.0)
+            self._marginals = np.minimum(np.maximum(np.concatenate([*attacking, np.empty(0)]), 0.0), 1.0)
         return self._marginals
 
-    def masks(self, subsets: BoolArray) -> list[IntArray]:
-        """Subsets (n, S), in the order of `members`, as masks: for each block (n,), bit by bit."""
+    def clean_within(self, block: int) -> FloatArray:
+        """Probability (2 ** n,) that nobody of each subset of a block attacks, by its mask there."""
+        clean: FloatArray = self._weights[0] + self._weights[1:] @ self._clean_tables()[block]
+        return clean
+
+    def masks(self, subsets: BoolArray) -> IntArray:
+        """Subsets (n, S), in the order of `members`, as masks (B, n): block by block, bit by bit."""
         if self._powers is None:  # of two, exact as floats, whose products are the fast ones
             self._powers = np.zeros((len(self.members), len(self._blocks)))
             start = 0
             for b, block in enumerate(self._blocks):
                 self._powers[start : start + len(block), b] = 1 << np.arange(len(block))
                 start += len(block)
-        return list((subsets.astype(np.float64) @ self._powers).astype(np.int64).T)
+        masks: IntArray = (subsets.astype(np.float64) @ self._powers).astype(np.int64).T
+        return masks
 
-    def unattacked(self, masks: Sequence[IntArray]) -> FloatArray:
+    def rows(self, blocks: IntArray, masks: IntArray) -> BoolArray:
+        """Subsets (n, S) each within one block, of the blocks (n,) and their masks there (n,)."""
+        starts = np.cumsum([0, *[len(block) for block in self._blocks]])
+        place = np.arange(starts[-1]) - starts[blocks, None]
+        inside = (place >= 0) & (place < EXACT)
+        rows: BoolArray = inside & ((masks[:, None] >> np.where(inside, place, 0)) & 1).astype(bool)
+        return rows
+
+    def unattacked(self, masks: IntArray) -> FloatArray:
         """Probability (n,) that nobody of each subset attacks."""
-        chance: FloatArray = self._weights[0] + self._weights[1:] @ self._all_clean(masks)
+        chance: FloatArray = self._weights[0] + self._weights[1:] @ self.clean(masks)
         return chance
 
-    def cells(self, a: Sequence[IntArray], d: Sequence[IntArray]) -> FloatArray:
+    def clean(self, masks: IntArray) -> FloatArray:
+        """Probability (K, n) that nobody of each subset attacks, given the kind."""
+        touched = np.flatnonzero(masks.any(axis=1)).tolist()
+        if not touched:
+            return np.ones((self._kinds, masks.shape[1]))
+        clean = self._clean_tables()
+        product: FloatArray = clean[touched[0]].take(masks[touched[0]], axis=1)
+        for b in touched[1:]:
+            product *= clean[b].take(masks[b], axis=1)
+        return product
+
+    def cells(self, a: IntArray, d: IntArray) -> FloatArray:
         """Joint probabilities (n, 1 + 3 K) of what pairs of disjoint subsets hold, by rows of an `EvidenceModel`.
 
         Column 0: no attacker in either; then for each kind: one in d only, in a only, in both.
         """
-        in_a, in_d = self._all_clean(a), self._all_clean(d)
-        alone = not any(mask.any() for mask in d)
-        both = in_a if alone else self._all_clean([x | y for x, y in zip(a, d, strict=True)])
+        in_a, in_d = self.clean(a), self.clean(d)
+        return self.joint(in_a, in_d, self.clean(a | d) if d.any() else in_a)
+
+    def joint(self, in_a: FloatArray, in_d: FloatArray, in_both: FloatArray) -> FloatArray:
+        """The same, from the probabilities (K, n) that nobody of ``a``, of ``d`` and of both attacks (see `clean`)."""
         q = self._weights[1:, None]
-        n = both.shape[1]
-        attacked = np.stack([in_a - both, in_d - both, 1 - in_a - in_d + both], axis=1) * q[..., None]  # (K, 3, n)
-        clean = self._weights[0] + (q * both).sum(axis=0)
-        joint: FloatArray = np.concatenate([clean[:, None], attacked.reshape(-1, n).T], axis=1)
+        joint = np.empty((in_both.shape[1], 1 + CELLS * self._kinds))
+        joint[:, 0] = self._weights[0] + (q * in_both).sum(axis=0)
+        attacked = (in_a - in_both, in_d - in_both, 1 - in_a - in_d + in_both)
+        for cell, chance in enumerate(attacked):
+            joint[:, 1 + cell :: CELLS] = (chance * q).T
         return np.maximum(joint, 0.0)
 
     def update(self, a: BoolArray, d: BoolArray, log_likelihood: FloatArray) -> None:
@@ -156,27 +186,24 @@ class Posterior:
         likelihood = np.exp(log_likelihood - log_likelihood.max())
         by_kind = likelihood[1:].reshape(self._kinds, CELLS)
         nothing, d_only, a_only, in_both = likelihood[0], by_kind[:, 0], by_kind[:, 1], by_kind[:, 2]
-        of_a, of_d = ([int(mask[0]) for mask in self.masks(subset[None])] for subset in (a, d))
+        of_a, of_d = self.masks(np.stack([a, d])).T.tolist()
         touched = [b for b, (x, y) in enumerate(zip(of_a, of_d, strict=True)) if x | y]
         clean = self._clean_tables()
-        a_each = [clean[b][:, of_a[b]] for b in touched]
-        d_each = [clean[b][:, of_d[b]] for b in touched]
-        both_each = [clean[b][:, of_a[b] | of_d[b]] for b in touched]
+        a_else = sets.products_but([clean[b][:, of_a[b]] for b in touched])
+        d_else = sets.products_but([clean[b][:, of_d[b]] for b in touched])
+        both_else = sets.products_but([clean[b][:, of_a[b] | of_d[b]] for b in touched])
+        neither = nothing * both_else + d_only * (a_else - both_else) + a_only * (d_else - both_else)
+        neither = neither + in_both * (1 - a_else - d_else + both_else)
+        expected = np.empty((len(touched), self._kinds, 4))  # by whether a and d hold attackers of the block
+        expected[..., sets.NEITHER] = neither
+        expected[..., sets.IN_A] = a_only * d_else + in_both * (1 - d_else)
+        expected[..., sets.IN_D] = d_only * a_else + in_both * (1 - a_else)
+        expected[..., sets.IN_BOTH] = in_both
         evidence = np.ones(self._kinds)
         tables = list(self._tables)
-        for index, b in enumerate(touched):
-            x, y, table = of_a[b], of_d[b], self._tables[b]
-            a_else, d_else, both_else = (sets.product_but(each, index) for each in (a_each, d_each, both_each))
-            states = np.arange(table.shape[1])
-            a_clean, d_clean = states & x == 0, states & y == 0
-            expected = np.empty_like(table)
-            neither = nothing * both_else + d_only * (a_else - both_else) + a_only * (d_else - both_else)
-            neither = neither + in_both * (1 - a_else - d_else + both_else)
-            expected[:, a_clean & d_clean] = neither[:, None]
-            expected[:, a_clean & ~d_clean] = (d_only * a_else + in_both * (1 - a_else))[:, None]
-            expected[:, ~a_clean & d_clean] = (a_only * d_else + in_both * (1 - d_else))[:, None]
-            expected[:, ~a_clean & ~d_clean] = in_both[:, None]
-            updated = table * expected
+        for b, by_state in zip(touched, expected, strict=True):
+            where = sets.touching(len(self._blocks[b]), of_a[b], of_d[b])
+            updated = tables[b] * by_state.take(where, axis=1)
             evidence = updated.sum(axis=1)
             tables[b] = updated / np.maximum(evidence, _TINY)[:, None]
         weights = self._weights * np.concatenate([[nothing], evidence])
@@ -185,11 +212,16 @@ class Posterior:
     def step(self, hazards: Hazards) -> None:
         """Go to the next frame: teammates are hijacked or recover, and the kind of attack may change."""
         h, r = hazards.hijack, hazards.recovery
-        kernel = np.array([[1 - h, h], [r, 1 - r]])
-        after = [sets.through(table, kernel) for table in self._tables]
+        kernel = sets.transition(h, r)
         team = len(self.members)
         sizes = {len(block) for block in self._blocks}
-        awakened = {n: sets.awakened(n, team, kernel, self._attacker_prior) for n in sizes}
+        after = list(self._tables)
+        for size in sizes:  # blocks of one size at once
+            alike = [b for b, block in enumerate(self._blocks) if len(block) == size]
+            moved = sets.through(np.concatenate([after[b] for b in alike]), kernel)
+            for b, table in zip(alike, np.split(moved, len(alike)), strict=True):
+                after[b] = table
+        awakened = {n: sets.awakened(n, team, h, r, self._attacker_prior) for n in sizes}
         self._mix(after, [awakened[len(block)] for block in self._blocks])
         attacked = self._weights[1:]
         change = hazards.change if self._kinds > 1 else 0.0
@@ -247,6 +279,30 @@ class Posterior:
         self._join()
         self._settle()
 
+    def regroup(self, together: BoolArray) -> None:
+        """Bring those (S,) that are to be tested together into as few blocks as can hold them.
+
+        Those of one block stay in one: what is known of them together is kept. The others are taken to be independent,
+        given the kind. Does nothing where no block is saved.
+        """
+        masks = self.masks(together[None])[:, 0].tolist()
+        crowded = [mask.bit_count() for mask in masks if mask]
+        if len(sets.packed(crowded, BLOCK)) >= len(crowded):
+            return
+        chosen: list[tuple[list[str], FloatArray]] = []
+        others: list[tuple[list[str], FloatArray]] = []
+        for block, table, mask in zip(self._blocks, self._tables, masks, strict=True):
+            for pile, wanted in ((chosen, 1), (others, 0)):
+                kept = [i for i in range(len(block)) if mask >> i & 1 == wanted]
+                if kept:
+                    pile.append(([block[i] for i in kept], sets.marginal(table, kept)))
+        self._blocks, self._tables = [], []
+        for pile in (chosen, others):
+            for group in sets.packed([len(names) for names, _ in pile], BLOCK):
+                self._blocks.append([name for i in group for name in pile[i][0]])
+                self._tables.append(reduce(sets.joint, [pile[i][1] for i in group]))
+        self._settle()
+
     def to_state(self) -> dict[str, Any]:
         """JSON values that `from_state` reads."""
         return {
@@ -267,26 +323,19 @@ class Posterior:
         posterior._replace(weights, [t / np.maximum(t.sum(axis=1, keepdims=True), _TINY) for t in tables])
         return posterior
 
-    def _all_clean(self, masks: Sequence[IntArray]) -> FloatArray:
-        """Probability (K, n) that nobody of each subset attacks, given the kind."""
-        product = np.ones((self._kinds, len(masks[0]) if masks else 1))
-        for table, mask in zip(self._clean_tables(), masks, strict=True):
-            if mask.any():
-                product *= table.take(mask, axis=1)
-        return product
-
     def _clean_tables(self) -> list[FloatArray]:
         """For each block and kind, the probability of no attacker within each of its subsets: sums over all sets of
         attackers outside the subset, by the zeta transform.
         """
-        for index, (block, table) in enumerate(zip(self._blocks, self._tables, strict=True)):
-            if self._clean[index] is None:
-                sums = table.copy()
-                for bit in range(len(block)):
+        for index, known in enumerate(self._clean) if self._stale else ():
+            if known is None:
+                sums = self._tables[index].copy()
+                for bit in range(len(self._blocks[index])):
                     view = sums.reshape(self._kinds, -1, 2, 1 << bit)
                     view[:, :, 1] += view[:, :, 0]
                 self._clean[index] = sums[:, ::-1]
-        return [sums for sums in self._clean if sums is not None]
+        self._stale = False
+        return self._clean  # type: ignore[return-value]
 
     def _mix(self, after: list[FloatArray], awakened: list[FloatArray]) -> None:
         """Add to each kind the share of "nobody" that turns into attackers as in ``awakened``."""
@@ -316,7 +365,7 @@ class Posterior:
         same = len(tables) == len(self._clean) == len(self._tables)
         self._clean = [self._clean[b] if same and table is self._tables[b] else None for b, table in enumerate(tables)]
         self._tables = tables
-        self._marginals = None
+        self._stale, self._marginals = True, None
 
     def _cut(self, limit: int) -> None:
         """Halve the blocks that are larger than the limit."""
@@ -330,6 +379,5 @@ class Posterior:
     def _join(self) -> None:
         """One block where the team is small enough."""
         while len(self._blocks) > 1 and len(self.members) <= EXACT:
-            low, high = self._tables[0], self._tables[1]
-            self._tables[:2] = [(high[:, :, None] * low[:, None, :]).reshape(self._kinds, -1)]
+            self._tables[:2] = [sets.joint(*self._tables[:2])]
             self._blocks[:2] = [self._blocks[0] + self._blocks[1]]

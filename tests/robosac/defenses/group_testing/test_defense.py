@@ -167,6 +167,34 @@ def test_fifty_teammates(rng):
     assert len(json.dumps(state)) < 60_000
 
 
+TWENTY = tuple(f"v{i:02d}" for i in range(20))
+
+
+def test_twenty_teammates_with_four_attackers(rng):
+    bad = {"v03", "v04", "v11", "v17"}
+    decision, tested = run(DEFENSE, bad, 9, rng, team=TWENTY)
+    assert named(decision) == bad
+    assert bad.isdisjoint(decision.accepted)
+    assert all(len(o.teammates) <= 10 for frame in tested[:3] for o in frame)
+
+
+def test_a_larger_team_tests_first_and_answers_with_what_is_clean(rng):
+    """Where that fails and the time is up, with whom it trusts; a small team answers first."""
+    known, _ = run(DEFENSE, {"v00"}, 1, rng, team=TWENTY)
+    doubtful = {name for name, p in known.suspicion.items() if p > 0.1}
+    assert len(doubtful) > 4
+    for bad in (set(), doubtful):
+        decision, tested = run(DEFENSE, bad, 1, rng, known.state, team=TWENTY, most=1)
+        (subset,) = [set(o.teammates) for o in tested[0]]
+        assert subset & doubtful
+        assert subset - doubtful <= set(known.state["trusted"])
+        assert decision.source is (Source.TRUSTED if bad else Source.CONSENSUS)
+        assert set(decision.accepted) == (set(known.state["trusted"]) if bad else subset)
+    small, _ = run(DEFENSE, ["car-3"], 1, rng)
+    _, tested = run(DEFENSE, ["car-3"], 1, rng, small.state, most=1)
+    assert set(tested[0][0].teammates) <= set(small.state["trusted"])
+
+
 @pytest.mark.parametrize(
     "settings",
     [

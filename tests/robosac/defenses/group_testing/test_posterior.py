@@ -156,3 +156,44 @@ def test_blocks_come_near_the_exact_posterior(size, monkeypatch):
         apart.append(np.abs(exact.marginals() - cut.marginals()))
     assert np.mean(apart) < 0.05
     assert np.quantile(apart, 0.95) < 0.3
+
+
+def test_regrouping_saves_blocks_and_keeps_what_is_known(rng):
+    team = [f"v{i:02d}" for i in range(20)]
+    posterior = Posterior.of(KINDS, 0.5, 0.25, team)
+    for first in range(0, 20, 5):  # what is known of two of a block hangs together
+        pair = team[first : first + 2]
+        posterior.update(*rows(posterior, pair, ()), rng.normal(1.0, 1.0, 1 + CELLS * KINDS))
+    doubtful = [name for first in range(0, 20, 5) for name in team[first : first + 2]]
+    assert len(posterior.blocks()) == 4
+    before = dict(zip(posterior.members, posterior.marginals(), strict=True))
+    pairs = [cells(posterior, doubtful[i : i + 1], doubtful[i + 1 : i + 2]) for i in range(0, 8, 2)]
+    posterior.regroup(np.isin(posterior.members, doubtful))
+    holding = [set(block) for block in posterior.blocks() if not set(block).isdisjoint(doubtful)]
+    assert sorted(map(len, holding)) == [2, 6]
+    assert set.union(*holding) == set(doubtful)
+    assert sorted(posterior.members) == team
+    assert max(map(len, posterior.blocks())) <= BLOCK
+    for name, p in zip(posterior.members, posterior.marginals(), strict=True):
+        assert p == pytest.approx(before[name], abs=2e-3)
+    for i, known in enumerate(pairs):
+        a, d = doubtful[2 * i : 2 * i + 1], doubtful[2 * i + 1 : 2 * i + 2]
+        np.testing.assert_allclose(cells(posterior, a, d), known, atol=2e-3)
+
+
+def test_regrouping_that_saves_no_block_changes_nothing():
+    posterior = Posterior.of(KINDS, 0.5, 0.25, [f"v{i:02d}" for i in range(20)])
+    before = posterior.to_state()
+    posterior.regroup(np.ones(20, dtype=bool))
+    posterior.regroup(np.arange(20) < 5)
+    posterior.regroup(np.zeros(20, dtype=bool))
+    assert posterior.to_state() == before
+
+
+def test_rows_are_the_subsets_of_their_masks():
+    posterior = Posterior.of(KINDS, 0.5, 0.25, [f"v{i:02d}" for i in range(13)])
+    subsets = posterior.rows(np.array([0, 2]), np.array([0b101, 0b10]))
+    sizes = [len(block) for block in posterior.blocks()]
+    assert [np.flatnonzero(row).tolist() for row in subsets] == [[0, 2], [sizes[0] + sizes[1] + 1]]
+    np.testing.assert_array_equal(posterior.masks(subsets), [[0b101, 0], [0, 0], [0, 0b10]])
+    np.testing.assert_allclose(posterior.clean_within(2)[0b10], posterior.unattacked(posterior.masks(subsets))[1])

@@ -1,0 +1,122 @@
+"""Which subsets are worth considering. Subsets are rows (n, S) of booleans over the members."""
+
+from __future__ import annotations
+
+from functools import lru_cache
+
+import numpy as np
+
+from robosac.boxes import FloatArray, IntArray
+from robosac.defenses.group_testing.choice import HARM, gain
+from robosac.defenses.group_testing.posterior import EXACT, BoolArray, Posterior
+
+SUSPECTS_AT_ONCE = 4
+"""Most unresolved teammates in a test of a larger team."""
+GROUPS = 60
+"""Groups of unresolved teammates considered in a larger team."""
+UNRESOLVED = (0.02, 0.995)
+"""A teammate with a suspicion between these is unresolved."""
+ANSWERS = 4
+"""Answers considered in a larger team."""
+WITNESSES = 4
+"""Trusted teammates that unresolved ones are added to in a larger team."""
+MOST_WITNESSES = 6
+"""Largest subset decoded already that unresolved teammates are added to in a larger team."""
+WORTH_WITNESSES = 0.1
+"""Bits that some group must be in doubt for answers to be kept small enough to be witnesses."""
+_CERTAIN = 1e-12
+
+
+def candidates(posterior: Posterior, present: BoolArray, decoded: BoolArray) -> BoolArray:
+    """Subsets worth considering, without those decoded: all in a small team; in a larger one the best answers, and up
+    to four unresolved teammates of one block, alone or beside trusted ones.
+
+    Parameters
+    ----------
+    posterior : Posterior
+    present : (S,) bool ndarray
+    decoded : (m, S) bool ndarray
+    """
+    here = np.flatnonzero(present)
+    found = _all_of(here, len(present)) if len(here) <= EXACT else _some_of(posterior, here, decoded)
+    unique = {row.tobytes(): index for index, row in reversed(list(enumerate(np.packbits(found, axis=1))))}
+    for row in np.packbits(decoded, axis=1):
+        unique.pop(row.tobytes(), None)
+    return found[sorted(unique.values())]
+
+
+def unresolved(suspicion: FloatArray) -> BoolArray:
+    """Who (S,) is neither as good as cleared nor as good as named."""
+    low, high = UNRESOLVED
+    doubtful: BoolArray = (suspicion >= low) & (suspicion <= high)
+    return doubtful
+
+
+def cleared(suspicion: FloatArray) -> BoolArray:
+    """Who (S,) is as good as cleared."""
+    good: BoolArray = suspicion < UNRESOLVED[0]
+    return good
+
+
+def _all_of(members: IntArray, size: int) -> BoolArray:
+    """All subsets but the empty one of these members, (2 ** m - 1, size)."""
+    codes = np.arange(1, 1 << len(members))
+    rows = np.zeros((len(codes), size), dtype=bool)
+    rows[:, members] = (codes[:, None] >> np.arange(len(members))) & 1
+    return rows
+
+
+def _some_of(posterior: Posterior, here: IntArray, decoded: BoolArray) -> BoolArray:
+    """Answers, and groups of unresolved teammates beside each subset of cleared ones decoded before: so a test is
+    evidence twice, by its index and by its pair. Where there is none yet, groups beside nobody and beside the least
+    suspected. While somebody is in doubt, an answer holds no more than can be witnesses afterwards.
+    """
+    suspicion = posterior.marginals()
+    good = cleared(suspicion)
+    ranked = here[np.argsort(suspicion[here], kind="stable")]
+    doubtful = np.zeros(len(suspicion), dtype=bool)
+    doubtful[here] = unresolved(suspicion)[here]
+    groups, doubt = _groups(posterior, doubtful)
+    counts = _answer_sizes(suspicion[ranked[:WITNESSES] if doubt >= WORTH_WITNESSES else ranked])
+    answers = np.zeros((len(counts), len(suspicion)), dtype=bool)
+    for row, count in zip(answers, counts, strict=True):
+        row[ranked[:count]] = True
+    bases = decoded[(decoded.sum(axis=1) <= MOST_WITNESSES) & ~decoded[:, ~good].any(axis=1)]
+    if not len(bases):
+        bases = np.zeros((2, len(suspicion)), dtype=bool)
+        bases[1, ranked[good[ranked]][:WITNESSES]] = True
+    return np.concatenate([answers, (bases[:, None] | groups[None]).reshape(-1, len(suspicion))])
+
+
+def _groups(posterior: Posterior, doubtful: BoolArray) -> tuple[BoolArray, float]:
+    """The groups (n, S) of doubtful teammates within blocks of which it is least certain whether anybody attacks, and
+    the greatest of their entropies, bits.
+    """
+    suspects = posterior.masks(doubtful[None])[:, 0].tolist()
+    within = [(b, _small_groups(mask)) for b, mask in enumerate(suspects) if mask]
+    if not within:
+        return np.zeros((0, len(doubtful)), dtype=bool), 0.0
+    clean = [posterior.clean_within(b)[masks] for b, masks in within]
+    p = np.clip(np.concatenate(clean), _CERTAIN, 1 - _CERTAIN)
+    entropy = -(p * np.log2(p) + (1 - p) * np.log2(1 - p))
+    best = np.argsort(-entropy, kind="stable")[:GROUPS]
+    blocks = np.repeat([b for b, _ in within], [len(masks) for _, masks in within])
+    rows = posterior.rows(blocks[best], np.concatenate([masks for _, masks in within])[best])
+    return rows, float(entropy.max())
+
+
+@lru_cache(maxsize=256)
+def _small_groups(suspects: int) -> IntArray:
+    """Masks of the groups of up to `SUSPECTS_AT_ONCE` of the suspects in a mask."""
+    masks = np.arange(1, suspects + 1)
+    few = np.array([mask.bit_count() <= SUSPECTS_AT_ONCE for mask in masks.tolist()], dtype=bool)
+    groups: IntArray = masks[few & (masks & ~suspects == 0)]
+    return groups
+
+
+def _answer_sizes(ascending: FloatArray) -> IntArray:
+    """How many of the least suspected make the best answers, as if teammates were independent."""
+    clean = np.cumprod(1.0 - ascending)
+    worth = clean * gain(np.arange(1, len(clean) + 1)) - (1.0 - clean) * HARM
+    best: IntArray = np.argsort(-worth, kind="stable")[:ANSWERS] + 1
+    return best
