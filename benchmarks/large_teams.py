@@ -124,7 +124,9 @@ def draw(teammates: int, attackers: int, kind: str, runs: int, frames: int) -> N
 
 
 def play_scenes(teammates: int, attackers: int, kind: str, frames: int, sequences: int) -> None:
-    """Scenes with one car more than the team without its roadside unit has; car-1 is the ego."""
+    """What the detector decodes, on scenes with as many cars as teammates: car-1 is the ego, the roadside unit one of
+    them.
+    """
     torch.set_num_threads(1)
     detector = load()
     defense = GroupTesting.calibrated(calibration_of(detector.info))
@@ -171,10 +173,12 @@ def _attacked(
 
 def _print_named(until_named: Sequence[int | None]) -> None:
     named = [n for n in until_named if n is not None]
-    print(
-        f"all named in {len(named)} of {len(until_named)}, after {np.mean(named):.1f} passes on average, "
-        f"median {np.median(named):.0f}, most {max(named)}"
-    )
+    print(f"all named in {len(named)} of {len(until_named)}", end="")
+    if named:
+        print(
+            f", after {np.mean(named):.1f} passes on average, median {np.median(named):.0f}, most {max(named)}", end=""
+        )
+    print()
 
 
 if __name__ == "__main__":
