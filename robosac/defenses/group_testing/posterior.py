@@ -47,6 +47,7 @@ class Posterior:
     teammates is one block, and nothing is approximated. A larger team is cut into blocks of up to `BLOCK`: inside a
     block all sets are held, between blocks (given the kind) independence is assumed, and after each piece of evidence
     the exact posterior is projected onto that form by its marginals on blocks and kind (assumed-density filtering).
+    Which teammates share a block may change with what is in doubt; see `regroup`.
 
     Parameters
     ----------
