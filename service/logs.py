@@ -53,7 +53,7 @@ def logging_to_stderr(settings: Settings) -> Iterator[None]:
     handler = _Stderr()
     handler.setFormatter(structlog.stdlib.ProcessorFormatter(foreign_pre_chain=_SHARED, processors=[*final, renderer]))
     loggers = [logging.getLogger(name) for name in (*_OWN, *_SERVER)]
-    before = [(logger, logger.handlers, logger.level, logger.propagate) for logger in loggers]
+    before = [(logger, list(logger.handlers), logger.level, logger.propagate) for logger in loggers]
     for logger in loggers:
         if logger.name in _OWN:
             logger.setLevel(settings.log_level.upper())
@@ -64,6 +64,6 @@ def logging_to_stderr(settings: Settings) -> Iterator[None]:
         yield
     finally:
         for logger, handlers, level, propagate in before:
-            logger.handlers = [kept for kept in handlers if kept is not handler]
+            logger.handlers = handlers
             logger.setLevel(level)
             logger.propagate = propagate
