@@ -99,7 +99,7 @@ def _settings(*numbers: tuple[str, int]) -> tuple[Setting, ...]:
 FULL = Extent(
     settings=_settings(
         *((attack, n) for attack in ("pgd", "bim", "cw") for n in (1, 2, 3, 4)),
-        *(("erase", n) for n in (1, 2, 3)),
+        *(("erase", n) for n in (1, 2)),
         *(("invent", n) for n in (1, 2)),
         *(("shift", n) for n in (1, 2)),
         ("erase-still", 1),
