@@ -201,3 +201,5 @@ def test_a_wrong_pose_moves_the_sender_by_as_much(rng):
     assert wrong[:, :2, 3].std(axis=0) == pytest.approx([0.2, 0.2], rel=0.15)
     np.testing.assert_array_equal(wrong[:, 2, 3], 1.6)
     np.testing.assert_allclose(np.linalg.det(wrong[:, :3, :3]), 1.0)
+    yaw = np.rad2deg(np.arctan2(wrong[:, 1, 0], wrong[:, 0, 0]) - 0.5)
+    assert yaw.std() == pytest.approx(0.4, rel=0.15)
