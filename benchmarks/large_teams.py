@@ -33,8 +33,6 @@ from robosac.scenes.splits import TEST_SEEDS
 
 LOSSES = np.array([0.0, *likelihoods.LOSS_EDGES])
 NOVELTIES = (0, *likelihoods.NOVELTY_EDGES)
-INDICES = np.array([0.0, *likelihoods.JACCARD_EDGES])
-REFERENCE = np.zeros((9, 6))
 EGO = "car-1"
 
 
@@ -42,9 +40,13 @@ class _Subset(np.ndarray):  # boxes that only say whose they are
     members: frozenset[str]
 
 
+REFERENCE = np.zeros((9, 6)).view(_Subset)
+REFERENCE.members = frozenset()
+
+
 @dataclass
 class World:
-    """Draws outcomes; the bins' lower edges stand for them."""
+    """Draws outcomes; the bins' lower edges stand for them. PGD, and no other kind, is taken to miss the consensus."""
 
     model: likelihoods.EvidenceModel
     attackers: frozenset[str]
@@ -52,19 +54,17 @@ class World:
     rng: np.random.Generator
 
     def outcome(self, subset: tuple[str, ...]) -> Outcome:
-        row = 0 if self.attackers.isdisjoint(subset) else 2 + likelihoods.CELLS * self.kind
-        table = self.model.jaccard_tables(np.array([len(subset)]))[0, row]
-        index = float(INDICES[self.rng.choice(len(table), p=table)])
         boxes = np.zeros((1, 6)).view(_Subset)
         boxes.members = frozenset(subset)
-        verdict = Verdict.CONSENSUS if index >= 0.3 else Verdict.DISSENSUS
+        agrees = self.attackers.isdisjoint(subset) or self.model.kinds[self.kind] != "pgd"
+        index, verdict = (0.5, Verdict.CONSENSUS) if agrees else (0.1, Verdict.DISSENSUS)
         return Outcome(subset, index, verdict, boxes, REFERENCE)
 
     def measure(self, smaller: _Subset, larger: _Subset) -> PairMeasure:
         a, d = smaller.members, larger.members - smaller.members
         cell = 2 * (not self.attackers.isdisjoint(a)) + (not self.attackers.isdisjoint(d))
-        row = likelihoods.CELLS * self.kind + cell if cell else 0
-        table = self.model.pair_tables(np.array([len(a)]), np.array([len(d)]))[0, row]
+        row = likelihoods.CLEAN + likelihoods.CELLS * self.kind + cell - 1 if cell else 0
+        table = self.model.tables(np.array([len(a)]), np.array([len(d)]))[0, row]
         loss, novelty = divmod(int(self.rng.choice(len(table), p=table)), likelihoods.NOVELTY_BINS)
         return PairMeasure(float(LOSSES[loss]), NOVELTIES[novelty])
 

@@ -10,14 +10,13 @@ from scipy.optimize import isotonic_regression
 from robosac.boxes import FloatArray
 from robosac.calibration.verdicts import Verdicts
 from robosac.defenses.group_testing.model import (
+    BINS,
     CELLS,
-    JACCARD_BINS,
-    JOINING_SIZES,
+    CLEAN,
     LOSS_BINS,
     NOVELTY_BINS,
     OPEN,
     SIZES,
-    WITNESS_SIZES,
     EvidenceModel,
 )
 
@@ -27,6 +26,7 @@ PSEUDO_COUNT = 2.0
 """Counts of a uniform histogram that every other one is mixed with."""
 UNIFORM_SHARE = 0.05
 """Share of a uniform histogram in those of attacked fusions, for what attackers may do otherwise."""
+PROJECTIONS = 50
 LARGEST_RATIO = 4.0
 """No single outcome says more than this, as a natural logarithm of a likelihood ratio."""
 _KERNEL = (0.25, 0.5, 0.25)
@@ -42,9 +42,10 @@ def fit(verdicts: Verdicts, kinds: Sequence[str], pose_error_m: float) -> Eviden
     1. A histogram of attacked fusions, and of unattacked ones, is smoothed along each axis by [1/4 1/2 1/4], and mixed
        with a uniform one.
     2. The ratio of attacked to unattacked is kept within ``exp(+-4)``.
-    3. Of the Jaccard index it is made not to rise with the index (isotonic regression): a fusion that agrees with the
-       ego never incriminates, whatever attackers in the calibration did.
-    4. The kind `OPEN` has a uniform histogram for every attacked fusion.
+    3. Beside the ego alone it is made not to fall with loss or novelty (isotonic regression): a fusion that agrees with
+       the ego never incriminates, whatever attackers in the calibration did.
+    4. The kind `OPEN` has a uniform histogram for every attacked pair.
+    5. Where nobody was complementary, the histogram of all unattacked pairs stands.
 
     Parameters
     ----------
@@ -57,29 +58,21 @@ def fit(verdicts: Verdicts, kinds: Sequence[str], pose_error_m: float) -> Eviden
     Raises
     ------
     TooFewVerdicts
-        If a kind, cell or size was never observed.
+        If a kind, a cell of it, or a size was never observed.
     """
-    jaccard = np.zeros((2 + len(kinds), SIZES, JACCARD_BINS))
-    for row, kind in enumerate([None, *kinds]):
-        for size in range(SIZES):
-            counts = [verdicts.jaccard[kind, size + 1, b] for b in range(JACCARD_BINS)]
-            jaccard[row, size] = _density(np.array(counts, dtype=np.float64)[:, None], kind, f"size {size + 1}")
-    jaccard[-1] = 1.0 / JACCARD_BINS
-    pairs = np.zeros((1 + CELLS * (len(kinds) + 1), WITNESS_SIZES, JOINING_SIZES, LOSS_BINS * NOVELTY_BINS))
-    rows = [(None, 0), *((kind, cell) for kind in kinds for cell in range(1, 1 + CELLS))]
+    rows = [(None, cell) for cell in range(CLEAN)] + [(kind, cell) for kind in kinds for cell in range(1, 1 + CELLS)]
+    pairs = np.full((len(rows) + CELLS, len(SIZES), BINS), 1.0 / BINS)
     for row, (kind, cell) in enumerate(rows):
-        for a in range(WITNESS_SIZES):
-            for d in range(JOINING_SIZES):
-                counts = [verdicts.pairs[kind, cell, a + 1, d + 1, b] for b in range(pairs.shape[-1])]
-                grid = np.array(counts, dtype=np.float64).reshape(LOSS_BINS, NOVELTY_BINS)
-                pairs[row, a, d] = _density(grid, kind, f"cell {cell}, sizes {a + 1} and {d + 1}")
-    pairs[len(rows) :] = 1.0 / pairs.shape[-1]
-    return EvidenceModel(
-        pose_error_m,
-        (*kinds, OPEN),
-        np.concatenate([jaccard[:1], _bounded(jaccard[:1], jaccard[1:], falling=True)]),
-        np.concatenate([pairs[:1], _bounded(pairs[:1], pairs[1:], falling=False)]),
-    )
+        for size, (a, d) in enumerate(SIZES):
+            seen = cell if a else min(cell, 1)  # nobody is in the ego alone, to attack
+            counts = [verdicts.pairs[kind, seen, size, b] for b in range(BINS)]
+            if kind is None and cell and not any(counts):  # nobody was complementary
+                pairs[row, size] = pairs[0, size]
+                continue
+            grid = np.array(counts, dtype=np.float64).reshape(LOSS_BINS, NOVELTY_BINS)
+            pairs[row, size] = _density(grid, kind, f"cell {seen}, sizes {a} and {d}")
+    attacked = _bounded(pairs[:1], pairs[CLEAN:])
+    return EvidenceModel(pose_error_m, (*kinds, OPEN), np.concatenate([pairs[:CLEAN], attacked]))
 
 
 def _density(counts: FloatArray, kind: str | None, what: str) -> FloatArray:
@@ -109,13 +102,31 @@ def _smoothed(histogram: FloatArray, axis: int) -> FloatArray:
     return smooth
 
 
-def _bounded(clean: FloatArray, attacked: FloatArray, *, falling: bool) -> FloatArray:
-    """The attacked rows with their ratio to the clean one bounded and, if asked, made not to rise with the bin."""
+def _bounded(clean: FloatArray, attacked: FloatArray) -> FloatArray:
+    """The attacked rows with their ratio to the clean one bounded and, beside the ego alone, made not to fall with loss
+    and novelty.
+    """
     ratio = np.clip(np.log(attacked / clean), -LARGEST_RATIO, LARGEST_RATIO)
-    if falling:
-        for row, size in np.ndindex(ratio.shape[:2]):
-            weight = (clean[0, size] + attacked[row, size]) / 2
-            ratio[row, size] = isotonic_regression(ratio[row, size], weights=weight, increasing=False).x
+    weight = (clean + attacked) / 2
+    for row, size in np.ndindex(ratio.shape[:2]):
+        if SIZES[size][0] == 0:
+            ratio[row, size] = _rising(ratio[row, size], weight[row, size])
     bounded = clean * np.exp(ratio)
     normal: FloatArray = bounded / bounded.sum(axis=-1, keepdims=True)
     return normal
+
+
+def _rising(values: FloatArray, weights: FloatArray) -> FloatArray:
+    """The closest grid (weighted least squares) that falls neither with loss nor with novelty, by Dykstra's
+    alternating projections.
+    """
+    grid, weight = values.reshape(LOSS_BINS, NOVELTY_BINS), weights.reshape(LOSS_BINS, NOVELTY_BINS)
+    owed = [np.zeros_like(grid), np.zeros_like(grid)]
+    for _ in range(PROJECTIONS):
+        for axis in range(2):
+            before = grid + owed[axis]
+            lines = zip(np.moveaxis(before, axis, -1), np.moveaxis(weight, axis, -1), strict=True)
+            grid = np.moveaxis(np.array([isotonic_regression(x, weights=w).x for x, w in lines]), -1, axis)
+            owed[axis] = before - grid
+    flat: FloatArray = grid.ravel()
+    return flat

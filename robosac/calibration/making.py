@@ -42,9 +42,9 @@ class Recipe:
     seed : int
     """
 
-    attacks: tuple[str, ...] = ("pgd", "erase")
+    attacks: tuple[str, ...] = ("pgd", "erase", "invent", "shift")
     attackers: tuple[int, ...] = (1, 2)
-    scenes: int = 48
+    scenes: int = 128
     frames_per_scene: int = 2
     check_scenes: int = 12
     pose_errors_m: tuple[float, ...] = (0.0, 0.2, 0.4)

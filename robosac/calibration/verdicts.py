@@ -10,9 +10,10 @@ from itertools import combinations
 import numpy as np
 
 from robosac.attacks import Attack
-from robosac.consensus import at_least, compare
-from robosac.defenses.group_testing.geometry import MIN_WITNESSES, measure
-from robosac.defenses.group_testing.model import JOINING_SIZES, SIZES, WITNESS_SIZES, jaccard_bin, pair_bin
+from robosac.boxes import FloatArray
+from robosac.consensus import at_least
+from robosac.defenses.group_testing.geometry import measure
+from robosac.defenses.group_testing.model import pair_bin, size_row
 from robosac.detectors import Detector
 from robosac.evaluation.frames import encode_all, misplaced, under_attack
 from robosac.evaluation.recordings import RecordedFrame, Subset, record
@@ -20,10 +21,14 @@ from robosac.scenes import IntersectionScene
 
 FRAME_STRIDE = 10
 """Frames of a scene are this many periods of 0.2 s apart, so that they differ."""
-JaccardKey = tuple[str | None, int, int]
-"""Kind of attack (None: no attacker in the subset), size of the subset, bin."""
-PairKey = tuple[str | None, int, int, int, int]
-"""Kind, cell (0: both clean; then d dirty, a dirty, both), sizes of a and d, bin."""
+ADDED_BOXES = 1.0
+"""A benign teammate is complementary if it adds so many boxes, on average, to fusions of up to two others."""
+PairKey = tuple[str | None, int, int, int]
+"""Kind of attack (None: nobody attacks in the pair), cell, row of `SIZES`, bin.
+
+Cells of a kind: 1 if only in d somebody attacks, 2 if only in a, 3 if in both. Without an attack the cells say so of
+those that are complementary, and 0 is for all pairs, whoever is.
+"""
 
 
 @dataclass
@@ -32,31 +37,45 @@ class Verdicts:
 
     Attributes
     ----------
-    jaccard : Counter of JaccardKey
     pairs : Counter of PairKey
     """
 
-    jaccard: Counter[JaccardKey] = field(default_factory=Counter)
     pairs: Counter[PairKey] = field(default_factory=Counter)
 
     def add(self, frame: RecordedFrame, kind: str | None) -> None:
-        """Count what all subsets of a frame show; of an attacked frame, those that an attacker has a part in."""
-        score = frame.info.consensus_score
-        reference = at_least(frame.detect(), score)
+        """Count what all pairs of a frame show; of an attacked frame, those that an attacker has a part in."""
+        special = complementary(frame) if kind is None else frame.attackers
         subsets = [s for size in range(1, len(frame.team) + 1) for s in combinations(frame.team, size)]
         for larger in map(frozenset, subsets):
-            if (kind is None) != larger.isdisjoint(frame.attackers):
+            if kind is not None and larger.isdisjoint(special):
                 continue
-            boxes = frame.detect(larger)
-            if len(reference) >= MIN_WITNESSES:
-                index = compare(reference, at_least(boxes, score)).jaccard_index
-                self.jaccard[kind, min(len(larger), SIZES), jaccard_bin(index)] += 1
             for smaller in _proper_parts(larger):
-                pair = measure(frame.detect(smaller), boxes)
+                pair = measure(_boxes(frame, smaller), frame.detect(larger))
                 if pair is not None:
                     joining = larger - smaller
-                    sizes = min(len(smaller), WITNESS_SIZES), min(len(joining), JOINING_SIZES)
-                    self.pairs[kind, _cell(frame, smaller, joining), *sizes, pair_bin(pair)] += 1
+                    row = int(size_row(np.array(len(smaller)), np.array(len(joining))))
+                    cell = 2 * (not smaller.isdisjoint(special)) + (not joining.isdisjoint(special))
+                    for counted in {0, cell} if kind is None else {cell}:
+                        self.pairs[kind, counted, row, pair_bin(pair)] += 1
+
+
+def complementary(frame: RecordedFrame) -> Subset:
+    """Teammates of a frame without attackers that see much of what the others do not: see `ADDED_BOXES`."""
+    found = set()
+    for name in frame.team:
+        others = [other for other in frame.team if other != name]
+        parts = [c for size in range(3) for c in combinations(others, size)]
+        pairs = [measure(_boxes(frame, frozenset(part)), frame.detect((*part, name))) for part in parts]
+        added = [pair.novelty for pair in pairs if pair is not None]
+        if added and np.mean(added) >= ADDED_BOXES:
+            found.add(name)
+    return frozenset(found)
+
+
+def _boxes(frame: RecordedFrame, subset: Subset) -> FloatArray:
+    """What a defence sees of a subset; of the ego alone, the boxes that take part in the comparison."""
+    boxes = frame.detect(subset)
+    return boxes if subset else at_least(boxes, frame.info.consensus_score)
 
 
 def validation_frames(
@@ -117,10 +136,5 @@ def collect(frames: Iterator[tuple[str | None, RecordedFrame]], tick: Callable[[
 
 def _proper_parts(larger: Subset) -> Iterator[Subset]:
     members = sorted(larger)
-    for size in range(1, len(members)):
+    for size in range(len(members)):
         yield from map(frozenset, combinations(members, size))
-
-
-def _cell(frame: RecordedFrame, a: Subset, d: Subset) -> int:
-    """0 if nobody attacks; 1 if only in d, 2 if only in a, 3 if in both."""
-    return 2 * (not a.isdisjoint(frame.attackers)) + (not d.isdisjoint(frame.attackers))

@@ -41,7 +41,8 @@ def run(
 ) -> None:
     """Observe what tests show when it is known who attacks, write the likelihoods, and check them.
 
-    Options that may be repeated: --attack (by default pgd and erase), --attackers (1 and 2), --pose-error (0, .2, .4).
+    Options that may be repeated: --attack (by default pgd, erase, invent and shift), --attackers (1 and 2),
+    --pose-error (0, .2, .4).
     """
     torch.set_num_threads(1)
     console = Console()

@@ -174,7 +174,7 @@ async def test_group_testing_names_the_attacker_and_tells_its_suspicion(served, 
     assert all("car-2" not in answer.accepted for answer in answers)
     last = answers[-1].rejected["car-2"]
     assert last["reason"] == "distrusted"
-    assert {item["test"] for item in last["evidence"]} <= {"jaccard", "pair"}
+    assert {item["test"] for item in last["evidence"]} <= {"ego", "pair"}
     body = wire.pack_frame(9, ego_message, attacked)
     result = (await served.post(session, "frames", body)).json()
     state = (await served.http.get(path, headers=bearer)).json()

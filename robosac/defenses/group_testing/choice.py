@@ -5,7 +5,7 @@ from __future__ import annotations
 import numpy as np
 
 from robosac.boxes import FloatArray, IntArray
-from robosac.defenses.group_testing.memory import JACCARD_REPEAT, PAIR_REPEAT, KeyArray, Memory, keys
+from robosac.defenses.group_testing.memory import EGO_REPEAT, PAIR_REPEAT, KeyArray, Memory, keys
 from robosac.defenses.group_testing.model import EvidenceModel
 from robosac.defenses.group_testing.posterior import BoolArray, Posterior
 
@@ -44,7 +44,7 @@ def expected_information(
     *,
     ego_sees: bool,
 ) -> FloatArray:
-    """Bits (n,) that decoding each subset promises: from its Jaccard index (unless the ego sees too little), and from
+    """Bits (n,) that decoding each subset promises: beside the ego alone (unless that sees too little), and from
     the best pair with an already decoded part or superset of it; each times what a repetition is worth.
 
     Parameters
@@ -60,11 +60,10 @@ def expected_information(
     """
     bits = np.zeros(len(subsets))
     masks, subset_keys, sizes = posterior.masks(subsets), subsets @ identities, subsets.sum(axis=1)
-    clean = posterior.clean(masks)
     if ego_sees:
-        cells = posterior.joint(clean, np.ones_like(clean), clean)
-        once = memory.weights(keys(subset_keys, np.zeros_like(subset_keys)), JACCARD_REPEAT)
-        bits += once * model.jaccard_information(sizes, cells) * dilution(sizes)
+        once = memory.weights(keys(np.zeros_like(subset_keys), subset_keys), EGO_REPEAT)
+        told = model.information(np.zeros_like(sizes), sizes, posterior.cells(np.zeros_like(masks), masks))
+        bits += once * told * dilution(sizes)
     shared = subsets.astype(np.float64) @ decoded.T  # exact as floats, whose products are the fast ones
     other_sizes = decoded.sum(axis=1)
     above = shared == other_sizes
@@ -72,15 +71,13 @@ def expected_information(
     if not len(index):
         return bits
     other_masks, other_keys = posterior.masks(decoded), decoded @ identities
-    other_clean = posterior.clean(other_masks)
     grows = above[index, other]
     a_keys = np.where(grows, other_keys[other], subset_keys[index])
     d_keys = np.where(grows, subset_keys[index], other_keys[other]) - a_keys
     a_sizes, together = np.minimum(sizes[index], other_sizes[other]), np.maximum(sizes[index], other_sizes[other])
-    in_a = np.where(grows, other_clean[:, other], clean[:, index])
-    in_both = np.where(grows, clean[:, index], other_clean[:, other])
-    in_d = posterior.clean(masks[:, index] ^ other_masks[:, other])
-    told = model.pair_information(a_sizes, together - a_sizes, posterior.joint(in_a, in_d, in_both))
+    a_masks = np.where(grows, other_masks[:, other], masks[:, index])
+    cells = posterior.cells(a_masks, masks[:, index] ^ other_masks[:, other])
+    told = model.information(a_sizes, together - a_sizes, cells)
     once = memory.weights(keys(a_keys, d_keys), PAIR_REPEAT)
     best = np.zeros(len(subsets))
     np.maximum.at(best, index, once * told * dilution(together))

@@ -30,19 +30,20 @@ DEFAULT_POSE_ERROR_M = 0.2
 class GroupTesting:
     """Bayesian group testing over the team, with memory; the number of attackers is not assumed.
 
-    1. The posterior over (set of attackers, kind of attack) goes one frame on: hijacks, recoveries.
+    1. The posterior over (who attacks, whose view is complementary, kind of attack) goes one frame on: hijacks,
+       recoveries.
     2. The next subset is the one with the greatest ``max(0, U(m) - best U so far) + .06 bits(m) - .004``: what it gains
        as an answer, and what it is expected to tell. Nothing above 0, the frame's budget, or the deadline ends the
        search.
-    3. A decoded subset is evidence by its Jaccard index against the ego, and by what it keeps, moves and invents
-       compared with each part and superset decoded in this frame (`geometry.measure`). A repeated test weighs less.
+    3. A decoded subset is evidence by what it keeps, moves and adds compared with the ego alone and with each part and
+       superset decoded in this frame (`geometry.measure`). A repeated test weighs less.
     4. The answer is the decoded subset of greatest utility that is in consensus with the ego, or all trusted.
     5. A teammate is named (``distrusted``) once its probability passes ``naming_bound`` and at least two different
        subsets speak against it; it is cleared when the probability falls below a half.
 
     An ego that sees fewer than two boxes gives no verdict: its consensus is none, and the answer falls back on the
     trust list (source ``trusted``). Teammates get onto that list by having been in consensus, and stay while their
-    suspicion is at most .1. Exact for teams up to 8; see `Posterior` for larger ones.
+    suspicion is at most .1. Exact for teams up to 6; see `Posterior` for larger ones.
 
     Parameters
     ----------
@@ -151,11 +152,11 @@ class GroupTesting:
         return decision.with_state(_state(posterior, memory, decision.trusted, decision.named))
 
     def _revive(self, state: State) -> tuple[Posterior, Memory]:
-        posterior = Posterior.from_state(state["posterior"], self.attack_prior, self.attacker_prior)
-        if len(posterior.kinds) != len(self.model.kinds):  # calibrated again, for other kinds, since
-            members = posterior.members
-            posterior = Posterior.of(len(self.model.kinds), self.attack_prior, self.attacker_prior, members)
-        return posterior, Memory.from_state(state["memory"])
+        known, kinds, priors = state["posterior"], len(self.model.kinds), (self.attack_prior, self.attacker_prior)
+        if len(known["weights"]) != 1 + kinds:  # calibrated again, for other kinds, since
+            members = [name for block in known["blocks"] for name in block["members"]]
+            return Posterior.of(kinds, *priors, members), Memory.from_state(state["memory"])
+        return Posterior.from_state(known, *priors), Memory.from_state(state["memory"])
 
     def _sync(self, posterior: Posterior, memory: Memory, joined: Sequence[str], kept: Sequence[str] | None) -> None:
         known = set(posterior.members)

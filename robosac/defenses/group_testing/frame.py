@@ -13,16 +13,16 @@ from robosac.boxes import FloatArray
 from robosac.consensus import Verdict
 from robosac.defenses.group_testing import choice
 from robosac.defenses.group_testing.candidates import WITNESSES, candidates, cleared
-from robosac.defenses.group_testing.geometry import MIN_WITNESSES, measure
+from robosac.defenses.group_testing.geometry import MIN_WITNESSES, PairMeasure, measure
 from robosac.defenses.group_testing.memory import (
-    JACCARD_REPEAT,
+    EGO_REPEAT,
     PAIR_REPEAT,
     WORTH_KEEPING,
     Memory,
     identity,
     keys,
 )
-from robosac.defenses.group_testing.model import EvidenceModel, jaccard_bin, pair_bin
+from robosac.defenses.group_testing.model import CLEAN, EvidenceModel, pair_bin
 from robosac.defenses.group_testing.posterior import EXACT, BoolArray, Posterior
 from robosac.defenses.protocol import (
     Decision,
@@ -102,7 +102,7 @@ class JudgedFrame:
         self._team = team
         self._trusted = trusted
         self._outcomes: list[Outcome] = []
-        self._ego_sees = True
+        self._ego_sees = self._ego_witnesses = True
         self._members = posterior.members
         self._index = {name: i for i, name in enumerate(self._members)}
         self._identities = np.array([identity(name) for name in self._members], dtype=np.uint64)
@@ -126,7 +126,7 @@ class JudgedFrame:
         if not len(options):
             return None
         bits = choice.expected_information(
-            self._model, self._posterior, self._memory, self._identities, options, decoded, ego_sees=self._ego_sees
+            self._model, self._posterior, self._memory, self._identities, options, decoded, ego_sees=self._ego_witnesses
         )
         worth = choice.utility(self._posterior, options) - max(0.0, self._best_answer()[1])
         value = np.maximum(0.0, worth) + choice.INFORMATION_VALUE * bits - choice.TEST_COST
@@ -141,14 +141,15 @@ class JudgedFrame:
         return tuple(name for name in self._team if options[chosen, self._index[name]])
 
     def learn(self, outcome: Outcome) -> None:
-        """Take in a decoded subset: its Jaccard index, and the pairs it makes with what was decoded before."""
+        """Take in a decoded subset: the pairs it makes with the ego alone and with what was decoded before."""
         self._ego_sees = outcome.reference is not None and len(outcome.reference) >= MIN_WITNESSES
         findings = self._pairs(outcome)
-        if self._ego_sees:
-            size = np.array([len(outcome.teammates)])
-            likelihood = self._model.jaccard_tables(size)[0, :, jaccard_bin(outcome.jaccard_index)]
-            values = {"test": "jaccard", "jaccard_index": round(outcome.jaccard_index, 4)}
-            findings.append(_Finding(outcome.teammates, (), np.log(likelihood), 1.0, values))
+        if outcome.reference is not None and outcome.boxes is not None:
+            pair = measure(outcome.reference, outcome.boxes)
+            self._ego_witnesses = pair is not None
+            if pair is not None:
+                values = {"jaccard_index": round(outcome.jaccard_index, 4)}
+                findings.append(self._finding((), outcome.teammates, pair, 1.0, values))
         self._outcomes.append(outcome)
         for finding in findings:
             self._apply(finding)
@@ -165,30 +166,35 @@ class JudgedFrame:
             pair = measure(small.boxes, large.boxes)
             if pair is not None:
                 found.append((small.teammates, joining, pair))
-        findings = []
-        for a, d, pair in found:
-            tables = self._model.pair_tables(np.array([len(a)]), np.array([len(d)]))
-            values = {"test": "pair", "loss": round(pair.loss, 4), "novelty": pair.novelty}
-            log_likelihood = np.log(tables[0, :, pair_bin(pair)])
-            findings.append(_Finding(a, d, log_likelihood, 1 / math.sqrt(len(found)), values))
-        return findings
+        return [self._finding(a, d, pair, 1 / math.sqrt(len(found)), {}) for a, d, pair in found]
+
+    def _finding(
+        self, a: Hypothesis, d: Hypothesis, pair: PairMeasure, weight: float, values: Mapping[str, Any]
+    ) -> _Finding:
+        table = self._model.tables(np.array([len(a)]), np.array([len(d)]))[0]
+        values = {"test": "pair" if a else "ego", **values, "loss": round(pair.loss, 4), "novelty": pair.novelty}
+        return _Finding(a, d, np.log(table[:, pair_bin(pair)]), weight, values)
 
     def _apply(self, finding: _Finding) -> None:
         a, d = self._rows([finding.a, finding.d])
         cells = self._posterior.cells(self._posterior.masks(a[None]), self._posterior.masks(d[None]))[0]
-        attacked = float(cells[1:] @ np.exp(finding.log_likelihood[1:])) / max(float(cells[1:].sum()), _TINY)
-        sign = 1 if math.log(max(attacked, _TINY)) > finding.log_likelihood[0] else -1
+        likelihood = np.exp(finding.log_likelihood)
+        clean, attacked = (
+            float(cells[part] @ likelihood[part]) / max(float(cells[part].sum()), _TINY)
+            for part in (slice(CLEAN), slice(CLEAN, None))
+        )
+        sign = 1 if attacked > clean else -1
         (key,) = keys(a[None] @ self._identities, d[None] @ self._identities)
         weight = finding.weight * float(choice.dilution(np.array([len(finding.a) + len(finding.d)]))[0])
-        weight *= self._memory.weigh(int(key), PAIR_REPEAT if finding.d else JACCARD_REPEAT, sign)
+        weight *= self._memory.weigh(int(key), PAIR_REPEAT if finding.a else EGO_REPEAT, sign)
         before = self._posterior.marginals()
         self._posterior.update(a, d, weight * finding.log_likelihood)
         ratios = _log_odds(self._posterior.marginals()) - _log_odds(before)
         for index in np.flatnonzero(np.abs(ratios) >= WORTH_KEEPING):
             name, ratio = self._members[index], float(ratios[index])
             if ratio > 0 or name in self._memory.evidence:
-                item = {"frame": self._memory.frame, **finding.values, "teammates": list(finding.a)}
-                if finding.d:
+                item = {"frame": self._memory.frame, **finding.values, "teammates": list(finding.a or finding.d)}
+                if finding.a:
                     item["joining"] = list(finding.d)
                 item["log_likelihood_ratio"] = round(ratio, 3)
                 self._memory.add_evidence(name, item)

@@ -14,7 +14,7 @@ from robosac.boxes import FloatArray
 
 REPEAT_MEMORY = 60
 """Frames after which a test counts as new."""
-JACCARD_REPEAT = 0.95
+EGO_REPEAT = 0.95
 PAIR_REPEAT = 0.9
 """A test made k frames ago repeats its bias: made again, it weighs 1 - rho ** k."""
 KEPT_ITEMS = 12
@@ -35,7 +35,7 @@ def identity(name: str) -> int:
 
 
 def keys(a: KeyArray, d: KeyArray) -> KeyArray:
-    """Keys (n,) of tests of subsets ``a`` beside which ``d`` joined (0: a test of the Jaccard index); all uint64."""
+    """Keys (n,) of tests of subsets ``a`` beside which ``d`` joined (``a`` 0: the ego alone); all uint64."""
     with np.errstate(over="ignore"):
         return a * _SPREAD + d
 

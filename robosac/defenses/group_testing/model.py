@@ -15,23 +15,27 @@ from robosac.boxes import FloatArray, IntArray
 from robosac.budget import DomainError
 from robosac.defenses.group_testing.geometry import PairMeasure
 
-FORMAT = 1
+FORMAT = 2
 OPEN = "open"
 """The kind of attack that nothing was calibrated for: any outcome of an attacked fusion is as likely as any other."""
-JACCARD_EDGES = tuple(np.round(np.arange(0.1, 1.0, 0.1), 1).tolist())
 LOSS_EDGES = (0.03, 0.045, 0.06, 0.075, 0.09, 0.11, 0.13, 0.16, 0.2, 0.28, 0.4)
-NOVELTY_EDGES = (1, 2, 4, 7)
-JACCARD_BINS = len(JACCARD_EDGES) + 1
+NOVELTY_EDGES = (1, 2, 3, 5, 7, 9, 12, 16)
 LOSS_BINS = len(LOSS_EDGES) + 1
 NOVELTY_BINS = len(NOVELTY_EDGES) + 1
-SIZES = 5
-"""Sizes of a subset told apart by the Jaccard index: 1 to 5; larger ones count as 5."""
-WITNESS_SIZES = 3
-"""Sizes of the smaller fusion of a pair told apart."""
-JOINING_SIZES = 2
-"""Numbers of joining teammates told apart."""
+BINS = LOSS_BINS * NOVELTY_BINS
+COARSE = (2, 2)
+"""Neighbouring bins of loss, and of novelty, that are taken together to reckon what a test promises."""
+JOINING_SIZES = (5, 3, 2, 2)
+"""Numbers of joining teammates told apart beside none (the ego alone), one, two, and three or more."""
+SIZES = tuple((a, d) for a, most in enumerate(JOINING_SIZES) for d in range(1, most + 1))
+"""Sizes (a, d) told apart; the last ones of each count for all that are larger."""
+CLEAN = 4
+"""Unattacked cells of a pair (a, d): nobody complementary; somebody in d; in a; in both."""
 CELLS = 3
-"""Attacked cells of a pair (a, d), after the one where both are clean: d dirty; a dirty; both dirty."""
+"""Attacked cells of a pair, for each kind: d dirty; a dirty; both dirty."""
+_FIRST = np.cumsum([0, *JOINING_SIZES[:-1]])
+_MOST = np.array(JOINING_SIZES)
+_TINY = 1e-300
 _TOLERANCE = 1e-3
 
 
@@ -39,9 +43,11 @@ class CalibrationError(DomainError):
     """A calibration is missing, damaged, or of other weights."""
 
 
-def jaccard_bin(jaccard_index: float) -> int:
-    """Bin of a Jaccard index."""
-    return int(np.searchsorted(JACCARD_EDGES, jaccard_index, side="right"))
+def size_row(a: IntArray, d: IntArray) -> IntArray:
+    """Which of `SIZES` (n,) pairs of these sizes (n,) and (n,) count as; d at least 1."""
+    witnesses = np.minimum(a, len(JOINING_SIZES) - 1)
+    row: IntArray = _FIRST[witnesses] + np.minimum(d, _MOST[witnesses]) - 1
+    return row
 
 
 def pair_bin(pair: PairMeasure) -> int:
@@ -55,8 +61,7 @@ def pair_bin(pair: PairMeasure) -> int:
 class EvidenceModel:
     """Likelihoods at one level of pose error.
 
-    Rows of a table stand for what is true: row 0 for an unattacked fusion (or pair), then for each kind of attack one
-    row (Jaccard index) or `CELLS` rows (pairs).
+    Rows of the table stand for what is true: `CLEAN` rows for unattacked pairs, then for each kind of attack `CELLS`.
 
     Attributes
     ----------
@@ -64,97 +69,72 @@ class EvidenceModel:
         Standard deviation of the teammates' positions that it was calibrated at, metres.
     kinds : tuple of str
         Kinds of attack, `OPEN` last.
-    jaccard : (1 + K, SIZES, JACCARD_BINS) ndarray
-        Each last axis sums to 1.
-    pairs : (1 + 3 K, WITNESS_SIZES, JOINING_SIZES, LOSS_BINS * NOVELTY_BINS) ndarray
+    pairs : (CLEAN + 3 K, len(SIZES), BINS) ndarray
         Each last axis sums to 1.
     """
 
     pose_error_m: float
     kinds: tuple[str, ...]
-    jaccard: FloatArray
     pairs: FloatArray
 
     def __post_init__(self) -> None:
-        k = len(self.kinds)
-        shapes = {
-            "jaccard": (1 + k, SIZES, JACCARD_BINS),
-            "pairs": (1 + CELLS * k, WITNESS_SIZES, JOINING_SIZES, LOSS_BINS * NOVELTY_BINS),
-        }
-        for name, shape in shapes.items():
-            table = getattr(self, name)
-            if table.shape != shape:
-                raise CalibrationError(f"{name} must have the shape {shape}, got {table.shape}")
-            if not (table > 0).all() or abs(table.sum(axis=-1) - 1).max() > _TOLERANCE:
-                raise CalibrationError(f"{name} must hold positive probabilities that sum to 1")
+        shape = (CLEAN + CELLS * len(self.kinds), len(SIZES), BINS)
+        if self.pairs.shape != shape:
+            raise CalibrationError(f"pairs must have the shape {shape}, got {self.pairs.shape}")
+        if not (self.pairs > 0).all() or abs(self.pairs.sum(axis=-1) - 1).max() > _TOLERANCE:
+            raise CalibrationError("pairs must hold positive probabilities that sum to 1")
 
     @cached_property
-    def as_cells(self) -> FloatArray:
-        """The Jaccard tables (SIZES, 1 + 3 K, JACCARD_BINS) as those of a pair (a, nobody), of which d is never
-        dirty.
+    def _by_size(self) -> FloatArray:
+        """The table (len(SIZES), CLEAN + 3 K, BINS)."""
+        return np.ascontiguousarray(self.pairs.swapaxes(0, 1))
+
+    @cached_property
+    def _parts(self) -> FloatArray:
+        """1 for the part of a pair that each row has attackers in (CLEAN + 3 K, 4): nowhere, d, a, both."""
+        return np.concatenate([np.eye(1 + CELLS)[[0] * CLEAN], *[np.eye(1 + CELLS)[1:]] * len(self.kinds)])
+
+    @cached_property
+    def _by_part(self) -> FloatArray:
+        """The table (len(SIZES), CLEAN + 3 K, 4 x fewer bins), each row beside zeros for the other parts; as many bins
+        of loss and of novelty as `COARSE` says are one, since what a test promises need not be known exactly.
         """
-        rows = np.repeat(self.jaccard[:1], 1 + CELLS * len(self.kinds), axis=0)
-        for cell in (1, 2):  # a dirty; "both dirty" cannot be, and gets the same row
-            rows[1 + cell :: CELLS] = self.jaccard[1:]
-        cells: FloatArray = np.ascontiguousarray(rows.swapaxes(0, 1))
-        return cells
+        grid = self._by_size.reshape(*self._by_size.shape[:2], LOSS_BINS, NOVELTY_BINS)
+        for axis, width in enumerate(COARSE, start=2):
+            grid = np.add.reduceat(grid, np.arange(0, grid.shape[axis], width), axis=axis)
+        apart = self._parts[None, :, :, None] * grid.reshape(*grid.shape[:2], 1, -1)
+        return apart.reshape(*grid.shape[:2], -1)
 
-    @cached_property
-    def by_size(self) -> FloatArray:
-        """The pair tables (WITNESS_SIZES * JOINING_SIZES, 1 + 3 K, bins)."""
-        tables = np.moveaxis(self.pairs, 0, 2).reshape(-1, len(self.pairs), self.pairs.shape[-1])
-        return np.ascontiguousarray(tables)
-
-    @cached_property
-    def entropies(self) -> tuple[FloatArray, FloatArray]:
-        """Entropy of each row of `as_cells` and of `by_size`, bits."""
-        of_index, of_pair = (-(tables * np.log2(tables)).sum(axis=-1) for tables in (self.as_cells, self.by_size))
-        return of_index, of_pair
-
-    def jaccard_tables(self, sizes: IntArray) -> FloatArray:
-        """Tables (n, 1 + 3 K, JACCARD_BINS) for subsets of these sizes (n,)."""
-        tables: FloatArray = self.as_cells[_size_row(sizes)]
+    def tables(self, a: IntArray, d: IntArray) -> FloatArray:
+        """Tables (n, CLEAN + 3 K, BINS) for pairs of these sizes (n,) and (n,); d at least 1."""
+        tables: FloatArray = self._by_size[size_row(a, d)]
         return tables
 
-    def pair_tables(self, witnesses: IntArray, joining: IntArray) -> FloatArray:
-        """Tables (n, 1 + 3 K, bins) for pairs of these sizes (n,) and (n,), each at least 1."""
-        tables: FloatArray = self.by_size[_pair_row(witnesses, joining)]
-        return tables
-
-    def jaccard_information(self, sizes: IntArray, cells: FloatArray) -> FloatArray:
-        """Bits (n,) that the Jaccard index of subsets of these sizes (n,) promises about what is true.
+    def information(self, a: IntArray, d: IntArray, cells: FloatArray) -> FloatArray:
+        """Bits (n,) that pairs of these sizes promise about who attacks: the entropy of the outcome less what is left
+        of it once it is known in which part attackers are. Neither their kind nor whose view is complementary is worth
+        knowing in itself.
 
         Parameters
         ----------
-        sizes : (n,) int ndarray
-        cells : (n, 1 + 3 K) ndarray
+        a, d : (n,) int ndarray
+            Sizes; d at least 1.
+        cells : (n, CLEAN + 3 K) ndarray
             Probability of what is true.
         """
-        return _information(self.as_cells, self.entropies[0], _size_row(sizes), cells)
-
-    def pair_information(self, witnesses: IntArray, joining: IntArray, cells: FloatArray) -> FloatArray:
-        """The same of pairs of these sizes (n,) and (n,)."""
-        return _information(self.by_size, self.entropies[1], _pair_row(witnesses, joining), cells)
-
-
-def _size_row(sizes: IntArray) -> IntArray:
-    row: IntArray = np.minimum(sizes, SIZES) - 1
-    return row
+        which = size_row(a, d)
+        bits = _entropy(cells @ self._parts)
+        for index in np.unique(which).tolist():
+            rows = np.flatnonzero(which == index)
+            shown = (cells[rows] @ self._by_part[index]).reshape(len(rows), 1 + CELLS, -1)
+            bits[rows] += _entropy(shown.sum(axis=1)) - _entropy(shown).sum(axis=1)
+        return np.maximum(bits, 0.0)
 
 
-def _pair_row(witnesses: IntArray, joining: IntArray) -> IntArray:
-    row: IntArray = (np.minimum(witnesses, WITNESS_SIZES) - 1) * JOINING_SIZES + np.minimum(joining, JOINING_SIZES) - 1
-    return row
-
-
-def _information(tables: FloatArray, entropies: FloatArray, which: IntArray, cells: FloatArray) -> FloatArray:
-    """Mutual information (n,): the entropy of the outcome less what is left of it once the truth is known."""
-    bits = np.empty(len(which))
-    for index in np.unique(which):
-        rows = which == index
-        mixed = cells[rows] @ tables[index]
-        bits[rows] = -(mixed * np.log2(mixed)).sum(axis=1) - cells[rows] @ entropies[index]
-    return np.maximum(bits, 0.0)
+def _entropy(p: FloatArray) -> FloatArray:
+    """Sum of -p log2 p over the last axis."""
+    bits: FloatArray = -np.einsum("...i,...i", p, np.log2(np.maximum(p, _TINY)))
+    return bits
 
 
 @dataclass(frozen=True)
@@ -202,7 +182,6 @@ class Calibration:
                 {
                     "pose_error_m": level.pose_error_m,
                     "kinds": list(level.kinds),
-                    "jaccard": _rounded(level.jaccard),
                     "pairs": _rounded(level.pairs),
                 }
                 for level in self.levels
@@ -227,7 +206,6 @@ class Calibration:
                 EvidenceModel(
                     float(level["pose_error_m"]),
                     tuple(map(str, level["kinds"])),
-                    _normalised(level["jaccard"]),
                     _normalised(level["pairs"]),
                 )
                 for level in content["levels"]

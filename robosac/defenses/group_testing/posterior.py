@@ -1,4 +1,4 @@
-"""Who attacks, and how: a probability for every set of attackers with every kind of attack, and for nobody."""
+"""Who attacks, and how: a probability for every state of the whole team under every kind of attack, and under none."""
 
 from __future__ import annotations
 
@@ -11,13 +11,19 @@ import numpy as np
 
 from robosac.boxes import FloatArray, IntArray
 from robosac.defenses.group_testing import sets
-from robosac.defenses.group_testing.model import CELLS
+from robosac.defenses.group_testing.model import CELLS, CLEAN
+from robosac.defenses.group_testing.sets import ATTACKS, BENIGN, PLAIN
 
-EXACT = 8
-"""Teammates up to which all sets are held together: 2 ** 8 of them for each kind of attack."""
-BLOCK = 6
+EXACT = 6
+"""Teammates up to which all states are held together: 3 ** 6 of them for each kind of attack."""
+BLOCK = 5
 """Most teammates of a block in larger teams."""
 BoolArray = np.ndarray[tuple[Any, ...], np.dtype[np.bool_]]
+VIEWS_CHANGE = 0.02
+"""Share of what is known of whose view is complementary that is forgotten from frame to frame."""
+_LEVELS = np.arange(sets.STATES)
+_GREATER = np.maximum.outer(_LEVELS, _LEVELS)
+_LIMITS = ((BENIGN, BENIGN), (BENIGN, ATTACKS), (ATTACKS, BENIGN), (PLAIN, PLAIN), (PLAIN, BENIGN), (BENIGN, PLAIN))
 _TINY = 1e-300
 
 
@@ -41,13 +47,14 @@ class Hazards:
 
 
 class Posterior:
-    """Probabilities over (set of attackers A, kind of attack k) and "nobody attacks".
+    """Probabilities over kinds of attack k, "nobody attacks" being k = 0, and states z of the teammates: plain,
+    complementary (benign, and it sees much of what the others do not) or attacking.
 
-    ``P(nobody) = q_0`` and ``P(A, k) = q_k * prod over blocks b of P_b(A within b | k)``. A team of up to `EXACT`
-    teammates is one block, and nothing is approximated. A larger team is cut into blocks of up to `BLOCK`: inside a
-    block all sets are held, between blocks (given the kind) independence is assumed, and after each piece of evidence
-    the exact posterior is projected onto that form by its marginals on blocks and kind (assumed-density filtering).
-    Which teammates share a block may change with what is in doubt; see `regroup`.
+    ``P(z, k) = q_k * prod over blocks b of P_b(z within b | k)``. A team of up to `EXACT` teammates is one block, and
+    nothing is approximated. A larger team is cut into blocks of up to `BLOCK`: inside a block all states are held,
+    between blocks (given the kind) independence is assumed, and after each piece of evidence the exact posterior is
+    projected onto that form by its marginals on blocks and kind (assumed-density filtering). Which teammates share a
+    block may change with what is in doubt; see `regroup`.
 
     Parameters
     ----------
@@ -65,9 +72,9 @@ class Posterior:
         self._attacker_prior = attacker_prior
         self._weights = np.array([1 - attack_prior, *[attack_prior / kinds] * kinds])
         self._blocks: list[list[str]] = []
-        self._tables: list[FloatArray] = []  # (K, 2 ** n) each
-        self._clean: list[FloatArray | None] = []
-        self._stale = True  # some of the clean tables are to be computed
+        self._tables: list[FloatArray] = []  # (1 + K, 3 ** n) each
+        self._below: list[FloatArray | None] = []
+        self._stale = True  # some of the tables below are to be computed
         self._marginals: FloatArray | None = None
         self._powers: FloatArray | None = None
 
@@ -77,11 +84,9 @@ class Posterior:
         posterior = cls(kinds, attack_prior, attacker_prior)
         count = 1 if len(team) <= EXACT else -(-len(team) // BLOCK)
         for part in np.array_split(np.arange(len(team)), count):
-            members = [team[i] for i in part]
-            posterior._blocks.append(members)
-            attacking = sets.bits(len(members)).sum(axis=0)
-            table = attacker_prior**attacking * (1 - attacker_prior) ** (len(members) - attacking)
-            posterior._tables.append(np.repeat(table[None], kinds, axis=0))
+            posterior._blocks.append([team[i] for i in part])
+            attacked = np.repeat(sets.prior(len(part), attacker_prior), kinds, axis=0)
+            posterior._tables.append(np.concatenate([sets.prior(len(part), 0.0), attacked]))
         posterior._settle()
         if team:
             posterior._weights = np.array([1 - attack_prior, *[attack_prior / kinds] * kinds])
@@ -110,7 +115,7 @@ class Posterior:
         """Probability (S,) of each member to attack."""
         if self._marginals is None:
             attacking = [
-                sets.bits(len(block)) @ (self._weights[1:] @ table)
+                sets.attacking(len(block)) @ (self._weights[1:] @ table[1:])
                 for block, table in zip(self._blocks, self._tables, strict=True)
             ]
             self._marginals = np.minimum(np.maximum(np.concatenate([*attacking, np.empty(0)]), 0.0), 1.0)
@@ -118,7 +123,8 @@ class Posterior:
 
     def clean_within(self, block: int) -> FloatArray:
         """Probability (2 ** n,) that nobody of each subset of a block attacks, by its mask there."""
-        clean: FloatArray = self._weights[0] + self._weights[1:] @ self._clean_tables()[block]
+        codes = sets.codes(len(self._blocks[block]))
+        clean: FloatArray = self._weights @ self._tables_below()[block][:, 2 * codes[-1] - codes]
         return clean
 
     def masks(self, subsets: BoolArray) -> IntArray:
@@ -142,37 +148,26 @@ class Posterior:
 
     def unattacked(self, masks: IntArray) -> FloatArray:
         """Probability (n,) that nobody of each subset attacks."""
-        chance: FloatArray = self._weights[0] + self._weights[1:] @ self.clean(masks)
+        chance: FloatArray = self._weights @ self._at_most(masks, np.zeros_like(masks), ((BENIGN, ATTACKS),))[:, 0]
         return chance
 
-    def clean(self, masks: IntArray) -> FloatArray:
-        """Probability (K, n) that nobody of each subset attacks, given the kind."""
-        touched = np.flatnonzero(masks.any(axis=1)).tolist()
-        if not touched:
-            return np.ones((self._kinds, masks.shape[1]))
-        clean = self._clean_tables()
-        product: FloatArray = clean[touched[0]].take(masks[touched[0]], axis=1)
-        for b in touched[1:]:
-            product *= clean[b].take(masks[b], axis=1)
-        return product
-
     def cells(self, a: IntArray, d: IntArray) -> FloatArray:
-        """Joint probabilities (n, 1 + 3 K) of what pairs of disjoint subsets hold, by rows of an `EvidenceModel`.
+        """Joint probabilities (n, CLEAN + 3 K) of what pairs of disjoint subsets hold, by rows of an `EvidenceModel`.
 
-        Column 0: no attacker in either; then for each kind: one in d only, in a only, in both.
+        Columns 0 to 3: no attacker in either; nobody complementary, somebody in d, in a, in both. Then for each kind:
+        attackers in d only, in a only, in both.
         """
-        in_a, in_d = self.clean(a), self.clean(d)
-        return self.joint(in_a, in_d, self.clean(a | d) if d.any() else in_a)
-
-    def joint(self, in_a: FloatArray, in_d: FloatArray, in_both: FloatArray) -> FloatArray:
-        """The same, from the probabilities (K, n) that nobody of ``a``, of ``d`` and of both attacks (see `clean`)."""
-        q = self._weights[1:, None]
-        joint = np.empty((in_both.shape[1], 1 + CELLS * self._kinds))
-        joint[:, 0] = self._weights[0] + (q * in_both).sum(axis=0)
-        attacked = (in_a - in_both, in_d - in_both, 1 - in_a - in_d + in_both)
-        for cell, chance in enumerate(attacked):
-            joint[:, 1 + cell :: CELLS] = (chance * q).T
-        return np.maximum(joint, 0.0)
+        q = self._weights
+        below = self._at_most(a, d, _LIMITS)
+        both, in_a, in_d = below[:, 0], below[:, 1], below[:, 2]
+        benign, neither, only_d, only_a = np.tensordot(q, below[:, (0, 3, 4, 5)], 1)
+        only_d, only_a = only_d - neither, only_a - neither
+        cells = np.empty((a.shape[1], CLEAN + CELLS * self._kinds))
+        cells[:, 0], cells[:, 1], cells[:, 2] = neither, only_d, only_a
+        cells[:, 3] = benign - neither - only_d - only_a
+        for cell, chance in enumerate((in_a - both, in_d - both, 1 - in_a - in_d + both)):
+            cells[:, CLEAN + cell :: CELLS] = (chance[1:] * q[1:, None]).T
+        return np.maximum(cells, 0.0)
 
     def update(self, a: BoolArray, d: BoolArray, log_likelihood: FloatArray) -> None:
         """Learn the outcome of a test of disjoint subsets ``a`` and ``d``.
@@ -181,55 +176,67 @@ class Posterior:
         ----------
         a, d : (S,) bool ndarray
             In the order of `members`.
-        log_likelihood : (1 + 3 K,) ndarray
+        log_likelihood : (CLEAN + 3 K,) ndarray
             Of the outcome, by columns of `cells`.
         """
         likelihood = np.exp(log_likelihood - log_likelihood.max())
-        by_kind = likelihood[1:].reshape(self._kinds, CELLS)
-        nothing, d_only, a_only, in_both = likelihood[0], by_kind[:, 0], by_kind[:, 1], by_kind[:, 2]
+        by_kind = likelihood[CLEAN:].reshape(self._kinds, CELLS)
+        by_level = np.empty((1 + self._kinds, sets.STATES, sets.STATES))  # the greatest states in a and in d
+        by_level[:, :2, :2] = likelihood[:CLEAN].reshape(2, 2)
+        by_level[0, 2], by_level[0, :, 2] = 0.0, 0.0
+        by_level[1:, :2, 2], by_level[1:, 2, :2], by_level[1:, 2, 2] = by_kind[:, :1], by_kind[:, 1:2], by_kind[:, 2]
         of_a, of_d = self.masks(np.stack([a, d])).T.tolist()
         touched = [b for b, (x, y) in enumerate(zip(of_a, of_d, strict=True)) if x | y]
-        clean = self._clean_tables()
-        a_else = sets.products_but([clean[b][:, of_a[b]] for b in touched])
-        d_else = sets.products_but([clean[b][:, of_d[b]] for b in touched])
-        both_else = sets.products_but([clean[b][:, of_a[b] | of_d[b]] for b in touched])
-        neither = nothing * both_else + d_only * (a_else - both_else) + a_only * (d_else - both_else)
-        neither = neither + in_both * (1 - a_else - d_else + both_else)
-        expected = np.empty((len(touched), self._kinds, 4))  # by whether a and d hold attackers of the block
-        expected[..., sets.NEITHER] = neither
-        expected[..., sets.IN_A] = a_only * d_else + in_both * (1 - d_else)
-        expected[..., sets.IN_D] = d_only * a_else + in_both * (1 - a_else)
-        expected[..., sets.IN_BOTH] = in_both
-        evidence = np.ones(self._kinds)
+        if len(touched) > 1:
+            expected = self._expected(by_level, [(b, of_a[b], of_d[b]) for b in touched])
+        else:
+            expected = by_level.reshape(1, 1 + self._kinds, -1)
+        evidence = np.ones(1 + self._kinds)
         tables = list(self._tables)
-        for b, by_state in zip(touched, expected, strict=True):
-            where = sets.touching(len(self._blocks[b]), of_a[b], of_d[b])
-            updated = tables[b] * by_state.take(where, axis=1)
+        for b, likely in zip(touched, expected, strict=True):
+            where = sets.levels(len(self._blocks[b]), of_a[b], of_d[b])
+            updated = tables[b] * likely.take(where, axis=1)
             evidence = updated.sum(axis=1)
             tables[b] = updated / np.maximum(evidence, _TINY)[:, None]
-        weights = self._weights * np.concatenate([[nothing], evidence])
-        self._replace(weights, tables)
+        self._replace(self._weights * evidence, tables)
+
+    def _expected(self, by_level: FloatArray, touched: Sequence[tuple[int, int, int]]) -> FloatArray:
+        """For each touched block (number, mask of a, mask of d), the likelihood (1 + K, 9) by the levels in it alone,
+        expected over what the other blocks hold.
+        """
+        below = self._tables_below()
+        each = np.empty((len(touched), *by_level.shape))
+        for known, (b, a, d) in zip(each, touched, strict=True):
+            codes = sets.codes(len(self._blocks[b]))
+            limits = 2 * codes[-1] - (2 - _LEVELS[:, None]) * codes[a] - (2 - _LEVELS) * codes[d]
+            below[b].take(limits, axis=1, out=known)
+        chance = sets.products_but(each)
+        chance[..., 1:, :] -= chance[..., :-1, :].copy()
+        chance[..., 1:] -= chance[..., :-1].copy()
+        greater = by_level[:, _GREATER[:, None, :, None], _GREATER[None, :, None, :]]
+        expected: FloatArray = np.einsum("kopxy,tkxy->tkop", greater, chance)
+        return expected.reshape(len(touched), len(by_level), -1)
 
     def step(self, hazards: Hazards) -> None:
         """Go to the next frame: teammates are hijacked or recover, and the kind of attack may change."""
         h, r = hazards.hijack, hazards.recovery
         kernel = sets.transition(h, r)
         team = len(self.members)
-        sizes = {len(block) for block in self._blocks}
-        after = list(self._tables)
-        for size in sizes:  # blocks of one size at once
+        after, awakened = list(self._tables), list(self._tables)
+        for size in {len(block) for block in self._blocks}:  # blocks of one size at once
             alike = [b for b, block in enumerate(self._blocks) if len(block) == size]
-            moved = sets.through(np.concatenate([after[b] for b in alike]), kernel)
-            for b, table in zip(alike, np.split(moved, len(alike)), strict=True):
-                after[b] = table
-        awakened = {n: sets.awakened(n, team, h, r, self._attacker_prior) for n in sizes}
-        self._mix(after, [awakened[len(block)] for block in self._blocks])
-        attacked = self._weights[1:]
+            attacked = sets.through(np.concatenate([self._tables[b][1:] for b in alike]), kernel)
+            benign = sets.awakened(np.stack([self._tables[b][0] for b in alike]), team, h, self._attacker_prior)
+            for i, (b, table) in enumerate(zip(alike, np.split(attacked, len(alike)), strict=True)):
+                after[b], awakened[b] = table, benign[i : i + 1]
+        self._mix(after, awakened)
         change = hazards.change if self._kinds > 1 else 0.0
+        attacked = self._weights[1:]
         tables = []
         for table in self._tables:
-            flow = (1 - change) * attacked[:, None] * table + change * (attacked @ table)[None] / self._kinds
-            tables.append(flow / np.maximum(flow.sum(axis=1), _TINY)[:, None])
+            flow = (1 - change) * attacked[:, None] * table[1:] + change * (attacked @ table[1:])[None] / self._kinds
+            flow = np.concatenate([table[:1], flow / np.maximum(flow.sum(axis=1), _TINY)[:, None]])
+            tables.append((1 - VIEWS_CHANGE) * flow + VIEWS_CHANGE * sets.forgotten_views(flow))
         kinds = (1 - change) * attacked + change * attacked.mean()
         self._replace(np.concatenate([self._weights[:1], kinds]), tables)
 
@@ -245,26 +252,22 @@ class Posterior:
         among_attackers = self._attacker_prior if suspicion is None else suspicion
         alone = self._attack_prior * self._attacker_prior if suspicion is None else suspicion
         if not self._blocks:
-            self._blocks, self._tables = [[]], [np.ones((self._kinds, 1))]
+            self._blocks, self._tables = [[]], [np.ones((1 + self._kinds, 1))]
         size = len(self.members) + 1
         limit = EXACT if size <= EXACT else BLOCK
         self._cut(limit)
         smallest = min(range(len(self._blocks)), key=lambda b: len(self._blocks[b]))
         if len(self._blocks[smallest]) >= limit:
             self._blocks.append([])
-            self._tables.append(np.ones((self._kinds, 1)))
+            self._tables.append(np.ones((1 + self._kinds, 1)))
             smallest = len(self._blocks) - 1
-        table = self._tables[smallest]
-        after = list(self._tables)
-        after[smallest] = np.concatenate([table * (1 - among_attackers), table * among_attackers], axis=1)
+        benign = [table[:1] for table in self._tables]
+        benign[smallest] = sets.joint(benign[smallest], sets.prior(1, 0.0))
+        awakened, after = list(benign), [table[1:] for table in self._tables]
+        after[smallest] = sets.joint(after[smallest], np.repeat(sets.prior(1, among_attackers), self._kinds, axis=0))
+        awakened[smallest] = sets.joint(self._tables[smallest][:1], sets.prior(1, alone))
+        self._tables = [np.concatenate(parts) for parts in zip(benign, after, strict=True)]
         self._blocks[smallest] = [*self._blocks[smallest], name]
-        awakened: list[FloatArray] = []
-        for b, block in enumerate(self._blocks):
-            start = np.zeros((1, 1 << len(block)))
-            start[0, 0] = 1 - alone if b == smallest else 1.0
-            if b == smallest:
-                start[0, 1 << (len(block) - 1)] = alone
-            awakened.append(start)
         self._mix(after, awakened)
 
     def remove(self, name: str) -> None:
@@ -272,8 +275,7 @@ class Posterior:
         block, bit = next((b, m.index(name)) for b, m in enumerate(self._blocks) if name in m)
         table = self._tables[block]
         n = len(self._blocks[block])
-        split = table.reshape(self._kinds, 1 << (n - 1 - bit), 2, 1 << bit)
-        self._tables[block] = split.sum(axis=2).reshape(self._kinds, -1)
+        self._tables[block] = sets.marginal(table, [i for i in range(n) if i != bit])
         self._blocks[block] = [other for other in self._blocks[block] if other != name]
         if not self._blocks[block] and len(self._blocks) > 1:
             del self._blocks[block], self._tables[block]
@@ -307,9 +309,9 @@ class Posterior:
     def to_state(self) -> dict[str, Any]:
         """JSON values that `from_state` reads."""
         return {
-            "weights": sets.short(self._weights),
+            "weights": self._weights.round(7).tolist(),
             "blocks": [
-                {"members": list(block), "tables": [sets.short(row) for row in table]}
+                {"members": list(block), "table": sets.short(table.ravel())}
                 for block, table in zip(self._blocks, self._tables, strict=True)
             ],
         }
@@ -320,51 +322,72 @@ class Posterior:
         weights = np.array(state["weights"], dtype=np.float64)
         posterior = cls(len(weights) - 1, attack_prior, attacker_prior)
         posterior._blocks = [list(block["members"]) for block in state["blocks"]]
-        tables = [np.array(block["tables"], dtype=np.float64) for block in state["blocks"]]
+        tables = [
+            sets.long(block["table"], len(weights) * sets.STATES ** len(block["members"])).reshape(len(weights), -1)
+            for block in state["blocks"]
+        ]
         posterior._replace(weights, [t / np.maximum(t.sum(axis=1, keepdims=True), _TINY) for t in tables])
         return posterior
 
-    def _clean_tables(self) -> list[FloatArray]:
-        """For each block and kind, the probability of no attacker within each of its subsets: sums over all sets of
-        attackers outside the subset, by the zeta transform.
+    def _at_most(self, a: IntArray, d: IntArray, limits: Sequence[tuple[int, int]]) -> FloatArray:
+        """Probability (1 + K, L, n), given the kind, that no state in subsets ``a`` is above the first of each pair of
+        limits (L,), and none in ``d`` above the second.
         """
-        for index, known in enumerate(self._clean) if self._stale else ():
-            if known is None:
-                sums = self._tables[index].copy()
-                for bit in range(len(self._blocks[index])):
-                    view = sums.reshape(self._kinds, -1, 2, 1 << bit)
-                    view[:, :, 1] += view[:, :, 0]
-                self._clean[index] = sums[:, ::-1]
+        of_a, of_d = 2 - np.array(limits).T[:, :, None]
+        product = np.ones((1 + self._kinds, len(limits), a.shape[1]))
+        below = self._tables_below()
+        for b in np.flatnonzero((a | d).any(axis=1)).tolist():
+            codes = sets.codes(len(self._blocks[b]))
+            product *= below[b].take(2 * codes[-1] - of_a * codes[a[b]] - of_d * codes[d[b]], axis=1)
+        return product
+
+    def _tables_below(self) -> list[FloatArray]:
+        """For each block and kind, the probability that no state is above given ones."""
+        stale = [b for b, known in enumerate(self._below) if known is None] if self._stale else []
+        for size in {len(self._blocks[b]) for b in stale}:  # blocks of one size at once
+            alike = [b for b in stale if len(self._blocks[b]) == size]
+            below = sets.at_most(np.concatenate([self._tables[b] for b in alike]))
+            for b, table in zip(alike, np.split(below, len(alike)), strict=True):
+                self._below[b] = table
         self._stale = False
-        return self._clean  # type: ignore[return-value]
+        return self._below  # type: ignore[return-value]
 
     def _mix(self, after: list[FloatArray], awakened: list[FloatArray]) -> None:
-        """Add to each kind the share of "nobody" that turns into attackers as in ``awakened``."""
+        """Attacked teams go on as in ``after`` (K, 3 ** n), and "nobody attacks" turns into what is in ``awakened``
+        (1, 3 ** n), some of which is still nobody.
+        """
         new = self._weights[0] / self._kinds
         old = self._weights[1:]
         total = np.maximum(old + new, _TINY)[:, None]
-        tables = [(old[:, None] * t + new * w) / total for t, w in zip(after, awakened, strict=True)]
+        tables = [
+            np.concatenate([table[:1], (old[:, None] * t + new * w) / total])
+            for table, t, w in zip(self._tables, after, awakened, strict=True)
+        ]
         self._replace(np.concatenate([[0.0], old + new]), tables)
         self._settle()
 
     def _settle(self) -> None:
         """An attack without attackers is none: move that probability to "nobody". To be called once blocks changed."""
         self._powers = None
-        none = np.prod([table[:, 0] for table in self._tables], axis=0) if self._tables else np.ones(self._kinds)
-        rest = np.maximum(1 - none, _TINY)
-        tables = []
-        for table in self._tables:
-            kept = table.copy()
-            kept[:, 0] = np.maximum(table[:, 0] - none, 0.0)
-            tables.append(kept / rest[:, None])
+        without = [sets.unattacked(len(block)) for block in self._blocks]
+        quiet = [table[1:] @ still for table, still in zip(self._tables, without, strict=True)]
+        none = np.prod(quiet, axis=0) if quiet else np.ones(self._kinds)
         moved = self._weights[1:] * none
-        weights = np.concatenate([[self._weights[0] + moved.sum()], self._weights[1:] - moved])
-        self._replace(weights, [t / np.maximum(t.sum(axis=1, keepdims=True), _TINY) for t in tables])
+        nobody = self._weights[0] + moved.sum()
+        tables = []
+        for table, still, chance in zip(self._tables, without, quiet, strict=True):
+            share = 1.0 / np.maximum(chance, _TINY)
+            lost = 1.0 - np.maximum(chance - none, 0.0) * share
+            kept = np.empty_like(table)
+            kept[0] = self._weights[0] * table[0] + ((moved * share) @ table[1:]) * still
+            kept[1:] = table[1:] * (1.0 - lost[:, None] * still)
+            tables.append(kept / np.maximum(kept.sum(axis=1, keepdims=True), _TINY))
+        self._replace(np.concatenate([[nobody], self._weights[1:] - moved]), tables)
 
     def _replace(self, weights: FloatArray, tables: list[FloatArray]) -> None:
         self._weights = weights / weights.sum()
-        same = len(tables) == len(self._clean) == len(self._tables)
-        self._clean = [self._clean[b] if same and table is self._tables[b] else None for b, table in enumerate(tables)]
+        same = len(tables) == len(self._below) == len(self._tables)
+        self._below = [self._below[b] if same and table is self._tables[b] else None for b, table in enumerate(tables)]
         self._tables = tables
         self._stale, self._marginals = True, None
 
@@ -373,7 +396,7 @@ class Posterior:
         while any(len(block) > limit for block in self._blocks):
             b = next(i for i, block in enumerate(self._blocks) if len(block) > limit)
             half = len(self._blocks[b]) // 2
-            table = self._tables[b].reshape(self._kinds, -1, 1 << half)
+            table = self._tables[b].reshape(1 + self._kinds, -1, sets.STATES**half)
             self._tables[b : b + 1] = [table.sum(axis=1), table.sum(axis=2)]
             self._blocks[b : b + 1] = [self._blocks[b][:half], self._blocks[b][half:]]
 

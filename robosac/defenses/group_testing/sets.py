@@ -1,4 +1,4 @@
-"""Tables over all subsets of up to a handful of teammates: entry i is the subset of the bits set in i."""
+"""Tables over the states of up to a handful of teammates: digit i, in base 3, of an entry's number is member i's."""
 
 from __future__ import annotations
 
@@ -9,37 +9,158 @@ import numpy as np
 
 from robosac.boxes import FloatArray, IntArray
 
-NEITHER, IN_A, IN_D, IN_BOTH = range(4)
-"""Which of two subsets ``a`` and ``d`` a third one touches."""
+PLAIN, COMPLEMENTARY, ATTACKS = range(3)
+"""States of a teammate: benign; benign, and it sees much of what the others do not; attacker."""
+BENIGN = COMPLEMENTARY
+"""No state of a benign teammate is above."""
+STATES = 3
+COMPLEMENTARY_TEAMS = 0.4
+COMPLEMENTARY_MEMBERS = 0.3
+"""Share of teams some of whose views complement the others', and of such members among the benign of those teams."""
 
 
 @lru_cache(maxsize=16)
-def bits(n: int) -> IntArray:
-    """Which of n members are in each of the 2 ** n subsets, (n, 2 ** n)."""
-    bits: IntArray = (np.arange(1 << n)[None] >> np.arange(n)[:, None]) & 1
+def states(n: int) -> IntArray:
+    """State of each of n members in each of the 3 ** n entries, (n, 3 ** n)."""
+    states: IntArray = np.arange(STATES**n)[None] // STATES ** np.arange(n)[:, None] % STATES
+    return states
+
+
+@lru_cache(maxsize=16)
+def attacking(n: int) -> FloatArray:
+    """1 where a member attacks (n, 3 ** n), 0 elsewhere."""
+    mask: FloatArray = (states(n) == ATTACKS).astype(np.float64)
+    return mask
+
+
+@lru_cache(maxsize=16)
+def unattacked(n: int) -> FloatArray:
+    """1 for entries (3 ** n,) in which nobody attacks, 0 for the others."""
+    mask: FloatArray = (states(n) != ATTACKS).all(axis=0).astype(np.float64)
+    return mask
+
+
+@lru_cache(maxsize=16)
+def codes(n: int) -> IntArray:
+    """Of each subset of n members (2 ** n,), by its bits, the sum of ``3 ** i`` over its members."""
+    members = np.arange(1 << n)[:, None] >> np.arange(n) & 1
+    total: IntArray = members @ STATES ** np.arange(n)
+    return total
+
+
+@lru_cache(maxsize=16)
+def _attackers(n: int) -> IntArray:
+    """Of each entry (3 ** n,) the bits of those that attack."""
+    bits: IntArray = (1 << np.arange(n)) @ (states(n) == ATTACKS)
     return bits
 
 
+@lru_cache(maxsize=16)
+def _by_attackers(n: int) -> FloatArray:
+    """Matrix (3 ** n, 2 ** n) that sums entries by who attacks."""
+    return np.eye(1 << n)[_attackers(n)]
+
+
+@lru_cache(maxsize=16)
+def views(n: int) -> FloatArray:
+    """Prior probability (3 ** n,) of who is complementary, given who attacks: in most teams nobody, in the others each
+    benign member independently.
+    """
+    complementary, benign = (states(n) == COMPLEMENTARY).sum(axis=0), (states(n) != ATTACKS).sum(axis=0)
+    drawn = COMPLEMENTARY_MEMBERS**complementary * (1 - COMPLEMENTARY_MEMBERS) ** (benign - complementary)
+    prior: FloatArray = (1 - COMPLEMENTARY_TEAMS) * (complementary == 0) + COMPLEMENTARY_TEAMS * drawn
+    return prior
+
+
+def forgotten_views(table: FloatArray) -> FloatArray:
+    """Tables (K, 3 ** n) after what was known of who is complementary is forgotten."""
+    n = members(table)
+    known: FloatArray = (table @ _by_attackers(n))[:, _attackers(n)] * views(n)
+    return known
+
+
+@lru_cache(maxsize=16)
+def prior(n: int, attacker_prior: float) -> FloatArray:
+    """Table (1, 3 ** n) of members each of whom attacks with the same probability."""
+    attacking = (states(n) == ATTACKS).sum(axis=0)
+    table: FloatArray = attacker_prior**attacking * (1 - attacker_prior) ** (n - attacking) * views(n)
+    return table[None]
+
+
+def members(table: FloatArray) -> int:
+    """n of a table (K, 3 ** n)."""
+    return round(float(np.log(table.shape[1]) / np.log(STATES)))
+
+
 def through(table: FloatArray, kernel: FloatArray) -> FloatArray:
-    """Tables (K, 2 ** n) after each member went through a transition kernel (2, 2)."""
-    for bit in range(table.shape[1].bit_length() - 1):
-        view = table.reshape(len(table), -1, 2, 1 << bit)
-        table = np.einsum("kjsi,st->kjti", view, kernel).reshape(len(table), -1)
+    """Tables (K, 3 ** n) after each member went through a transition kernel (3, 3)."""
+    for member in range(members(table)):
+        view = table.reshape(len(table), -1, STATES, STATES**member)
+        table = (kernel.T @ view).reshape(len(table), -1)
     return table
 
 
+def at_most(table: FloatArray) -> FloatArray:
+    """Tables (K, 3 ** n) of the probability that no member's state is above its state in the entry."""
+    total = table.copy()
+    for member in range(members(table)):
+        view = total.reshape(len(table), -1, STATES, STATES**member)
+        view[:, :, 1] += view[:, :, 0]
+        view[:, :, 2] += view[:, :, 1]
+    return total
+
+
 def joint(low: FloatArray, high: FloatArray) -> FloatArray:
-    """Tables (K, 2 ** (n + m)) of two groups that are independent given the kind, from (K, 2 ** n) and (K, 2 ** m)."""
+    """Tables (K, 3 ** (n + m)) of two groups that are independent given the kind, from (K, 3 ** n) and (K, 3 ** m)."""
     table: FloatArray = (high[:, :, None] * low[:, None, :]).reshape(len(low), -1)
     return table
 
 
 def marginal(table: FloatArray, kept: Sequence[int]) -> FloatArray:
-    """Tables (K, 2 ** m) of some of the members (ascending), summed over what the others of (K, 2 ** n) may be."""
-    n = table.shape[1].bit_length() - 1
+    """Tables (K, 3 ** m) of some of the members (ascending), summed over what the others of (K, 3 ** n) may be."""
+    n = members(table)
     others = tuple(n - i for i in range(n) if i not in kept)  # axis 0 is the kind, axis 1 the last member
-    part: FloatArray = table.reshape(len(table), *[2] * n).sum(axis=others).reshape(len(table), -1)
+    part: FloatArray = table.reshape(len(table), *[STATES] * n).sum(axis=others).reshape(len(table), -1)
     return part
+
+
+@lru_cache(maxsize=1024)
+def levels(n: int, a: int, d: int) -> IntArray:
+    """Of each entry (3 ** n,), the greatest states in subsets ``a`` and ``d`` (their bits): ``3 * in_a + in_d``."""
+    bits = 1 << np.arange(n)[:, None]
+    in_a, in_d = ((states(n) * (bits & subset != 0)).max(axis=0, initial=0) for subset in (a, d))
+    where: IntArray = STATES * in_a + in_d
+    return where
+
+
+def transition(hijack: float, recovery: float) -> FloatArray:
+    """Kernel (3, 3) from state (rows) to state."""
+    return np.array([[1 - hijack, 0, hijack], [0, 1 - hijack, hijack], [recovery, 0, 1 - recovery]])
+
+
+def awakened(table: FloatArray, team: int, hijack: float, attacker_prior: float) -> FloatArray:
+    """Tables (B, 3 ** n) of members of a team that was benign, after attackers may have awoken.
+
+    Each teammate is hijacked by itself; or, at the same chance that anybody is, all that attack awake together, as they
+    would have been drawn beforehand. Either story has half the probability.
+
+    Parameters
+    ----------
+    table : (B, 3 ** n) ndarray
+        Of the benign team.
+    team : int
+        Members of the whole team.
+    hijack : float
+        Probability that a benign member turns into an attacker.
+    attacker_prior : float
+        Probability of each teammate to attack if anybody does.
+    """
+    benign, nobody = (1 - hijack) ** team, (1 - attacker_prior) ** team
+    alone = through(table, transition(hijack, 0.0))
+    drawn = through(table, transition(attacker_prior, 0.0))
+    together = (1 - benign) * (drawn - nobody * table) / (1 - nobody) + benign * table
+    after: FloatArray = (alone + together) / 2
+    return after
 
 
 def packed(sizes: Sequence[int], room: int) -> list[list[int]]:
@@ -54,60 +175,26 @@ def packed(sizes: Sequence[int], room: int) -> list[list[int]]:
     return bins
 
 
-@lru_cache(maxsize=1024)
-def touching(n: int, a: int, d: int) -> IntArray:
-    """Of each of the subsets of n members (2 ** n,), whether it touches the subsets ``a`` and ``d``: `NEITHER`, `IN_A`,
-    `IN_D` or `IN_BOTH`.
-    """
-    subsets = np.arange(1 << n)
-    where: IntArray = IN_A * (subsets & a != 0) + IN_D * (subsets & d != 0)
-    return where
-
-
-def products_but(each: Sequence[FloatArray]) -> FloatArray:
+def products_but(each: FloatArray) -> FloatArray:
     """For each factor (n, ...), the product of all others."""
-    before, after = np.ones((2, len(each), *each[0].shape))
+    before, after = np.ones((2, *each.shape))
     np.cumprod(each[:-1], axis=0, out=before[1:])
     np.cumprod(each[:0:-1], axis=0, out=after[-2::-1])
     product: FloatArray = before * after
     return product
 
 
-def short(values: FloatArray) -> list[float]:
-    """Seven decimals: what is less likely is as likely as what the next frame's hazards let happen."""
-    digits: list[float] = values.round(7).tolist()
-    return digits
-
-
-def transition(hijack: float, recovery: float) -> FloatArray:
-    """Kernel (2, 2) from benign or attacker (rows) to benign or attacker."""
-    return np.array([[1 - hijack, hijack], [recovery, 1 - recovery]])
-
-
-@lru_cache(maxsize=64)
-def awakened(n: int, team: int, hijack: float, recovery: float, attacker_prior: float) -> FloatArray:
-    """Table (1, 2 ** n) of n members of a team that was benign, after attackers may have awoken.
-
-    Each teammate is hijacked by itself; or, at the same chance that anybody is, all that attack awake together, as they
-    would have been drawn beforehand. Either story has half the probability.
-
-    Parameters
-    ----------
-    n, team : int
-        Members of the table, and of the whole team.
-    hijack, recovery : float
-        Probability that a benign member turns into an attacker, and the other way round.
-    attacker_prior : float
-        Probability of each teammate to attack if anybody does.
+def short(values: FloatArray) -> list[list[float]]:
+    """Where it is not 0, and how much: seven decimals. What is less likely is as likely as what the next frame's
+    hazards let happen.
     """
-    kernel = transition(hijack, recovery)
-    benign, honest = kernel[0, 0] ** team, 1 - attacker_prior
-    nobody = honest**team
-    start = np.zeros((1, 1 << n))
-    start[0, 0] = 1.0
-    alone = through(start, kernel)
-    attacking = bits(n).sum(axis=0)[None]
-    drawn = attacker_prior**attacking * honest ** (n - attacking)
-    together = (1 - benign) * (drawn - nobody * start) / (1 - nobody) + benign * start
-    table: FloatArray = (alone + together) / 2
-    return table
+    rounded = values.round(7)
+    where = np.flatnonzero(rounded)
+    return [where.tolist(), rounded[where].tolist()]
+
+
+def long(kept: Sequence[Sequence[float]], size: int) -> FloatArray:
+    """What `short` made of an array of this size."""
+    values = np.zeros(size)
+    values[np.asarray(kept[0], dtype=np.int64)] = kept[1]
+    return values

@@ -8,7 +8,7 @@ from typer.testing import CliRunner
 from robosac.boxes import pose_matrix
 from robosac.calibration import Recipe, calibration_of
 from robosac.calibration.making import check
-from robosac.calibration.verdicts import Verdicts
+from robosac.calibration.verdicts import Verdicts, complementary
 from robosac.cli import app
 from robosac.defenses import GroupTesting
 from robosac.defenses.group_testing import Calibration, CalibrationError
@@ -33,17 +33,15 @@ def recorded(attackers=()):
 def test_verdicts_of_an_honest_frame_are_all_counted():
     verdicts = Verdicts()
     verdicts.add(recorded(), None)
-    assert sum(verdicts.jaccard.values()) == 7
-    assert sum(verdicts.pairs.values()) == 12
+    assert sum(verdicts.pairs.values()) == 7 + 12
     assert {cell for _, cell, *_ in verdicts.pairs} == {0}
 
 
 def test_of_an_attacked_frame_what_the_attacker_is_part_of():
     verdicts = Verdicts()
     verdicts.add(recorded(["a"]), "pgd")
-    assert sum(verdicts.jaccard.values()) == 4
     cells = {cell: sum(n for (_, c, *_), n in verdicts.pairs.items() if c == cell) for cell in (0, 1, 2, 3)}
-    assert cells == {0: 0, 1: 5, 2: 5, 3: 0}
+    assert cells == {0: 0, 1: 5 + 4, 2: 5, 3: 0}
     assert {kind for kind, *_ in verdicts.pairs} == {"pgd"}
 
 
@@ -56,14 +54,13 @@ def test_a_calibration_survives_a_file(tmp_path):
     for before, after in zip(calibration.levels, again.levels, strict=True):
         assert after.kinds == before.kinds
         np.testing.assert_allclose(after.pairs, before.pairs, atol=1e-5)
-        np.testing.assert_allclose(after.jaccard, before.jaccard, atol=1e-5)
     assert again.at(0.0).pose_error_m == 0.0
     assert again.at(0.1).pose_error_m == 0.2
     with pytest.raises(CalibrationError, match=r"up to a pose error of 0\.2 m, 0\.3 m is asked for"):
         again.at(0.3)
 
 
-@pytest.mark.parametrize("damage", ["not json", "{}", '{"format": 2}', "[1]", "wrong shape", "negative"])
+@pytest.mark.parametrize("damage", ["not json", "{}", '{"format": 1}', "[1]", "wrong shape", "negative"])
 def test_a_damaged_calibration_is_refused(tmp_path, damage):
     path = tmp_path / "x.json"
     Calibration("x", "0", {}, (make_model(),)).write(path)
@@ -72,7 +69,7 @@ def test_a_damaged_calibration_is_refused(tmp_path, damage):
         content["levels"][0]["kinds"].append("more")
         damage = json.dumps(content)
     elif damage == "negative":
-        content["levels"][0]["jaccard"][0][0][0] = -1.0
+        content["levels"][0]["pairs"][0][0][0] = -1.0
         damage = json.dumps(content)
     path.write_text(damage)
     with pytest.raises(CalibrationError, match="is no calibration"):
@@ -151,3 +148,16 @@ def test_the_command_names_an_unknown_attack(tmp_path):
     result = CliRunner().invoke(app, ["calibrate", "--out", str(tmp_path / "x.json"), "--attack", "nonesuch"])
     assert result.exit_code == 1
     assert "unknown attack 'nonesuch'" in " ".join(result.output.split())
+
+
+def test_a_teammate_that_adds_boxes_to_every_fusion_is_complementary():
+    frame = recorded()
+    boxes = {s: np.vstack([b, b + [0, 40, 0, 0, 0, 0]]) if "c" in s else b for s, b in frame.boxes.items()}
+    seen = replace(frame, boxes=boxes)
+    assert complementary(frame) == frozenset()
+    assert complementary(seen) == {"c"}
+    verdicts = Verdicts()
+    verdicts.add(seen, None)
+    cells = {cell: sum(n for (_, c, *_), n in verdicts.pairs.items() if c == cell) for cell in (0, 1, 2, 3)}
+    assert cells == {0: 19, 1: 5 + 4, 2: 5, 3: 0}
+    assert complementary(replace(seen, boxes={s: b if s else b[:0] for s, b in boxes.items()})) == {"c"}

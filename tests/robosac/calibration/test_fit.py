@@ -4,64 +4,84 @@ import pytest
 from robosac.calibration import TooFewVerdicts, Verdicts, fit
 from robosac.calibration.fit import LARGEST_RATIO
 from robosac.defenses.group_testing import OPEN
-from robosac.defenses.group_testing.model import (
-    CELLS,
-    JACCARD_BINS,
-    JOINING_SIZES,
-    LOSS_BINS,
-    NOVELTY_BINS,
-    SIZES,
-    WITNESS_SIZES,
-)
+from robosac.defenses.group_testing.model import BINS, CELLS, CLEAN, LOSS_BINS, NOVELTY_BINS, SIZES
 
-BINS = LOSS_BINS * NOVELTY_BINS
+ALONE = [size for size, (a, _) in enumerate(SIZES) if a == 0]
 
 
-def make_verdicts(honest_index=7, pgd_index=1, erase_index=9):
+def make_verdicts(honest=2 * NOVELTY_BINS + 2, complementary=3 * NOVELTY_BINS + 5, erase=2 * NOVELTY_BINS):
+    """Honest pairs lose little and bring a few boxes, PGD destroys, an eraser brings nothing."""
     verdicts = Verdicts()
-    for size in range(1, SIZES + 1):
-        for kind, index in ((None, honest_index), ("pgd", pgd_index), ("erase", erase_index)):
-            verdicts.jaccard[kind, size, index] += 500
-    for a in range(1, WITNESS_SIZES + 1):
-        for d in range(1, JOINING_SIZES + 1):
-            verdicts.pairs[None, 0, a, d, 2 * NOVELTY_BINS] += 500
-            for cell in range(1, CELLS + 1):
-                verdicts.pairs["pgd", cell, a, d, 10 * NOVELTY_BINS] += 500
-                verdicts.pairs["erase", cell, a, d, 5 * NOVELTY_BINS] += 500
+    for size in range(len(SIZES)):
+        verdicts.pairs[None, 0, size, honest] += 500
+        for cell in range(1, 1 + CELLS):
+            verdicts.pairs[None, cell, size, complementary] += 500
+            verdicts.pairs["pgd", cell, size, 10 * NOVELTY_BINS + 8] += 500
+            verdicts.pairs["erase", cell, size, erase] += 500
     return verdicts
+
+
+def log_ratio(model):
+    return np.log(model.pairs[CLEAN:] / model.pairs[:1])
 
 
 def test_tables_show_what_was_observed():
     model = fit(make_verdicts(), ["pgd", "erase"], 0.2)
     assert model.kinds == ("pgd", "erase", OPEN)
     assert model.pose_error_m == 0.2
-    assert (model.jaccard[0].argmax(axis=-1) == 7).all()
-    assert (model.jaccard[1, :, :3].sum(axis=-1) > 0.8).all()
-    assert (model.pairs[0].argmax(axis=-1) == 2 * NOVELTY_BINS).all()
-    loss = model.pairs.reshape(-1, WITNESS_SIZES, JOINING_SIZES, LOSS_BINS, NOVELTY_BINS).sum(axis=-1)
-    assert (loss[1 : 1 + CELLS].argmax(axis=-1) == 9).all()
-    for table in (model.jaccard, model.pairs):
-        np.testing.assert_allclose(table.sum(axis=-1), 1.0)
+    assert (model.pairs[0].argmax(axis=-1) == 2 * NOVELTY_BINS + 2).all()
+    assert (model.pairs[1:CLEAN].argmax(axis=-1) == 3 * NOVELTY_BINS + 5).all()
+    grid = model.pairs.reshape(-1, len(SIZES), LOSS_BINS, NOVELTY_BINS)
+    attacked = slice(CLEAN, CLEAN + CELLS)
+    assert (grid.sum(axis=-1)[attacked].argmax(axis=-1) >= 9).all()
+    assert (grid.sum(axis=-2)[attacked].argmax(axis=-1) >= 7).all()
+    beside = [size for size in range(len(SIZES)) if size not in ALONE]
+    assert (model.pairs[-CELLS:, beside, 5 * NOVELTY_BINS :] > 0.5 / BINS).all()
+    np.testing.assert_allclose(model.pairs.sum(axis=-1), 1.0)
 
 
 def test_agreeing_with_the_ego_never_incriminates():
-    model = fit(make_verdicts(), ["pgd", "erase"], 0.0)
-    ratio = np.log(model.jaccard[1:] / model.jaccard[:1])
-    assert (np.diff(ratio, axis=-1) <= 1e-9).all()
-    np.testing.assert_allclose(ratio[1, :, 8:], ratio[1, :, 6:7] * np.ones(2), atol=0.2)
-    assert (ratio[0, :, 1] > 2).all()
+    ratio = log_ratio(fit(make_verdicts(), ["pgd", "erase"], 0.0))[:, ALONE]
+    grid = ratio.reshape(*ratio.shape[:2], LOSS_BINS, NOVELTY_BINS)
+    assert (np.diff(grid, axis=-1) >= -1e-6).all()
+    assert (np.diff(grid, axis=-2) >= -1e-6).all()
+    erase = grid[CELLS : 2 * CELLS]
+    assert (erase[..., 2, 0] < 0.5).all()
+    assert (grid[:CELLS, :, 10, 8] > 2).all()
+
+
+def test_a_pair_without_the_ego_may_incriminate_by_bringing_nothing():
+    ratio = log_ratio(fit(make_verdicts(), ["pgd", "erase"], 0.0))
+    beside = [size for size in range(len(SIZES)) if size not in ALONE]
+    assert (ratio[CELLS : 2 * CELLS, beside, 2 * NOVELTY_BINS] > 2).all()
 
 
 def test_no_single_outcome_says_too_much():
-    model = fit(make_verdicts(), ["pgd", "erase"], 0.0)
-    spread = np.log(model.pairs[1:] / model.pairs[:1])
-    assert spread.max() - spread.min() < 2 * LARGEST_RATIO + 1
-    assert spread.max() > 2
+    ratio = log_ratio(fit(make_verdicts(), ["pgd", "erase"], 0.0))
+    assert np.ptp(ratio, axis=-1).max() <= 2 * LARGEST_RATIO + 1e-9
+    assert ratio.max() > 2
 
 
-def test_what_was_never_seen_is_said():
+@pytest.mark.parametrize(
+    ("kind", "cell", "message"),
+    [
+        ("pgd", 2, "no verdicts of pgd, cell 2, sizes 2 and 1"),
+        (None, 0, "no verdicts of honest teammates, cell 0, sizes 2 and 1"),
+    ],
+)
+def test_what_was_never_seen_is_said(kind, cell, message):
     verdicts = make_verdicts()
-    for b in range(JACCARD_BINS):
-        del verdicts.jaccard["pgd", 3, b]
-    with pytest.raises(TooFewVerdicts, match="no verdicts of pgd, size 3"):
+    for b in range(BINS):
+        del verdicts.pairs[kind, cell, SIZES.index((2, 1)), b]
+    with pytest.raises(TooFewVerdicts, match=message):
         fit(verdicts, ["pgd", "erase"], 0.0)
+
+
+def test_where_nobody_was_complementary_it_makes_no_difference():
+    verdicts = make_verdicts()
+    for size in range(len(SIZES)):
+        del verdicts.pairs[None, 3, size, 3 * NOVELTY_BINS + 5]
+    model = fit(verdicts, ["pgd", "erase"], 0.0)
+    beside = [size for size in range(len(SIZES)) if size not in ALONE]
+    np.testing.assert_array_equal(model.pairs[3, beside], model.pairs[0, beside])
+    assert not np.array_equal(model.pairs[2, beside], model.pairs[0, beside])

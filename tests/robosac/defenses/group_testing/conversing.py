@@ -7,15 +7,7 @@ import numpy as np
 from robosac.consensus import Verdict
 from robosac.defenses import Outcome
 from robosac.defenses.group_testing import OPEN, EvidenceModel
-from robosac.defenses.group_testing.model import (
-    CELLS,
-    JACCARD_BINS,
-    JOINING_SIZES,
-    LOSS_BINS,
-    NOVELTY_BINS,
-    SIZES,
-    WITNESS_SIZES,
-)
+from robosac.defenses.group_testing.model import BINS, CELLS, CLEAN, LOSS_BINS, NOVELTY_BINS, SIZES
 
 TEAM = ("car-2", "car-3", "car-4", "car-5", "rsu")
 SEEN = np.array([[10.0 * i, 5.0, 4.0, 2.0, 0.0, 0.9] for i in range(8)])
@@ -28,20 +20,17 @@ def shifted(subset: tuple[str, ...]) -> np.ndarray:
 
 
 def make_model(kinds=("pgd", "erase", OPEN)) -> EvidenceModel:
-    """Unattacked outcomes low in loss and high in index; attacked ones the other way round, but for the index of the
-    kind ``erase``, which says nothing.
+    """Unattacked outcomes low in loss, attacked ones the other way round; beside the ego alone, attacks of the kind
+    ``erase`` show nothing. Whose view is complementary makes no difference.
     """
-    k = len(kinds)
-    index = np.linspace(-2, 2, JACCARD_BINS)
-    by_kind = {"pgd": np.exp(-index), "erase": np.exp(index), OPEN: np.ones(JACCARD_BINS)}
-    jaccard = np.stack([np.exp(index), *[by_kind[kind] for kind in kinds]])
     loss = np.repeat(np.linspace(-2, 2, LOSS_BINS), NOVELTY_BINS)
-    pairs = np.stack([np.exp(-loss), *[np.exp(loss)] * (CELLS * (k - 1)), *[np.ones(len(loss))] * CELLS])
-    jaccard = np.repeat(jaccard[:, None], SIZES, axis=1)
-    pairs = np.tile(pairs[:, None, None], (1, WITNESS_SIZES, JOINING_SIZES, 1))
-    jaccard /= jaccard.sum(axis=-1, keepdims=True)
-    pairs /= pairs.sum(axis=-1, keepdims=True)
-    return EvidenceModel(0.0, tuple(kinds), jaccard, pairs)
+    pairs = np.empty((CLEAN + CELLS * len(kinds), len(SIZES), BINS))
+    pairs[:CLEAN] = np.exp(-loss)
+    for row, kind in zip(range(CLEAN, len(pairs), CELLS), kinds, strict=True):
+        pairs[row : row + CELLS] = np.ones(BINS) if kind == OPEN else np.exp(loss)
+        if kind == "erase":
+            pairs[row : row + CELLS, [a == 0 for a, _ in SIZES]] = np.exp(-loss)
+    return EvidenceModel(0.0, tuple(kinds), pairs / pairs.sum(axis=-1, keepdims=True))
 
 
 def outcome(subset: tuple[str, ...], attackers: Collection[str], *, reference=SEEN) -> Outcome:

@@ -8,7 +8,7 @@ from robosac.defenses.group_testing.candidates import (
     WITNESSES,
     candidates,
 )
-from robosac.defenses.group_testing.model import CELLS
+from robosac.defenses.group_testing.model import CELLS, CLEAN
 from robosac.defenses.group_testing.posterior import BLOCK, Posterior
 
 KINDS = 2
@@ -17,8 +17,8 @@ NOTHING = np.zeros((0, 20), dtype=bool)
 
 def learn(posterior, subset, log_ratio):
     """Evidence that somebody of a subset attacks, or that nobody does."""
-    told = np.zeros(1 + CELLS * KINDS)
-    told[1:] = log_ratio
+    told = np.zeros(CLEAN + CELLS * KINDS)
+    told[CLEAN:] = log_ratio
     posterior.update(subset, np.zeros_like(subset), told)
 
 

@@ -1,28 +1,62 @@
 import numpy as np
 import pytest
 
+from robosac.defenses.group_testing import model as likelihoods
+from robosac.defenses.group_testing.model import BINS, CELLS, CLEAN, SIZES, EvidenceModel, size_row
 from tests.robosac.defenses.group_testing.conversing import make_model
 
-MODEL = make_model()
-ROWS = MODEL.pairs.shape[0]
+KINDS = 3
+ROWS = CLEAN + CELLS * KINDS
+
+
+@pytest.fixture
+def model(rng, monkeypatch):
+    """Likelihoods without any order, reckoned with bin by bin."""
+    monkeypatch.setattr(likelihoods, "COARSE", (1, 1))
+    return EvidenceModel(0.0, ("x", "y", "z"), rng.dirichlet(np.ones(BINS), (ROWS, len(SIZES))))
 
 
 def mutual_information(table, cells):
-    joint = cells[:, None] * table
+    """Between the outcome and the part of the pair that attackers are in."""
+    parts = [range(CLEAN), *(range(CLEAN + cell, ROWS, CELLS) for cell in range(CELLS))]
+    joint = np.array([(cells[list(part), None] * table[list(part)]).sum(axis=0) for part in parts])
     apart = joint.sum(axis=1, keepdims=True) * joint.sum(axis=0, keepdims=True)
     seen = joint > 0
     return float((joint[seen] * np.log2(joint[seen] / apart[seen])).sum())
 
 
-def test_what_a_test_promises_is_the_mutual_information(rng):
+def test_what_a_test_promises_is_the_mutual_information(model, rng):
     cells = rng.dirichlet(np.full(ROWS, 0.3), 12)
-    sizes, witnesses, joining = (rng.integers(1, 9, 12) for _ in range(3))
-    told = MODEL.jaccard_information(sizes, cells), MODEL.pair_information(witnesses, joining, cells)
-    tables = MODEL.jaccard_tables(sizes), MODEL.pair_tables(witnesses, joining)
-    for bits, table in zip(told, tables, strict=True):
-        assert bits == pytest.approx([mutual_information(t, c) for t, c in zip(table, cells, strict=True)])
+    a, d = rng.integers(0, 9, 12), rng.integers(1, 9, 12)
+    expected = [mutual_information(t, c) for t, c in zip(model.tables(a, d), cells, strict=True)]
+    assert model.information(a, d, cells) == pytest.approx(expected)
+    assert max(expected) > 0.1
 
 
-def test_what_is_certain_promises_nothing():
-    certain = np.eye(ROWS)[[0, 2]]
-    assert MODEL.pair_information(np.array([1, 2]), np.array([1, 1]), certain) == pytest.approx([0, 0], abs=1e-9)
+def test_coarser_bins_promise_less_but_not_nothing(model, rng, monkeypatch):
+    cells = rng.dirichlet(np.full(ROWS, 0.3), 12)
+    a, d = np.full(12, 2), np.ones(12, dtype=int)
+    exact = model.information(a, d, cells)
+    monkeypatch.setattr(likelihoods, "COARSE", (2, 2))
+    coarse = EvidenceModel(0.0, model.kinds, model.pairs).information(a, d, cells)
+    assert (coarse <= exact).all()
+    assert (coarse > 0).all()
+
+
+@pytest.mark.parametrize("truth", [0, 1, CLEAN, CLEAN + 4])
+def test_what_is_certain_promises_nothing(truth):
+    certain = np.eye(ROWS)[[truth]]
+    assert make_model().information(np.array([1]), np.array([1]), certain) == pytest.approx([0], abs=1e-9)
+
+
+def test_neither_the_kind_nor_whose_view_is_complementary_is_worth_knowing(model):
+    a, d = np.array([1, 1]), np.array([1, 1])
+    which = np.zeros((2, ROWS))
+    which[0, [CLEAN, CLEAN + CELLS]] = 0.5  # d attacks, in one of two ways
+    which[1, [0, 1]] = 0.5  # nobody does, and d is complementary or not
+    assert model.information(a, d, which) == pytest.approx([0, 0], abs=1e-9)
+
+
+def test_larger_sizes_count_as_the_largest_told_apart():
+    a, d = np.array([0, 0, 1, 3, 9]), np.array([1, 7, 3, 2, 9])
+    assert [SIZES[row] for row in size_row(a, d)] == [(0, 1), (0, 5), (1, 3), (3, 2), (3, 2)]
