@@ -6,7 +6,7 @@ import pytest
 from robosac.budget import DomainError
 from robosac.consensus import Verdict
 from robosac.defenses import GroupTesting, Outcome, Reason, Source
-from robosac.defenses.group_testing import OPEN, Hazards
+from robosac.defenses.group_testing import OPEN, Hazards, choice
 from robosac.defenses.group_testing.memory import FORGETTING_FRAMES
 from tests.robosac.defenses.group_testing.conversing import SEEN, TEAM, make_model, outcome, run_frame, shifted
 
@@ -54,6 +54,32 @@ def test_the_evidence_on_a_named_attacker_is_given_item_by_item(rng):
         assert ("jaccard_index" in item) == (item["test"] == "ego")
         assert ("joining" in item) == (item["test"] == "pair")
         assert {"loss", "novelty"} <= set(item)
+        assert item["teammates"]
+
+
+def test_memory_keeps_which_way_a_test_spoke(rng):
+    honest, _ = run(DEFENSE, [], 2, rng)
+    assert {sign for _, sign in honest.state["memory"]["tests"].values()} == {-1}
+    attacked, _ = run(DEFENSE, TEAM, 2, rng)
+    assert {sign for _, sign in attacked.state["memory"]["tests"].values()} == {1}
+
+
+def test_an_ego_without_confident_boxes_is_no_witness(rng, monkeypatch):
+    asked = []
+    promised = choice.expected_information
+
+    def expected_information(*arguments, ego_sees):
+        asked.append(ego_sees)
+        return promised(*arguments, ego_sees=ego_sees)
+
+    monkeypatch.setattr(choice, "expected_information", expected_information)
+    unsure = np.copy(SEEN)
+    unsure[:, 5] = 0.3
+    state = DEFENSE.initial_state(TEAM)
+    run_frame(DEFENSE, state, TEAM, [], rng, judge=lambda *a: outcome(*a, reference=unsure))
+    assert asked[0]
+    assert len(asked) > 1
+    assert not any(asked[1:])
 
 
 def test_the_same_subset_again_and_again_names_nobody():
