@@ -39,6 +39,7 @@ DEFENSES: Mapping[str, Mapping[str, Any]] = {
     "sample_consensus": {"kind": "sample_consensus", "attacker_ratio": 0.2, "sampling_budget": 7, "collaborators": 3},
     "static_team": {"kind": "static_team", "attacker_ratio": 0.2, "sampling_budget": 7, "collaborators": 3},
     "a2cp": {"kind": "a2cp"},
+    "group_testing": {"kind": "group_testing"},
     "none": {"kind": "none"},
 }
 LOADED_S = (0.05, 1.2)
@@ -273,7 +274,7 @@ def show(console: Console, sessions: int, kills: Sequence[Kill]) -> None:
 
 def main(
     kills: Annotated[int, typer.Option(min=1, help="How often the gateway is killed.")] = 20,
-    sessions: Annotated[int, typer.Option(min=1, help="Sessions, with one defence after another.")] = 4,
+    sessions: Annotated[int, typer.Option(min=1, help="Sessions, with one defence after another.")] = 5,
     seed: Annotated[int, typer.Option(min=0, help="Of the moments.")] = 0,
     database_url: Annotated[str | None, typer.Option(help="By default SQLite in a temporary folder.")] = None,
     out: Annotated[Path | None, typer.Option(help="Folder for crash_test.json and the gateways' log.")] = None,
