@@ -68,8 +68,8 @@ def _all_of(members: IntArray, size: int) -> BoolArray:
 
 def _some_of(posterior: Posterior, here: IntArray, decoded: BoolArray) -> BoolArray:
     """Answers, and groups of unresolved teammates beside each subset of cleared ones decoded before: so a test is
-    evidence twice, by its index and by its pair. Where there is none yet, groups beside nobody and beside the least
-    suspected. While somebody is in doubt, an answer holds no more than can be witnesses afterwards.
+    evidence twice, by the pairs with the ego and with that subset. Where there is none yet, groups beside nobody and
+    beside the least suspected. While somebody is in doubt, an answer holds no more than can be witnesses afterwards.
     """
     suspicion = posterior.marginals()
     good = cleared(suspicion)
