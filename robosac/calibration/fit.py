@@ -27,6 +27,7 @@ PSEUDO_COUNT = 2.0
 UNIFORM_SHARE = 0.05
 """Share of a uniform histogram in those of attacked fusions, for what attackers may do otherwise."""
 PROJECTIONS = 50
+"""Rounds of alternating projections."""
 LARGEST_RATIO = 4.0
 """No single outcome says more than this, as a natural logarithm of a likelihood ratio."""
 _KERNEL = (0.25, 0.5, 0.25)

@@ -102,11 +102,6 @@ class Posterior:
         """Probability that nobody attacks."""
         return float(self._weights[0])
 
-    @property
-    def kinds(self) -> FloatArray:
-        """Probability of each kind of attack (K,)."""
-        return self._weights[1:].copy()
-
     def blocks(self) -> list[list[str]]:
         """The team as it is cut into blocks."""
         return [list(block) for block in self._blocks]

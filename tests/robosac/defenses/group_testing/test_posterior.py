@@ -128,6 +128,42 @@ def test_a_small_team_is_exact(rng):
         assert posterior.nobody == pytest.approx(brute.nobody)
 
 
+def spelled_out(posterior):
+    """The distribution that a posterior stands for, whatever its blocks, from its state."""
+    state = posterior.to_state()
+    brute = BruteForce(posterior.members)
+    tables = [
+        sets.long(block["table"], (1 + KINDS) * 3 ** len(block["members"])).reshape(1 + KINDS, -1)
+        for block in state["blocks"]
+    ]
+    brute.p = {}
+    for z in product(range(3), repeat=len(brute.team)):
+        parts, start = [], 0
+        for block in state["blocks"]:
+            part = z[start : start + len(block["members"])]
+            parts.append(sum(s * 3**i for i, s in enumerate(part)))
+            start += len(part)
+        for k, weight in enumerate(state["weights"]):
+            chance = weight * np.prod([table[k, part] for table, part in zip(tables, parts, strict=True)])
+            if k or ATTACKS not in z:
+                brute.p[z, k - 1 if k else None] = chance
+    return brute
+
+
+def test_learning_across_blocks_keeps_the_marginals_exact(rng, monkeypatch):
+    monkeypatch.setattr("robosac.defenses.group_testing.posterior.EXACT", 3)
+    monkeypatch.setattr("robosac.defenses.group_testing.posterior.BLOCK", 2)
+    posterior = Posterior.of(KINDS, 0.5, 0.25, TEAM)
+    assert len(posterior.blocks()) == 2
+    for a, d, log_likelihood in random_tests(rng, TEAM, 12):
+        brute = spelled_out(posterior)
+        np.testing.assert_allclose(cells(posterior, a, d), brute.cells(a, d), atol=1e-5)
+        posterior.update(*rows(posterior, a, d), log_likelihood)
+        brute.update(a, d, log_likelihood)
+        np.testing.assert_allclose(posterior.marginals(), brute.marginals(posterior.members), atol=1e-4)
+        assert posterior.nobody == pytest.approx(brute.nobody, abs=1e-4)
+
+
 def test_state_survives_json(rng):
     posterior = Posterior.of(KINDS, 0.5, 0.25, TEAM)
     for a, d, log_likelihood in random_tests(rng, TEAM, 4):
