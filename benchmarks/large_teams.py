@@ -33,6 +33,9 @@ from robosac.scenes.splits import TEST_SEEDS
 
 LOSSES = np.array([0.0, *likelihoods.LOSS_EDGES])
 NOVELTIES = (0, *likelihoods.NOVELTY_EDGES)
+CHANGES = (0, *likelihoods.CHANGE_EDGES)
+SHOWN = np.tile([0.0, 0.0, 0.0, 0.9], (28, 1))
+POSE = np.eye(4)
 EGO = "car-1"
 
 
@@ -53,12 +56,12 @@ class World:
     kind: int
     rng: np.random.Generator
 
-    def outcome(self, subset: tuple[str, ...]) -> Outcome:
+    def outcome(self, subset: tuple[str, ...], frame: int) -> Outcome:
         boxes = np.zeros((1, 6)).view(_Subset)
         boxes.members = frozenset(subset)
         agrees = self.attackers.isdisjoint(subset) or self.model.kinds[self.kind] != "pgd"
         index, verdict = (0.5, Verdict.CONSENSUS) if agrees else (0.1, Verdict.DISSENSUS)
-        return Outcome(subset, index, verdict, boxes, REFERENCE)
+        return Outcome(subset, index, verdict, boxes, REFERENCE, POSE, frame)
 
     def measure(self, smaller: _Subset, larger: _Subset) -> PairMeasure:
         a, d = smaller.members, larger.members - smaller.members
@@ -67,6 +70,17 @@ class World:
         table = self.model.tables(np.array([len(a)]), np.array([len(d)]))[0, row]
         loss, novelty = divmod(int(self.rng.choice(len(table), p=table)), likelihoods.NOVELTY_BINS)
         return PairMeasure(float(LOSSES[loss]), NOVELTIES[novelty])
+
+    def followed(self, boxes: _Subset, pose: np.ndarray) -> _Subset:  # noqa: ARG002
+        shown = SHOWN.view(_Subset)
+        shown.members = boxes.members
+        return shown
+
+    def changes(self, before: np.ndarray, now: _Subset) -> int:  # noqa: ARG002
+        row = 0 if self.attackers.isdisjoint(now.members) else 1 + self.kind
+        size = min(len(now.members), likelihoods.CHANGE_SIZES)
+        table = self.model.changes[row, size - 1, likelihoods.crowd_bin(len(SHOWN))]
+        return CHANGES[int(self.rng.choice(len(table), p=table))]
 
 
 def main(
@@ -96,8 +110,10 @@ def draw(teammates: int, attackers: int, kind: str, runs: int, frames: int) -> N
         bad = frozenset(str(name) for name in rng.choice(team, attackers, replace=False))
         world = World(defense.model, bad, defense.model.kinds.index(kind), rng)
         judging.measure = world.measure  # type: ignore[assignment]
+        judging.followed = world.followed  # type: ignore[assignment]
+        judging.changes = world.changes  # type: ignore[assignment]
         state, spent, done = defense.initial_state(team), 0, None
-        for _ in range(frames):
+        for frame in range(frames):
             before, deciding, tested = spent, 0.0, None
             conversation = defense.converse(team, state, rng)
             try:
@@ -106,7 +122,7 @@ def draw(teammates: int, attackers: int, kind: str, runs: int, frames: int) -> N
                     batch = conversation.send(tested)
                     deciding += time.perf_counter() - started
                     spent += 1
-                    tested = [world.outcome(batch[0])]
+                    tested = [world.outcome(batch[0], frame)]
             except StopIteration as stop:
                 state = stop.value.state
             seconds.append(deciding + time.perf_counter() - started)

@@ -113,7 +113,7 @@ def fuse(
     state : mapping, optional
         What the defence remembers; by default its initial state for the teammates present.
     frame : int
-        The frame's number; needed only with ``previous``.
+        The frame's number, for what compares it with the frame before.
     previous : PreviousAnswer, optional
         The latest answer's. A defence with the reference ``previous`` compares with it if it is of the frame before
         this one, else with the ego's own perception.
@@ -226,7 +226,8 @@ class _FrameRun:
             started = self.clock()
             comparison = compare(reference, self._confident(boxes), self.defense.consensus_threshold)
             self._spend("consensus", started)
-            tested.append(Outcome(subset, comparison.jaccard_index, comparison.verdict, boxes, reference))
+            index, verdict = comparison.jaccard_index, comparison.verdict
+            tested.append(Outcome(subset, index, verdict, boxes, reference, self.ego.pose, self.frame))
             self.outcomes.append(tested[-1])
         return tested
 

@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Collection
-from typing import Annotated, Any, Literal
+from typing import Annotated, Any, Literal, Self
 
 from pydantic import (
     AfterValidator,
@@ -33,6 +33,8 @@ from robosac.defenses.static_team import DEFAULT_RECHECK
 from robosac.detectors import DetectorInfo
 from robosac.signatures import read_public_key
 
+COMPARABLE_PERIOD_MS = 250.0
+"""Longest period of frames of which one is like the next, as calibrated at 200 ms."""
 VehicleId = Annotated[str, StringConstraints(pattern=r"^[A-Za-z0-9][A-Za-z0-9._:-]{0,63}$")]
 
 
@@ -50,6 +52,10 @@ class _DefenseSettings(_Request):
             If the settings contradict each other, or the detector lacks the calibration that the defence needs.
         """
         return build(self.model_dump(mode="json"), lambda: calibration_of(detector))
+
+    def at_period(self, frame_period_ms: float) -> Self:  # noqa: ARG002
+        """With what is left open decided for frames so far apart."""
+        return self
 
 
 class _SamplingSettings(_DefenseSettings):
@@ -153,6 +159,17 @@ class GroupTestingSettings(_DefenseSettings):
     pose_error_m: float = Field(
         DEFAULT_POSE_ERROR_M, ge=0, description="Standard deviation of the teammates' positions to expect, metres."
     )
+    compare_frames: bool | None = Field(
+        None,
+        description="Whether boxes that come and go from frame to frame are evidence, as calibrated at 5 frames a "
+        f"second; by default if frame_period_ms is at most {COMPARABLE_PERIOD_MS:g}.",
+    )
+
+    def at_period(self, frame_period_ms: float) -> Self:
+        """With ``compare_frames`` decided."""
+        if self.compare_frames is not None:
+            return self
+        return self.model_copy(update={"compare_frames": frame_period_ms <= COMPARABLE_PERIOD_MS})
 
 
 DefenseSettings = Annotated[

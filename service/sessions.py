@@ -85,7 +85,7 @@ class Sessions:
         """Begin a session; the answer is the only place where its tokens are shown."""
         detector = self._detector(self._settings.detector if request.detector is None else request.detector)
         check_size(request.teammates, self._settings.max_teammates)
-        settings = request.defense or default_defense(detector.info)
+        settings = (request.defense or default_defense(detector.info)).at_period(request.frame_period_ms)
         try:
             defense = settings.build(detector.info)
             defense.check_team(len(request.teammates))

@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from robosac import references
-from robosac.attacks.adaptive import Erase, Invent, Shift
+from robosac.attacks.adaptive import Erase, Invent, InventSteady, Shift
 from robosac.attacks.base import Attack, IterativeAttack, Knowledge, inverted_pseudo_truth
 from robosac.attacks.campaign import BEHAVIOURS, HONEST, SEPARATOR, Campaign
 from robosac.attacks.carlini_wagner import CarliniWagner
@@ -21,6 +21,7 @@ _ALL: tuple[type[Attack], ...] = (
     EraseStill,
     Invent,
     InventStill,
+    InventSteady,
     Shift,
     ShiftStill,
 )
@@ -95,6 +96,7 @@ __all__ = [
     "GaussianNoise",
     "HONEST",
     "Invent",
+    "InventSteady",
     "InventStill",
     "IterativeAttack",
     "Knowledge",

@@ -10,12 +10,16 @@ import torch
 from torch.nn import functional
 
 from robosac.attacks.base import SEEN, Aim, Knowledge, Tensors
-from robosac.attacks.geometric import Perception, average, balanced, geometric
+from robosac.attacks.geometric import Perception, average, balanced, displacement, geometric
 from robosac.attacks.gradient import BIM
 from robosac.detectors.base import AttackSurface
 
 APART_M = 5.0
 """Invented objects keep this far from one another and from everything seen."""
+SPACING_M = 8.0
+"""Between the points at which steady invented objects are."""
+CAR = (1.5, 0.64, 1.0, 0.0)
+"""Logarithms of length and width, and the yaw's two numbers, of a car of 4.5 m by 1.9 m that heads as the ego does."""
 MAX_PLACES = 5000
 """Places that are considered for invented objects, best first: bounds the search where there are many anchors."""
 
@@ -93,6 +97,59 @@ class Invent(BIM):
                 chosen[index] = True
                 taken = torch.cat([taken, flat[index : index + 1]])
         return chosen.reshape(seen.shape)
+
+
+@dataclass(frozen=True)
+class InventSteady(Invent):
+    """`Invent`, with objects that are still there in the next frame.
+
+    A defence can compare frames: what is there stays, or drives on. So the places are points of a fixed grid around the
+    ego, 8 m apart, the farthest first, 5 m from everything seen; and what is descended has another term, how far the
+    objects are from cars at these points that head as the ego does. They drive along with it. Steps are smaller and
+    more than elsewhere: a signed step of 0.1 shakes boxes by itself.
+    """
+
+    name: ClassVar[str] = "invent-steady"
+
+    steps: int = 30
+    step_size: float = 0.04
+
+    def aim(self, surface: AttackSurface, attackers: Collection[str]) -> Aim:
+        """Objects, and these at their points."""
+        harm, shown = super().aim(surface, attackers), geometric(surface)
+        ego, honest = Perception.of(surface, ()), Perception.of(surface, surface.messages)
+        seen = torch.maximum(ego.scores, honest.scores) >= SEEN
+        cells, points = self._points(honest.geometry[..., :2], seen)
+        wanted = torch.cat([points, torch.tensor(CAR).expand(len(points), -1)], dim=1)
+        everywhere = torch.ones(len(points), dtype=torch.bool)
+
+        def loss(sent: Tensors, delta: Tensors) -> torch.Tensor:
+            _, geometry = shown.perceive({**surface.messages, **sent})
+            return harm(sent, delta) + displacement(geometry.reshape(-1, 6)[cells], wanted, everywhere)
+
+        return loss
+
+    def _places(self, ego_logits: torch.Tensor, centres: torch.Tensor, seen: torch.Tensor) -> torch.Tensor:  # noqa: ARG002
+        chosen = torch.zeros(seen.numel(), dtype=torch.bool)
+        chosen[self._points(centres, seen)[0]] = True
+        return chosen.reshape(seen.shape)
+
+    def _points(self, centres: torch.Tensor, seen: torch.Tensor) -> tuple[torch.Tensor, torch.Tensor]:
+        """Points (n, 2) and the numbers (n,) of the places nearest to them."""
+        flat = centres.reshape(-1, 2)
+        steps = int(flat.abs().max() // SPACING_M)
+        side = SPACING_M * torch.arange(-steps, steps + 1.0)
+        points = torch.cartesian_prod(side, side)
+        points = points[points.norm(dim=1).argsort(descending=True, stable=True)]
+        apart = (
+            torch.cdist(points, flat[seen.flatten()]).min(dim=1).values
+            if bool(seen.any())
+            else points[:, 0] + torch.inf
+        )
+        points = points[apart >= APART_M][: self.objects]
+        distance = torch.cdist(points, flat)
+        distance[:, seen.flatten()] = torch.inf
+        return distance.argmin(dim=1), points
 
 
 @dataclass(frozen=True)

@@ -20,7 +20,8 @@ from robosac.fusion import FusionResult, fuse
 from robosac.previous import PreviousAnswer
 
 JACCARD_TOLERANCE = 1e-9
-STATE_TOLERANCE = 1e-9
+STATE_TOLERANCE = 2e-6
+"""What it holds of boxes is rounded to 1e-6."""
 BOX_TOLERANCE = 1e-6
 """Metres, radians and score: what another order of summation may change."""
 

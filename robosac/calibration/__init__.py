@@ -3,7 +3,7 @@
 from robosac.calibration.fit import TooFewVerdicts, fit
 from robosac.calibration.making import Recipe, ReliabilityBin, calibrate
 from robosac.calibration.shipped import calibration_digest, calibration_of
-from robosac.calibration.verdicts import Verdicts, collect, validation_frames
+from robosac.calibration.verdicts import Verdicts, collect, validation_stretches
 
 __all__ = [
     "Recipe",
@@ -15,5 +15,5 @@ __all__ = [
     "calibration_of",
     "collect",
     "fit",
-    "validation_frames",
+    "validation_stretches",
 ]

@@ -12,7 +12,10 @@ from robosac.calibration.verdicts import Verdicts
 from robosac.defenses.group_testing.model import (
     BINS,
     CELLS,
+    CHANGE_BINS,
+    CHANGE_SIZES,
     CLEAN,
+    CROWD_BINS,
     LOSS_BINS,
     NOVELTY_BINS,
     OPEN,
@@ -29,7 +32,10 @@ UNIFORM_SHARE = 0.05
 PROJECTIONS = 50
 """Rounds of alternating projections."""
 LARGEST_RATIO = 4.0
-"""No single outcome says more than this, as a natural logarithm of a likelihood ratio."""
+"""No comparison within a frame says more than this, as a natural logarithm of a likelihood ratio."""
+LARGEST_CHANGE_RATIO = 3.0
+"""Nor one with the frame before more than this: it is made again and again."""
+_FEW = 1e-12
 _KERNEL = (0.25, 0.5, 0.25)
 
 
@@ -47,6 +53,9 @@ def fit(verdicts: Verdicts, kinds: Sequence[str], pose_error_m: float) -> Eviden
        the ego never incriminates, whatever attackers in the calibration did.
     4. The kind `OPEN` has a uniform histogram for every attacked pair.
     5. Where nobody was complementary, the histogram of all unattacked pairs stands.
+    6. Of boxes that come and go there is a histogram for each number of boxes, smoothed over the neighbouring numbers.
+       Its ratio is kept within ``exp(+-3)`` and made not to fall with the changes, and `OPEN` shows what nobody's
+       attack shows: an attacker that is not among the kinds may well hold its boxes.
 
     Parameters
     ----------
@@ -73,7 +82,40 @@ def fit(verdicts: Verdicts, kinds: Sequence[str], pose_error_m: float) -> Eviden
             grid = np.array(counts, dtype=np.float64).reshape(LOSS_BINS, NOVELTY_BINS)
             pairs[row, size] = _density(grid, kind, f"cell {seen}, sizes {a} and {d}")
     attacked = _bounded(pairs[:1], pairs[CLEAN:])
-    return EvidenceModel(pose_error_m, (*kinds, OPEN), np.concatenate([pairs[:CLEAN], attacked]))
+    clean = _change_density(verdicts, None)
+    changes = [_change_ratio_bounded(clean, _change_density(verdicts, kind)) for kind in kinds]
+    return EvidenceModel(
+        pose_error_m, (*kinds, OPEN), np.concatenate([pairs[:CLEAN], attacked]), np.stack([clean, *changes, clean])
+    )
+
+
+def _change_density(verdicts: Verdicts, kind: str | None) -> FloatArray:
+    """Histograms (CHANGE_SIZES, CROWD_BINS, CHANGE_BINS), each last axis by itself."""
+    counts = np.zeros((CHANGE_SIZES, CROWD_BINS, CHANGE_BINS))
+    for index in np.ndindex(counts.shape):
+        counts[index] = verdicts.changes[kind, *index]
+    for size, counted in enumerate(counts.sum(axis=(1, 2)), start=1):
+        if not counted:
+            raise TooFewVerdicts(f"no successive frames of {kind or 'honest teammates'} with {size} in the fusion")
+    padded = np.pad(counts, [(0, 0), (1, 1), (0, 0)], mode="edge")
+    smooth = np.sum([w * padded[:, i : i + CROWD_BINS] for i, w in enumerate(_KERNEL)], axis=0)
+    total = smooth.sum(axis=-1, keepdims=True)
+    worth = np.minimum(total, EFFECTIVE_COUNT)
+    uniform = 1.0 / CHANGE_BINS
+    density = (worth * smooth / np.maximum(total, _FEW) + PSEUDO_COUNT * uniform) / (worth + PSEUDO_COUNT)
+    if kind is not None:
+        density = (1 - UNIFORM_SHARE) * density + UNIFORM_SHARE * uniform
+    normal: FloatArray = density / density.sum(axis=-1, keepdims=True)
+    return normal
+
+
+def _change_ratio_bounded(clean: FloatArray, attacked: FloatArray) -> FloatArray:
+    ratio = np.clip(np.log(attacked / clean), -LARGEST_CHANGE_RATIO, LARGEST_CHANGE_RATIO)
+    for index in np.ndindex(ratio.shape[:2]):
+        ratio[index] = isotonic_regression(ratio[index], weights=(clean[index] + attacked[index]) / 2).x
+    bounded = clean * np.exp(ratio)
+    normal: FloatArray = bounded / bounded.sum(axis=-1, keepdims=True)
+    return normal
 
 
 def _density(counts: FloatArray, kind: str | None, what: str) -> FloatArray:

@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable, Iterator, Mapping, Sequence
+from collections.abc import Callable, Iterable, Iterator, Mapping, Sequence
 from dataclasses import asdict, dataclass
 from itertools import pairwise
 
@@ -11,7 +11,7 @@ import numpy as np
 from robosac import attacks
 from robosac.attacks import Attack
 from robosac.calibration.fit import fit
-from robosac.calibration.verdicts import collect, validation_frames
+from robosac.calibration.verdicts import STRETCH, collect, validation_stretches
 from robosac.defenses.group_testing import Calibration, EvidenceModel, GroupTesting
 from robosac.detectors import Detector
 from robosac.evaluation.playing import play
@@ -33,8 +33,8 @@ class Recipe:
         Names of `robosac.attacks.ATTACKS`, or ``module:callable``; each is a kind.
     attackers : tuple of int
         Each attack comes with each of these numbers of attackers.
-    scenes, frames_per_scene : int
-        The first validation scenes, and frames of each.
+    scenes, stretches_per_scene : int
+        The first validation scenes, and stretches of two successive frames of each.
     check_scenes : int
         The scenes after them, for the reliability.
     pose_errors_m : tuple of float
@@ -45,7 +45,7 @@ class Recipe:
     attacks: tuple[str, ...] = ("pgd", "erase", "invent", "shift")
     attackers: tuple[int, ...] = (1, 2)
     scenes: int = 128
-    frames_per_scene: int = 2
+    stretches_per_scene: int = 1
     check_scenes: int = 12
     pose_errors_m: tuple[float, ...] = (0.0, 0.2, 0.4)
     seed: int = 0
@@ -61,13 +61,13 @@ class Recipe:
     @property
     def frames_per_level(self) -> int:
         """Recorded frames of a level, those of the check among them."""
-        moments = (self.scenes + self.check_scenes) * self.frames_per_scene
-        return moments * (1 + len(self.attacks) * len(self.attackers))
+        frames = (self.scenes + self.check_scenes) * self.stretches_per_scene * STRETCH
+        return frames * (1 + len(self.attacks) * len(self.attackers))
 
 
 @dataclass(frozen=True)
 class ReliabilityBin:
-    """Teammates whose suspicion after one frame lay between two bounds.
+    """Teammates whose suspicion after two frames lay between two bounds.
 
     Attributes
     ----------
@@ -91,7 +91,7 @@ def calibrate(
 ) -> tuple[Calibration, dict[float, list[ReliabilityBin]]]:
     """Make the calibration of a detector, and its reliability by level of pose error.
 
-    The reliability is that of the suspicion after the first frame of a session, on scenes that the tables were not
+    The reliability is that of the suspicion after the second frame of a session, on scenes that the tables were not
     fitted to; attacks and numbers of attackers are those of the recipe.
 
     Parameters
@@ -117,15 +117,16 @@ def calibrate(
     held_out = VALIDATION_SEEDS[recipe.scenes : recipe.scenes + recipe.check_scenes]
     for number, error in enumerate(sorted(recipe.pose_errors_m)):
 
-        def frames(
+        def stretches(
             seeds: Sequence[int], *stream: int, error: float = error
-        ) -> Iterator[tuple[str | None, RecordedFrame]]:
+        ) -> Iterator[tuple[str | None, list[RecordedFrame]]]:
             rng = np.random.default_rng([recipe.seed, _STREAM, *stream])
-            return validation_frames(detector, seeds, recipe.frames_per_scene, chosen, recipe.attackers, error, rng)
+            count = recipe.stretches_per_scene
+            return validation_stretches(detector, seeds, count, chosen, recipe.attackers, error, rng, tick)
 
-        model = fit(collect(frames(fitted, number), tick), recipe.attacks, error)
+        model = fit(collect(stretches(fitted, number)), recipe.attacks, error)
         levels.append(model)
-        reliability[error] = check(model, frames(held_out, number, _CHECK), tick)
+        reliability[error] = check(model, stretches(held_out, number, _CHECK))
     made_by = {
         "command": command,
         **asdict(recipe),
@@ -137,18 +138,17 @@ def calibrate(
 
 
 def check(
-    model: EvidenceModel, frames: Iterator[tuple[str | None, RecordedFrame]], tick: Callable[[], None] = lambda: None
+    model: EvidenceModel, stretches: Iterable[tuple[str | None, Sequence[RecordedFrame]]]
 ) -> list[ReliabilityBin]:
-    """Suspicion after one frame against the truth."""
+    """Suspicion after the frames of each stretch against the truth."""
     defense = GroupTesting(model)
     predicted: list[float] = []
     attacked: list[bool] = []
-    for index, (_, frame) in enumerate(frames):
-        (answer,) = play(defense, [frame], np.random.default_rng(index))
-        for name, suspicion in (answer.result.suspicion or {}).items():
+    for index, (_, stretch) in enumerate(stretches):
+        *_, last = play(defense, stretch, np.random.default_rng(index))
+        for name, suspicion in (last.result.suspicion or {}).items():
             predicted.append(suspicion)
-            attacked.append(name in frame.attackers)
-        tick()
+            attacked.append(name in stretch[-1].attackers)
     p, y = np.array(predicted), np.array(attacked)
     bins = []
     for low, high in pairwise(RELIABILITY_EDGES):

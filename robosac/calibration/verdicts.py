@@ -3,24 +3,26 @@
 from __future__ import annotations
 
 from collections import Counter
-from collections.abc import Callable, Iterator, Mapping, Sequence
+from collections.abc import Callable, Iterable, Iterator, Mapping, Sequence
 from dataclasses import dataclass, field
-from itertools import combinations
+from itertools import combinations, pairwise
 
 import numpy as np
 
 from robosac.attacks import Attack
 from robosac.boxes import FloatArray
 from robosac.consensus import at_least
-from robosac.defenses.group_testing.geometry import measure
-from robosac.defenses.group_testing.model import pair_bin, size_row
+from robosac.defenses.group_testing.geometry import changes, crowd, followed, measure
+from robosac.defenses.group_testing.model import CHANGE_SIZES, change_bin, crowd_bin, pair_bin, size_row
 from robosac.detectors import Detector
 from robosac.evaluation.frames import encode_all, misplaced, under_attack
 from robosac.evaluation.recordings import RecordedFrame, Subset, record
 from robosac.scenes import IntersectionScene
 
-FRAME_STRIDE = 10
-"""Frames of a scene are this many periods of 0.2 s apart, so that they differ."""
+STRETCH_STRIDE = 10
+"""Stretches of a scene begin this many periods of 0.2 s apart, so that they differ."""
+STRETCH = 2
+"""Successive frames of a stretch."""
 ADDED_BOXES = 1.0
 """A benign teammate is complementary if it adds so many boxes, on average, to fusions of up to two others."""
 PairKey = tuple[str | None, int, int, int]
@@ -29,6 +31,8 @@ PairKey = tuple[str | None, int, int, int]
 Cells of a kind: 1 if only in d somebody attacks, 2 if only in a, 3 if in both. Without an attack the cells say so of
 those that are complementary, and 0 is for all pairs, whoever is.
 """
+ChangeKey = tuple[str | None, int, int, int]
+"""Kind of attack (None: nobody attacks in the fusion), index of its size, bin of its boxes, bin of its changes."""
 
 
 @dataclass
@@ -38,9 +42,24 @@ class Verdicts:
     Attributes
     ----------
     pairs : Counter of PairKey
+    changes : Counter of ChangeKey
     """
 
     pairs: Counter[PairKey] = field(default_factory=Counter)
+    changes: Counter[ChangeKey] = field(default_factory=Counter)
+
+    def add_stretch(self, stretch: Sequence[RecordedFrame], kind: str | None) -> None:
+        """Count what successive frames show, each by itself and from one to the next; the same ones attack in all."""
+        for frame in stretch:
+            self.add(frame, kind)
+        for before, frame in pairwise(stretch):
+            for size in range(1, len(frame.team) + 1):
+                for subset in map(frozenset, combinations(frame.team, size)):
+                    if kind is not None and subset.isdisjoint(frame.attackers):
+                        continue
+                    then, now = (followed(f.detect(subset), f.pose) for f in (before, frame))
+                    which = min(size, CHANGE_SIZES) - 1
+                    self.changes[kind, which, crowd_bin(crowd(now)), change_bin(changes(then, now))] += 1
 
     def add(self, frame: RecordedFrame, kind: str | None) -> None:
         """Count what all pairs of a frame show; of an attacked frame, those that an attacker has a part in."""
@@ -78,59 +97,64 @@ def _boxes(frame: RecordedFrame, subset: Subset) -> FloatArray:
     return boxes if subset else at_least(boxes, frame.info.consensus_score)
 
 
-def validation_frames(
+def validation_stretches(
     detector: Detector,
     seeds: Sequence[int],
-    frames_per_scene: int,
+    stretches_per_scene: int,
     attacks: Mapping[str, Attack],
     attackers: Sequence[int],
     pose_error_m: float,
     rng: np.random.Generator,
-) -> Iterator[tuple[str | None, RecordedFrame]]:
-    """Frames without an attack, each followed by the same frame under every attack, the cars taking turns as ego.
+    tick: Callable[[], None] = lambda: None,
+) -> Iterator[tuple[str | None, list[RecordedFrame]]]:
+    """Successive frames without an attack, then the same frames under every attack, the cars taking turns as ego.
 
     Parameters
     ----------
     detector : Detector
     seeds : sequence of int
         Scenes.
-    frames_per_scene : int
+    stretches_per_scene : int
     attacks : mapping of kind to Attack
     attackers : sequence of int
         Each attack comes once with each number of attackers, drawn anew.
     pose_error_m : float
-        Standard deviation of the error of each teammate's position along either axis, metres.
+        Standard deviation of the error of each teammate's position along either axis, metres; each frame has its own.
     rng : numpy.random.Generator
+    tick : callable
+        Called after each recorded frame.
 
     Yields
     ------
-    kind, frame : str or None, RecordedFrame
+    kind, stretch : str or None, list of RecordedFrame
     """
-    turn = 0
-    for seed in seeds:
+    for turn, (seed, number) in enumerate((s, n) for s in seeds for n in range(stretches_per_scene)):
         scene = IntersectionScene(seed)
-        for frame in scene.frames(frames_per_scene, stride=FRAME_STRIDE):
-            ego_id = f"car-{turn % scene.car_agents + 1}"
-            turn += 1
+        ego_id = f"car-{turn % scene.car_agents + 1}"
+        met = []
+        for frame in scene.frames(STRETCH, start=number * STRETCH_STRIDE):
             messages = encode_all(detector, frame)
-            met = {n: m if n == ego_id else misplaced(m, pose_error_m, rng) for n, m in messages.items()}
-            truth = frame.truth(ego_id)
-            team = sorted(set(met) - {ego_id})
-            honest = None
-            for kind, attack, count in [(None, None, 0), *((k, a, n) for k, a in attacks.items() for n in attackers)]:
-                chosen = [team[i] for i in rng.choice(len(team), count, replace=False)]
-                some = attack or next(iter(attacks.values()))
-                recorded = record(detector, under_attack(detector, met, truth, ego_id, chosen, some, rng), honest)
-                honest = honest or recorded
-                yield kind, recorded
+            placed = {n: m if n == ego_id else misplaced(m, pose_error_m, rng) for n, m in messages.items()}
+            met.append((placed, frame.truth(ego_id)))
+        team = sorted(set(met[0][0]) - {ego_id})
+        honest: list[RecordedFrame] = []
+        for kind, attack, count in [(None, None, 0), *((k, a, n) for k, a in attacks.items() for n in attackers)]:
+            chosen = [team[i] for i in rng.choice(len(team), count, replace=False)]
+            some = attack or next(iter(attacks.values()))
+            stretch = []
+            for index, (messages, truth) in enumerate(met):
+                frame_met = under_attack(detector, messages, truth, ego_id, chosen, some, rng)
+                stretch.append(record(detector, frame_met, honest[index] if honest else None))
+                tick()
+            honest = honest or stretch
+            yield kind, stretch
 
 
-def collect(frames: Iterator[tuple[str | None, RecordedFrame]], tick: Callable[[], None] = lambda: None) -> Verdicts:
-    """Count the verdicts of frames; ``tick`` is called after each."""
+def collect(stretches: Iterable[tuple[str | None, Sequence[RecordedFrame]]]) -> Verdicts:
+    """Count the verdicts of stretches."""
     verdicts = Verdicts()
-    for kind, frame in frames:
-        verdicts.add(frame, kind)
-        tick()
+    for kind, stretch in stretches:
+        verdicts.add_stretch(stretch, kind)
     return verdicts
 
 

@@ -36,7 +36,9 @@ def run(
     ] = None,
     scenes: Annotated[int, typer.Option(min=1, help="Validation scenes to fit to.")] = _DEFAULTS.scenes,
     check_scenes: Annotated[int, typer.Option(min=0, help="Further ones to check on.")] = _DEFAULTS.check_scenes,
-    frames: Annotated[int, typer.Option(min=1, help="Frames of each, 2 s apart.")] = _DEFAULTS.frames_per_scene,
+    stretches: Annotated[
+        int, typer.Option(min=1, help="Stretches of two successive frames of each, 2 s apart.")
+    ] = _DEFAULTS.stretches_per_scene,
     seed: Annotated[int, typer.Option(min=0, help="Of everything random.")] = _DEFAULTS.seed,
 ) -> None:
     """Observe what tests show when it is known who attacks, write the likelihoods, and check them.
@@ -51,7 +53,7 @@ def run(
             attacks=tuple(attack or _DEFAULTS.attacks),
             attackers=tuple(attackers or _DEFAULTS.attackers),
             scenes=scenes,
-            frames_per_scene=frames,
+            stretches_per_scene=stretches,
             check_scenes=check_scenes,
             pose_errors_m=tuple(sorted(pose_error or _DEFAULTS.pose_errors_m)),
             seed=seed,
@@ -81,13 +83,13 @@ def command(recipe: Recipe, detector: str) -> str:
     parts += [f"--attackers {count}" for count in recipe.attackers]
     parts += [f"--pose-error {error:g}" for error in recipe.pose_errors_m]
     parts.append(f"--scenes {recipe.scenes} --check-scenes {recipe.check_scenes}")
-    parts.append(f"--frames {recipe.frames_per_scene} --seed {recipe.seed}")
+    parts.append(f"--stretches {recipe.stretches_per_scene} --seed {recipe.seed}")
     return " ".join(parts)
 
 
 def _print(console: Console, pose_error_m: float, bins: list[ReliabilityBin]) -> None:
     table = Table(
-        title=f"Suspicion after one frame, pose error {pose_error_m:g} m, scenes held out", title_justify="left"
+        title=f"Suspicion after two frames, pose error {pose_error_m:g} m, scenes held out", title_justify="left"
     )
     for heading in ("suspicion", "teammates", "predicted", "attacked"):
         table.add_column(heading, justify="right")

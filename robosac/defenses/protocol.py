@@ -74,6 +74,10 @@ class Outcome:
         All that was decoded, with scores; ego frame. None where only the verdict is known.
     reference : (m, 6) ndarray or None
         What took part in the comparison on the reference's side.
+    pose : (4, 4) ndarray or None
+        world_from_sensor of the ego. None where it is not known.
+    frame : int
+        Its number; frames of successive numbers are one frame period apart.
     """
 
     teammates: Hypothesis
@@ -81,6 +85,8 @@ class Outcome:
     verdict: Verdict
     boxes: FloatArray | None = field(default=None, compare=False, repr=False)
     reference: FloatArray | None = field(default=None, compare=False, repr=False)
+    pose: FloatArray | None = field(default=None, compare=False, repr=False)
+    frame: int = field(default=0, compare=False, repr=False)
 
 
 @dataclass(frozen=True)

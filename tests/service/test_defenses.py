@@ -174,7 +174,7 @@ async def test_group_testing_names_the_attacker_and_tells_its_suspicion(served, 
     assert all("car-2" not in answer.accepted for answer in answers)
     last = answers[-1].rejected["car-2"]
     assert last["reason"] == "distrusted"
-    assert {item["test"] for item in last["evidence"]} <= {"ego", "pair"}
+    assert {item["test"] for item in last["evidence"]} <= {"ego", "pair", "change"}
     body = wire.pack_frame(9, ego_message, attacked)
     result = (await served.post(session, "frames", body)).json()
     state = (await served.http.get(path, headers=bearer)).json()
@@ -183,6 +183,17 @@ async def test_group_testing_names_the_attacker_and_tells_its_suspicion(served, 
     assert state["suspicion"] == pytest.approx(result["suspicion"], abs=1e-5)
     assert state["state"]["named"] == ["car-2"]
     assert (await ego.state())["defense"]["budget"] == 4
+
+
+@pytest.mark.parametrize(
+    ("period_ms", "asked", "compared"), [(200.0, {}, True), (251.0, {}, False), (500.0, {"compare_frames": True}, True)]
+)
+async def test_frames_far_apart_are_compared_only_if_asked_for(served, ego_message, benign, period_ms, asked, compared):
+    session = await served.open(defense={"kind": "group_testing", **asked}, frame_period_ms=period_ms)
+    await run(served, session, ego_message, benign, 2)
+    state = await served.ego(session).state()
+    assert state["defense"]["compare_frames"] is compared
+    assert bool(state["state"]["memory"]["shown"]) is compared
 
 
 async def test_other_defences_have_no_suspicion(served, ego_message, benign):

@@ -5,7 +5,8 @@ from __future__ import annotations
 import numpy as np
 
 from robosac.boxes import FloatArray, IntArray
-from robosac.defenses.group_testing.memory import EGO_REPEAT, PAIR_REPEAT, KeyArray, Memory, keys
+from robosac.defenses.group_testing.geometry import crowd
+from robosac.defenses.group_testing.memory import CHANGE_REPEAT, EGO_REPEAT, PAIR_REPEAT, KeyArray, Memory, keys
 from robosac.defenses.group_testing.model import EvidenceModel
 from robosac.defenses.group_testing.posterior import BoolArray, Posterior
 
@@ -17,6 +18,8 @@ INFORMATION_VALUE = 0.06
 """What a bit about who attacks is worth, in the unit of utility."""
 TEST_COST = 0.004
 """What a pass must bring, in the unit of utility."""
+DEPENDENCE = 0.85
+"""What a comparison within a frame counts: what makes one outcome odd, a crossing or a crowd, makes others odd too."""
 UNDILUTED_SIZE = 8
 """Largest subset whose evidence counts in full."""
 
@@ -44,8 +47,9 @@ def expected_information(
     *,
     ego_sees: bool,
 ) -> FloatArray:
-    """Bits (n,) that decoding each subset promises: beside the ego alone (unless that sees too little), and from
-    the best pair with an already decoded part or superset of it; each times what a repetition is worth.
+    """Bits (n,) that decoding each subset promises: beside the ego alone (unless that sees too little), beside itself
+    in the frame before (if it was decoded there), and from the best pair with an already decoded part or superset of
+    it; each times what a repetition is worth.
 
     Parameters
     ----------
@@ -60,10 +64,17 @@ def expected_information(
     """
     bits = np.zeros(len(subsets))
     masks, subset_keys, sizes = posterior.masks(subsets), subsets @ identities, subsets.sum(axis=1)
+    nobody, nothing = np.zeros_like(sizes), np.zeros_like(subset_keys)
+    alone = posterior.cells(np.zeros_like(masks), masks)
     if ego_sees:
-        once = memory.weights(keys(np.zeros_like(subset_keys), subset_keys), EGO_REPEAT)
-        told = model.information(np.zeros_like(sizes), sizes, posterior.cells(np.zeros_like(masks), masks))
-        bits += once * told * dilution(sizes)
+        once = memory.weights(keys(nothing, subset_keys), EGO_REPEAT)
+        bits += DEPENDENCE * once * model.information(nobody, sizes, alone) * dilution(sizes)
+    again = np.flatnonzero([key in memory.shown for key in subset_keys.tolist()])
+    if len(again):
+        once = memory.weights(keys(subset_keys[again], nothing[again]), CHANGE_REPEAT)
+        boxes = np.array([crowd(memory.shown[key]) for key in subset_keys[again].tolist()])
+        told = model.change_information(sizes[again], boxes, alone[again])
+        bits[again] += once * told * dilution(sizes[again])
     shared = subsets.astype(np.float64) @ decoded.T  # exact as floats, whose products are the fast ones
     other_sizes = decoded.sum(axis=1)
     above = shared == other_sizes
@@ -80,7 +91,7 @@ def expected_information(
     told = model.information(a_sizes, together - a_sizes, cells)
     once = memory.weights(keys(a_keys, d_keys), PAIR_REPEAT)
     best = np.zeros(len(subsets))
-    np.maximum.at(best, index, once * told * dilution(together))
+    np.maximum.at(best, index, DEPENDENCE * once * told * dilution(together))
     return bits + best
 
 

@@ -36,7 +36,8 @@ class GroupTesting:
        as an answer, and what it is expected to tell. Nothing above 0, the frame's budget, or the deadline ends the
        search.
     3. A decoded subset is evidence by what it keeps, moves and adds compared with the ego alone and with each part and
-       superset decoded in this frame (`geometry.measure`). A repeated test weighs less.
+       superset decoded in this frame (`geometry.measure`), and by what comes and goes in it since the frame before, if
+       it was decoded there too (`geometry.changes`). A repeated test weighs less.
     4. The answer is the decoded subset of greatest utility that is in consensus with the ego, or all trusted.
     5. A teammate is named (``distrusted``) once its probability passes ``naming_bound`` and at least two different
        subsets speak against it; it is cleared when the probability falls below a half.
@@ -61,6 +62,9 @@ class GroupTesting:
         In [0.5, 1).
     consensus_threshold : float
         Jaccard index from which on a subset may be answered without trust.
+    compare_frames : bool
+        Whether what comes and goes from one frame to the next is evidence. Calibrated at 5 frames a second: where
+        they are farther apart, honest teammates would seem to attack.
 
     Raises
     ------
@@ -79,6 +83,7 @@ class GroupTesting:
     budget: int = DEFAULT_LATER_BUDGET
     naming_bound: float = DEFAULT_NAMING_BOUND
     consensus_threshold: float = DEFAULT_THRESHOLD
+    compare_frames: bool = True
 
     def __post_init__(self) -> None:
         for name in ("attack_prior", "attacker_prior"):
@@ -138,7 +143,9 @@ class GroupTesting:
         if not first:
             posterior.step(self.hazards)
         posterior.regroup(unresolved(posterior.marginals()))
-        judged = JudgedFrame(self.model, posterior, memory, tuple(team), frozenset(state["trusted"]))
+        judged = JudgedFrame(
+            self.model, posterior, memory, tuple(team), frozenset(state["trusted"]), compare_frames=self.compare_frames
+        )
         for passes in range(self.first_budget if first else self.budget, 0, -1):
             subset = judged.next_test(rng, passes)
             if subset is None:

@@ -13,8 +13,9 @@ from robosac.boxes import FloatArray
 from robosac.consensus import Verdict
 from robosac.defenses.group_testing import choice
 from robosac.defenses.group_testing.candidates import WITNESSES, candidates, cleared
-from robosac.defenses.group_testing.geometry import MIN_WITNESSES, PairMeasure, measure
+from robosac.defenses.group_testing.geometry import MIN_WITNESSES, PairMeasure, changes, crowd, followed, measure
 from robosac.defenses.group_testing.memory import (
+    CHANGE_REPEAT,
     EGO_REPEAT,
     PAIR_REPEAT,
     WORTH_KEEPING,
@@ -43,8 +44,9 @@ FORGOTTEN_BELOW = 0.05
 """Evidence about a teammate less suspected is dropped."""
 SUBSETS_TO_NAME = 2
 """Different subsets that must speak against a teammate before it is named."""
-WORTH_WAITING = 0.4
+WORTH_WAITING = 0.34
 """Bits that a test must promise for a larger team's answer to wait for it."""
+_REPEATS = {"ego": EGO_REPEAT, "pair": PAIR_REPEAT, "change": CHANGE_REPEAT}
 _CERTAIN = 1e-9
 _TIE = 1e-9
 _TINY = 1e-300
@@ -69,8 +71,13 @@ class Conclusion:
 
 @dataclass(frozen=True)
 class _Finding:
-    """One piece of evidence: a test of ``a`` (and ``d`` beside it), and how likely its outcome was."""
+    """One piece of evidence: a test of ``a`` (and ``d`` beside it), and how likely its outcome was.
 
+    ``test`` is ``ego`` (d beside the ego alone), ``pair`` (beside a), or ``change`` (d beside itself in the frame
+    before).
+    """
+
+    test: str
     a: Hypothesis
     d: Hypothesis
     log_likelihood: FloatArray
@@ -91,17 +98,28 @@ class JudgedFrame:
         Teammates present.
     trusted : frozenset of str
         The trust list that the frame began with.
+    compare_frames : bool
+        Whether to compare with the frame before.
     """
 
     def __init__(
-        self, model: EvidenceModel, posterior: Posterior, memory: Memory, team: Hypothesis, trusted: frozenset[str]
+        self,
+        model: EvidenceModel,
+        posterior: Posterior,
+        memory: Memory,
+        team: Hypothesis,
+        trusted: frozenset[str],
+        *,
+        compare_frames: bool,
     ) -> None:
         self._model = model
         self._posterior = posterior
         self._memory = memory
         self._team = team
         self._trusted = trusted
+        self._compare_frames = compare_frames
         self._outcomes: list[Outcome] = []
+        self._shown: dict[int, FloatArray] = {}
         self._ego_sees = self._ego_witnesses = True
         self._members = posterior.members
         self._index = {name: i for i, name in enumerate(self._members)}
@@ -141,7 +159,9 @@ class JudgedFrame:
         return tuple(name for name in self._team if options[chosen, self._index[name]])
 
     def learn(self, outcome: Outcome) -> None:
-        """Take in a decoded subset: the pairs it makes with the ego alone and with what was decoded before."""
+        """Take in a decoded subset: the pairs it makes with the ego alone and with what this frame has shown already,
+        and what has changed in it since the frame before.
+        """
         self._ego_sees = outcome.reference is not None and len(outcome.reference) >= MIN_WITNESSES
         findings = self._pairs(outcome)
         if outcome.reference is not None and outcome.boxes is not None:
@@ -150,6 +170,7 @@ class JudgedFrame:
             if pair is not None:
                 values = {"jaccard_index": round(outcome.jaccard_index, 4)}
                 findings.append(self._finding((), outcome.teammates, pair, 1.0, values))
+        findings += self._changes(outcome)
         self._outcomes.append(outcome)
         for finding in findings:
             self._apply(finding)
@@ -168,12 +189,26 @@ class JudgedFrame:
                 found.append((small.teammates, joining, pair))
         return [self._finding(a, d, pair, 1 / math.sqrt(len(found)), {}) for a, d, pair in found]
 
+    def _changes(self, outcome: Outcome) -> list[_Finding]:
+        if not self._compare_frames or outcome.boxes is None or outcome.pose is None:
+            return []
+        (key,) = (self._rows([outcome.teammates]) @ self._identities).tolist()
+        self._shown[key] = now = followed(outcome.boxes, outcome.pose)
+        before = self._memory.shown.get(key) if outcome.frame == self._memory.shown_in + 1 else None
+        if before is None or max(crowd(before), crowd(now)) < MIN_WITNESSES:
+            return []
+        boxes, changed = crowd(now), changes(before, now)
+        likelihood = self._model.change(len(outcome.teammates), boxes, changed)
+        values = {"boxes": boxes, "changes": changed}
+        return [_Finding("change", (), outcome.teammates, np.log(likelihood), 1.0, values)]
+
     def _finding(
         self, a: Hypothesis, d: Hypothesis, pair: PairMeasure, weight: float, values: Mapping[str, Any]
     ) -> _Finding:
         table = self._model.tables(np.array([len(a)]), np.array([len(d)]))[0]
-        values = {"test": "pair" if a else "ego", **values, "loss": round(pair.loss, 4), "novelty": pair.novelty}
-        return _Finding(a, d, np.log(table[:, pair_bin(pair)]), weight, values)
+        values = {**values, "loss": round(pair.loss, 4), "novelty": pair.novelty}
+        weight *= choice.DEPENDENCE
+        return _Finding("pair" if a else "ego", a, d, np.log(table[:, pair_bin(pair)]), weight, values)
 
     def _apply(self, finding: _Finding) -> None:
         a, d = self._rows([finding.a, finding.d])
@@ -184,16 +219,18 @@ class JudgedFrame:
             for part in (slice(CLEAN), slice(CLEAN, None))
         )
         sign = 1 if attacked > clean else -1
-        (key,) = keys(a[None] @ self._identities, d[None] @ self._identities)
+        of_a, of_d = a[None] @ self._identities, d[None] @ self._identities
+        (key,) = keys(of_d, of_a) if finding.test == "change" else keys(of_a, of_d)
         weight = finding.weight * float(choice.dilution(np.array([len(finding.a) + len(finding.d)]))[0])
-        weight *= self._memory.weigh(int(key), PAIR_REPEAT if finding.a else EGO_REPEAT, sign)
+        weight *= self._memory.weigh(int(key), _REPEATS[finding.test], sign)
         before = self._posterior.marginals()
         self._posterior.update(a, d, weight * finding.log_likelihood)
         ratios = _log_odds(self._posterior.marginals()) - _log_odds(before)
         for index in np.flatnonzero(np.abs(ratios) >= WORTH_KEEPING):
             name, ratio = self._members[index], float(ratios[index])
             if ratio > 0 or name in self._memory.evidence:
-                item = {"frame": self._memory.frame, **finding.values, "teammates": list(finding.a or finding.d)}
+                item = {"frame": self._memory.frame, "test": finding.test, **finding.values}
+                item["teammates"] = list(finding.a or finding.d)
                 if finding.a:
                     item["joining"] = list(finding.d)
                 item["log_likelihood_ratio"] = round(ratio, 3)
@@ -217,6 +254,8 @@ class JudgedFrame:
                 believed.update(outcome.teammates)
         trusted = [name for name, p in suspicion.items() if name in believed and p <= TRUSTED_BELOW]
         rejected = self._explain(accepted, set(named), suspicion)
+        self._memory.shown = self._shown
+        self._memory.shown_in = self._outcomes[0].frame if self._outcomes else 0
         self._memory.forget_evidence({name for name, p in suspicion.items() if p < FORGOTTEN_BELOW})
         return Conclusion(accepted, source, rejected, suspicion, trusted, named)
 

@@ -1,10 +1,12 @@
-"""What joins and what vanishes when messages are added to a fusion: two measures on pairs of perceptions."""
+"""What joins and what vanishes: when messages are added to a fusion, and from one frame to the next."""
 
 from __future__ import annotations
 
 from dataclasses import dataclass
 
-from robosac.boxes import FloatArray, pairwise_iou
+import numpy as np
+
+from robosac.boxes import FloatArray, pairwise_iou, to_world
 
 WITNESS_SCORE = 0.5
 """Boxes of the smaller fusion from this score on must survive in the larger one."""
@@ -16,6 +18,12 @@ KNOWN_SCORE = 0.1
 """A box of the smaller fusion from this score on counts as something there."""
 MIN_WITNESSES = 2
 """With fewer boxes to survive there is no evidence."""
+
+
+ALONG_M = 3.0
+ACROSS_M = 0.8
+TURN_RAD = 0.4
+"""How far a vehicle gets from one frame to the next, along itself (15 m/s at 5 Hz) and across, and how far it turns."""
 
 
 @dataclass(frozen=True)
@@ -55,3 +63,48 @@ def measure(smaller: FloatArray, larger: FloatArray) -> PairMeasure | None:
     known = smaller[smaller[:, 5] >= KNOWN_SCORE]
     overlap = pairwise_iou(claimed, known).max(axis=1, initial=0.0)
     return PairMeasure(1.0 - float(kept), int((overlap == 0.0).sum()))
+
+
+def followed(boxes: FloatArray, pose: FloatArray) -> FloatArray:
+    """What is kept of the boxes (n, 6) of a fusion for the next frame, in the world frame.
+
+    Parameters
+    ----------
+    boxes : (n, 6) ndarray
+        Ego frame.
+    pose : (4, 4) ndarray
+        world_from_sensor of the ego.
+
+    Returns
+    -------
+    (m, 4) ndarray
+        x, y, yaw, score, rounded to 1e-6, of the boxes with score >= .1.
+    """
+    placed = to_world(boxes[boxes[:, 5] >= KNOWN_SCORE], pose)
+    kept: FloatArray = placed[:, [0, 1, 4, 5]].round(6)
+    return kept
+
+
+def crowd(now: FloatArray) -> int:
+    """Boxes (n, 4), as `followed` gives them, that may have come: those with score >= .3."""
+    return int((now[:, 3] >= NEW_SCORE).sum())
+
+
+def changes(before: FloatArray, now: FloatArray) -> int:
+    """Boxes that came or went between two frames of one fusion, (n, 4) and (m, 4), as `followed` gives them.
+
+    A box has come if it has a score >= .3 and before there was none of any score where it can have been; it has gone if
+    it had a score >= .5 and there is none where it can be. It can get as far as `ALONG_M`, `ACROSS_M` and `TURN_RAD`
+    say; front and rear are not told apart. What is there stays, or drives on: made-up boxes, and boxes that a
+    perturbed map shakes, come and go.
+    """
+    return _nowhere(now[now[:, 3] >= NEW_SCORE], before) + _nowhere(before[before[:, 3] >= WITNESS_SCORE], now)
+
+
+def _nowhere(boxes: FloatArray, others: FloatArray) -> int:
+    """Boxes that are none of the others."""
+    x, y = np.moveaxis(boxes[:, None, :2] - others[None, :, :2], -1, 0)
+    cos, sin = np.cos(boxes[:, 2, None]), np.sin(boxes[:, 2, None])
+    turned = np.abs((boxes[:, 2, None] - others[None, :, 2] + np.pi / 2) % np.pi - np.pi / 2)
+    same = (np.abs(cos * x + sin * y) < ALONG_M) & (np.abs(cos * y - sin * x) < ACROSS_M) & (turned < TURN_RAD)
+    return len(boxes) - int(same.any(axis=1).sum())

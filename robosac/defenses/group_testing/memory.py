@@ -1,4 +1,4 @@
-"""What the defence keeps from frame to frame besides the posterior: tests made, evidence, those who left."""
+"""What the defence keeps from frame to frame besides the posterior: tests and what they showed, evidence, who left."""
 
 from __future__ import annotations
 
@@ -16,7 +16,10 @@ REPEAT_MEMORY = 60
 """Frames after which a test counts as new."""
 EGO_REPEAT = 0.95
 PAIR_REPEAT = 0.9
-"""A test made k frames ago repeats its bias: made again, it weighs 1 - rho ** k."""
+CHANGE_REPEAT = 0.5
+"""A test made k frames ago repeats its bias: made again, it weighs 1 - rho ** k. What changed since the frame before is
+mostly new.
+"""
 KEPT_ITEMS = 12
 """Pieces of evidence kept of one teammate, the strongest."""
 WORTH_KEEPING = 0.5
@@ -54,12 +57,19 @@ class Memory:
         What spoke for or against those under suspicion: JSON values.
     left : dict of teammate to (suspicion, frame)
         Who left, and when.
+    shown : dict of key to (n, 4) ndarray
+        Of each subset decoded in the latest frame, the sum of its identities, and what it showed, see
+        `geometry.followed`.
+    shown_in : int
+        That frame's number, as its outcomes gave it.
     """
 
     frame: int = 0
     tests: dict[int, tuple[int, int]] = field(default_factory=dict)
     evidence: dict[str, list[dict[str, Any]]] = field(default_factory=dict)
     left: dict[str, tuple[float, int]] = field(default_factory=dict)
+    shown: dict[int, FloatArray] = field(default_factory=dict)
+    shown_in: int = 0
 
     def weights(self, tests: KeyArray, rho: float) -> FloatArray:
         """What tests (n,) are expected to be worth: one made k frames ago ``1 - rho ** k``, others 1."""
@@ -122,6 +132,8 @@ class Memory:
             "tests": {f"{k:016x}": [f, s] for k, (f, s) in self.tests.items() if self.frame - f <= REPEAT_MEMORY},
             "evidence": self.evidence,
             "left": {name: [p, f] for name, (p, f) in self.left.items()},
+            "shown": {f"{key:016x}": boxes.tolist() for key, boxes in self.shown.items()},
+            "shown_in": self.shown_in,
         }
 
     @classmethod
@@ -132,4 +144,7 @@ class Memory:
             tests={int(key, 16): (int(f), int(s)) for key, (f, s) in state["tests"].items()},
             evidence={name: [dict(item) for item in items] for name, items in state["evidence"].items()},
             left={name: (float(p), int(f)) for name, (p, f) in state["left"].items()},
+            # neither is in the states of older versions
+            shown={int(key, 16): np.reshape(boxes, (-1, 4)) for key, boxes in state.get("shown", {}).items()},
+            shown_in=int(state.get("shown_in", 0)),
         )

@@ -15,14 +15,18 @@ from robosac.boxes import FloatArray, IntArray
 from robosac.budget import DomainError
 from robosac.defenses.group_testing.geometry import PairMeasure
 
-FORMAT = 2
+FORMAT = 3
 OPEN = "open"
 """The kind of attack that nothing was calibrated for: any outcome of an attacked fusion is as likely as any other."""
 LOSS_EDGES = (0.03, 0.045, 0.06, 0.075, 0.09, 0.11, 0.13, 0.16, 0.2, 0.28, 0.4)
 NOVELTY_EDGES = (1, 2, 3, 5, 7, 9, 12, 16)
+CROWD_EDGES = (16, 21, 26, 31, 36, 41)
+CHANGE_EDGES = (1, 2, 3, 5, 8, 12)
 LOSS_BINS = len(LOSS_EDGES) + 1
 NOVELTY_BINS = len(NOVELTY_EDGES) + 1
 BINS = LOSS_BINS * NOVELTY_BINS
+CROWD_BINS = len(CROWD_EDGES) + 1
+CHANGE_BINS = len(CHANGE_EDGES) + 1
 COARSE = (2, 2)
 """Neighbouring bins of loss, and of novelty, that are taken together to reckon what a test promises."""
 JOINING_SIZES = (5, 3, 2, 2)
@@ -33,6 +37,8 @@ CLEAN = 4
 """Unattacked cells of a pair (a, d): nobody complementary; somebody in d; in a; in both."""
 CELLS = 3
 """Attacked cells of a pair, for each kind: d dirty; a dirty; both dirty."""
+CHANGE_SIZES = 5
+"""Sizes 1, 2, ... of fusions compared with the frame before; the last one counts for all that are larger."""
 _FIRST = np.cumsum([0, *JOINING_SIZES[:-1]])
 _MOST = np.array(JOINING_SIZES)
 _TINY = 1e-300
@@ -57,6 +63,16 @@ def pair_bin(pair: PairMeasure) -> int:
     return loss * NOVELTY_BINS + novelty
 
 
+def crowd_bin(boxes: int) -> int:
+    """Bin of a number of boxes."""
+    return int(np.searchsorted(CROWD_EDGES, boxes, side="right"))
+
+
+def change_bin(changes: int) -> int:
+    """Bin of a number of boxes that came or went."""
+    return int(np.searchsorted(CHANGE_EDGES, changes, side="right"))
+
+
 @dataclass(frozen=True)
 class EvidenceModel:
     """Likelihoods at one level of pose error.
@@ -71,18 +87,28 @@ class EvidenceModel:
         Kinds of attack, `OPEN` last.
     pairs : (CLEAN + 3 K, len(SIZES), BINS) ndarray
         Each last axis sums to 1.
+    changes : (1 + K, CHANGE_SIZES, CROWD_BINS, CHANGE_BINS) ndarray
+        How many boxes come or go from one frame to the next in a fusion with so many boxes: unattacked, and attacked
+        by each kind in both frames. Each last axis sums to 1.
     """
 
     pose_error_m: float
     kinds: tuple[str, ...]
     pairs: FloatArray
+    changes: FloatArray
 
     def __post_init__(self) -> None:
-        shape = (CLEAN + CELLS * len(self.kinds), len(SIZES), BINS)
-        if self.pairs.shape != shape:
-            raise CalibrationError(f"pairs must have the shape {shape}, got {self.pairs.shape}")
-        if not (self.pairs > 0).all() or abs(self.pairs.sum(axis=-1) - 1).max() > _TOLERANCE:
-            raise CalibrationError("pairs must hold positive probabilities that sum to 1")
+        kinds = len(self.kinds)
+        shapes = {
+            "pairs": (CLEAN + CELLS * kinds, len(SIZES), BINS),
+            "changes": (1 + kinds, CHANGE_SIZES, CROWD_BINS, CHANGE_BINS),
+        }
+        for name, shape in shapes.items():
+            table = getattr(self, name)
+            if table.shape != shape:
+                raise CalibrationError(f"{name} must have the shape {shape}, got {table.shape}")
+            if not (table > 0).all() or abs(table.sum(axis=-1) - 1).max() > _TOLERANCE:
+                raise CalibrationError(f"{name} must hold positive probabilities that sum to 1")
 
     @cached_property
     def _by_size(self) -> FloatArray:
@@ -109,6 +135,25 @@ class EvidenceModel:
         """Tables (n, CLEAN + 3 K, BINS) for pairs of these sizes (n,) and (n,); d at least 1."""
         tables: FloatArray = self._by_size[size_row(a, d)]
         return tables
+
+    def change(self, size: int, boxes: int, changes: int) -> FloatArray:
+        """Likelihoods (CLEAN + 3 K,), by the rows of `pairs`, of so many changes in a fusion of this many teammates in
+        which there are so many boxes. The teammates are d; nobody is in a.
+        """
+        table = self.changes[:, min(size, CHANGE_SIZES) - 1, crowd_bin(boxes), change_bin(changes)]
+        likelihood: FloatArray = np.concatenate([np.repeat(table[:1], CLEAN), np.repeat(table[1:], CELLS)])
+        return likelihood
+
+    def change_information(self, sizes: IntArray, boxes: IntArray, cells: FloatArray) -> FloatArray:
+        """Bits (n,) that fusions of so many teammates (n,) promise about who attacks, by what changed since the frame
+        before, when they showed so many boxes (n,); ``cells`` as for `information`.
+        """
+        tables = self.changes[:, np.minimum(sizes, CHANGE_SIZES) - 1, np.searchsorted(CROWD_EDGES, boxes, side="right")]
+        clean, attacked = cells[:, :CLEAN].sum(axis=1), cells[:, CLEAN::CELLS]
+        shown = np.stack([clean[:, None] * tables[0], np.einsum("nk,knc->nc", attacked, tables[1:])], axis=1)
+        bits = _entropy(np.stack([clean, attacked.sum(axis=1)], axis=1))
+        bits += _entropy(shown.sum(axis=1)) - _entropy(shown).sum(axis=1)
+        return np.maximum(bits, 0.0)
 
     def information(self, a: IntArray, d: IntArray, cells: FloatArray) -> FloatArray:
         """Bits (n,) that pairs of these sizes promise about who attacks: the entropy of the outcome less what is left
@@ -183,6 +228,7 @@ class Calibration:
                     "pose_error_m": level.pose_error_m,
                     "kinds": list(level.kinds),
                     "pairs": _rounded(level.pairs),
+                    "changes": _rounded(level.changes),
                 }
                 for level in self.levels
             ],
@@ -207,6 +253,7 @@ class Calibration:
                     float(level["pose_error_m"]),
                     tuple(map(str, level["kinds"])),
                     _normalised(level["pairs"]),
+                    _normalised(level["changes"]),
                 )
                 for level in content["levels"]
             ]

@@ -104,6 +104,7 @@ FULL = Extent(
         *(("shift", n) for n in (1, 2)),
         ("erase-still", 1),
         ("invent-still", 1),
+        ("invent-steady", 1),
         ("shift-still", 1),
         ("pgd@asleep", 1),
         ("erase@asleep", 1),

@@ -2,7 +2,8 @@ import numpy as np
 import pytest
 import torch
 
-from robosac.attacks import Erase, EraseStill, Invent, InventStill, NoGeometry, Shift, ShiftStill
+from robosac.attacks import Erase, EraseStill, Invent, InventSteady, InventStill, NoGeometry, Shift, ShiftStill
+from robosac.attacks.adaptive import SPACING_M
 from robosac.boxes import pairwise_iou
 from robosac.consensus import at_least, compare
 from robosac.detectors import GeometricSurface
@@ -48,7 +49,9 @@ def shaken(fused, attack):
     return 1 - pairwise_iou(before, fused(attack, TEAM)).max(axis=1).mean()
 
 
-@pytest.mark.parametrize("attack", [Erase, EraseStill, Invent, InventStill, Shift, ShiftStill], ids=lambda a: a.name)
+@pytest.mark.parametrize(
+    "attack", [Erase, EraseStill, Invent, InventStill, InventSteady, Shift, ShiftStill], ids=lambda a: a.name
+)
 def test_they_pass_the_consensus_test_and_do_harm(attack, fused):
     assert compare(fused(None, []), fused(attack, TEAM)).jaccard_index > 0.35
     truth = FRAME.truth("car-1")
@@ -64,6 +67,26 @@ def test_an_inventor_adds_boxes_where_nobody_sees_any(fused):
     assert (pairwise_iou(new, FRAME.truth("car-1")).max(axis=1) < 0.3).all()
     own = fused(None, [])
     assert compare(own, invented).matched >= compare(own, fused(None, TEAM)).matched - 1
+
+
+def test_a_steady_inventor_puts_cars_on_a_grid(fused):
+    def on_grid(attack):
+        boxes = fused(attack, TEAM)
+        new = boxes[pairwise_iou(boxes, fused(None, TEAM)).max(axis=1) < 0.1]
+        off = np.abs(new[:, :2] - SPACING_M * np.round(new[:, :2] / SPACING_M)).max(axis=1)
+        return int((off < 0.5).sum())
+
+    assert on_grid(InventSteady) >= 3
+    assert on_grid(Invent) <= 1
+
+
+def test_without_anything_seen_a_steady_inventor_has_the_whole_grid():
+    surface = Linear((4, 5))
+    surface.ego = torch.full((4, 5), -5.0)
+    surface.messages = {name: torch.zeros(4, 5) for name in "ab"}
+    sent = InventSteady(epsilon=20.0, steps=150, step_size=0.2, objects=3).run(surface, ["a"], np.random.default_rng(0))
+    logits = surface.class_logits({**surface.messages, **sent})
+    assert 3 <= int((logits > 0).sum()) <= 4  # a logit moves the next cell's box too
 
 
 def test_a_shifter_moves_boxes_by_less_than_a_metre(fused):

@@ -45,6 +45,17 @@ def test_of_an_attacked_frame_what_the_attacker_is_part_of():
     assert {kind for kind, *_ in verdicts.pairs} == {"pgd"}
 
 
+def test_successive_frames_show_what_comes_and_goes():
+    honest, attacked = Verdicts(), Verdicts()
+    honest.add_stretch([recorded(), recorded()], None)
+    assert sum(honest.pairs.values()) == 2 * (7 + 12)
+    assert honest.changes == {(None, 0, 0, 0): 3, (None, 1, 0, 0): 3, (None, 2, 0, 0): 1}
+    moved = recorded(["a"])
+    boxes = {s: b + [0, 9.0, 0, 0, 0, 0] if "a" in s else b for s, b in moved.boxes.items()}
+    attacked.add_stretch([moved, replace(moved, boxes=boxes)], "pgd")
+    assert attacked.changes == {("pgd", 0, 0, 6): 1, ("pgd", 1, 0, 6): 2, ("pgd", 2, 0, 6): 1}
+
+
 def test_a_calibration_survives_a_file(tmp_path):
     model = make_model()
     calibration = Calibration("x", "0" * 64, {"command": "none"}, (model, replace(model, pose_error_m=0.2)))
@@ -54,6 +65,7 @@ def test_a_calibration_survives_a_file(tmp_path):
     for before, after in zip(calibration.levels, again.levels, strict=True):
         assert after.kinds == before.kinds
         np.testing.assert_allclose(after.pairs, before.pairs, atol=1e-5)
+        np.testing.assert_allclose(after.changes, before.changes, atol=1e-5)
     assert again.at(0.0).pose_error_m == 0.0
     assert again.at(0.1).pose_error_m == 0.2
     with pytest.raises(CalibrationError, match=r"up to a pose error of 0\.2 m, 0\.3 m is asked for"):
@@ -109,8 +121,8 @@ def test_the_shipped_detector_finds_an_attacker(detector, ego_message, attacked)
 
 
 def test_reliability_compares_suspicion_with_the_truth():
-    frames = [(None, recorded()), ("pgd", recorded(["a"])), ("pgd", recorded(["b", "c"]))] * 4
-    bins = check(make_model(), iter(frames))
+    stretches = [(None, [recorded()]), ("pgd", [recorded(["a"])]), ("pgd", [recorded(["b", "c"])])] * 4
+    bins = check(make_model(), stretches)
     assert sum(b.teammates for b in bins) == 36
     assert bins[0].observed == 0.0
     assert bins[-1].observed == 1.0
@@ -134,7 +146,7 @@ def test_recipes_that_cannot_be(settings):
 
 def test_the_command_writes_a_calibration(tmp_path):
     out = tmp_path / "x.json"
-    arguments = ["--scenes", "1", "--check-scenes", "1", "--frames", "1", "--pose-error", "0", "--attack", "noise"]
+    arguments = ["--scenes", "1", "--check-scenes", "1", "--stretches", "1", "--pose-error", "0", "--attack", "noise"]
     result = CliRunner().invoke(app, ["calibrate", "--out", str(out), *arguments])
     assert result.exit_code == 0, result.output
     assert "scenes held out" in " ".join(result.output.split())

@@ -2,15 +2,26 @@ import numpy as np
 import pytest
 
 from robosac.calibration import TooFewVerdicts, Verdicts, fit
-from robosac.calibration.fit import LARGEST_RATIO
+from robosac.calibration.fit import LARGEST_CHANGE_RATIO, LARGEST_RATIO
 from robosac.defenses.group_testing import OPEN
-from robosac.defenses.group_testing.model import BINS, CELLS, CLEAN, LOSS_BINS, NOVELTY_BINS, SIZES
+from robosac.defenses.group_testing.model import (
+    BINS,
+    CELLS,
+    CHANGE_BINS,
+    CHANGE_SIZES,
+    CLEAN,
+    LOSS_BINS,
+    NOVELTY_BINS,
+    SIZES,
+)
 
 ALONE = [size for size, (a, _) in enumerate(SIZES) if a == 0]
 
 
 def make_verdicts(honest=2 * NOVELTY_BINS + 2, complementary=3 * NOVELTY_BINS + 5, erase=2 * NOVELTY_BINS):
-    """Honest pairs lose little and bring a few boxes, PGD destroys, an eraser brings nothing."""
+    """Honest pairs lose little and bring a few boxes, PGD destroys, an eraser brings nothing. Under PGD boxes come and
+    go; under an eraser they hold strangely still.
+    """
     verdicts = Verdicts()
     for size in range(len(SIZES)):
         verdicts.pairs[None, 0, size, honest] += 500
@@ -18,6 +29,10 @@ def make_verdicts(honest=2 * NOVELTY_BINS + 2, complementary=3 * NOVELTY_BINS + 
             verdicts.pairs[None, cell, size, complementary] += 500
             verdicts.pairs["pgd", cell, size, 10 * NOVELTY_BINS + 8] += 500
             verdicts.pairs["erase", cell, size, erase] += 500
+    for size in range(CHANGE_SIZES):
+        verdicts.changes[None, size, 3, 1] += 500
+        verdicts.changes["pgd", size, 3, 5] += 500
+        verdicts.changes["erase", size, 3, 0] += 500
     return verdicts
 
 
@@ -85,3 +100,24 @@ def test_where_nobody_was_complementary_it_makes_no_difference():
     beside = [size for size in range(len(SIZES)) if size not in ALONE]
     np.testing.assert_array_equal(model.pairs[3, beside], model.pairs[0, beside])
     assert not np.array_equal(model.pairs[2, beside], model.pairs[0, beside])
+
+
+def test_what_comes_and_goes_incriminates_and_what_stays_does_not():
+    model = fit(make_verdicts(), ["pgd", "erase"], 0.0)
+    np.testing.assert_allclose(model.changes.sum(axis=-1), 1.0)
+    assert (model.changes[0, :, 3].argmax(axis=-1) == 1).all()
+    np.testing.assert_array_equal(model.changes[3], model.changes[0])
+    ratio = np.log(model.changes[1:3] / model.changes[0])
+    assert (np.diff(ratio, axis=-1) >= -1e-9).all()
+    assert (ratio[0, :, 2:5, 5] > 2).all()
+    assert (ratio[0, :, 2:5, 1] < -1).all()
+    assert np.ptp(ratio, axis=-1).max() <= 2 * LARGEST_CHANGE_RATIO + 1e-9
+    np.testing.assert_allclose(ratio[:, :, 6], 0.0, atol=0.2)  # so many boxes were never seen
+    assert model.changes.shape[-1] == CHANGE_BINS
+
+
+def test_successive_frames_that_were_never_seen_are_said():
+    verdicts = make_verdicts()
+    del verdicts.changes["pgd", 2, 3, 5]
+    with pytest.raises(TooFewVerdicts, match="no successive frames of pgd with 3 in the fusion"):
+        fit(verdicts, ["pgd", "erase"], 0.0)

@@ -7,7 +7,17 @@ import numpy as np
 from robosac.consensus import Verdict
 from robosac.defenses import Outcome
 from robosac.defenses.group_testing import OPEN, EvidenceModel
-from robosac.defenses.group_testing.model import BINS, CELLS, CLEAN, LOSS_BINS, NOVELTY_BINS, SIZES
+from robosac.defenses.group_testing.model import (
+    BINS,
+    CELLS,
+    CHANGE_BINS,
+    CHANGE_SIZES,
+    CLEAN,
+    CROWD_BINS,
+    LOSS_BINS,
+    NOVELTY_BINS,
+    SIZES,
+)
 
 TEAM = ("car-2", "car-3", "car-4", "car-5", "rsu")
 SEEN = np.array([[10.0 * i, 5.0, 4.0, 2.0, 0.0, 0.9] for i in range(8)])
@@ -21,7 +31,7 @@ def shifted(subset: tuple[str, ...]) -> np.ndarray:
 
 def make_model(kinds=("pgd", "erase", OPEN)) -> EvidenceModel:
     """Unattacked outcomes low in loss, attacked ones the other way round; beside the ego alone, attacks of the kind
-    ``erase`` show nothing. Whose view is complementary makes no difference.
+    ``erase`` show nothing. Whose view is complementary makes no difference. Unattacked boxes come and go less.
     """
     loss = np.repeat(np.linspace(-2, 2, LOSS_BINS), NOVELTY_BINS)
     pairs = np.empty((CLEAN + CELLS * len(kinds), len(SIZES), BINS))
@@ -30,7 +40,14 @@ def make_model(kinds=("pgd", "erase", OPEN)) -> EvidenceModel:
         pairs[row : row + CELLS] = np.ones(BINS) if kind == OPEN else np.exp(loss)
         if kind == "erase":
             pairs[row : row + CELLS, [a == 0 for a, _ in SIZES]] = np.exp(-loss)
-    return EvidenceModel(0.0, tuple(kinds), pairs / pairs.sum(axis=-1, keepdims=True))
+    changes = np.ones((1 + len(kinds), CHANGE_SIZES, CROWD_BINS, CHANGE_BINS))
+    changes[0] = np.exp(-np.linspace(-3, 3, CHANGE_BINS))
+    return EvidenceModel(0.0, tuple(kinds), normal(pairs), normal(changes))
+
+
+def normal(table: np.ndarray) -> np.ndarray:
+    """So that each last axis sums to 1."""
+    return table / table.sum(axis=-1, keepdims=True)
 
 
 def outcome(subset: tuple[str, ...], attackers: Collection[str], *, reference=SEEN) -> Outcome:

@@ -3,6 +3,7 @@ import json
 import numpy as np
 import pytest
 
+from robosac.boxes import from_world, pose_matrix
 from robosac.budget import DomainError
 from robosac.consensus import Verdict
 from robosac.defenses import GroupTesting, Outcome, Reason, Source
@@ -49,11 +50,11 @@ def test_the_evidence_on_a_named_attacker_is_given_item_by_item(rng):
     against = [item for item in items if item["log_likelihood_ratio"] > 0]
     assert len({tuple(sorted([*i["teammates"], *i.get("joining", [])])) for i in against}) >= 2
     for item in items:
-        assert item["test"] in ("ego", "pair")
+        assert item["test"] in ("ego", "pair", "change")
         assert item["frame"] in range(3)
         assert ("jaccard_index" in item) == (item["test"] == "ego")
         assert ("joining" in item) == (item["test"] == "pair")
-        assert {"loss", "novelty"} <= set(item)
+        assert {"boxes", "changes"} <= set(item) if item["test"] == "change" else {"loss", "novelty"} <= set(item)
         assert item["teammates"]
 
 
@@ -117,6 +118,84 @@ def test_an_attacker_that_spoils_what_an_honest_one_joins_is_blamed_itself(rng):
     assert named(decision) == {"car-2"}
 
 
+class Flitting:
+    """A world in which an attacker adds boxes that nobody can check, somewhere else in every frame; the ego drives."""
+
+    def __init__(self, frames=range(100), attackers=("car-4",)):
+        self.frames, self.attackers = frames, attackers
+
+    def outcome(self, frame, subset):
+        pose = pose_matrix(3.0 * frame, 0.0, 0.0, 0.0)
+        added = np.array([[50.0, 20.0 + 9 * i + 2 * (frame % 3), 4.0, 2.0, 0.0, 0.9] for i in range(6)])
+        flitting = not set(self.attackers).isdisjoint(subset)
+        boxes = from_world(np.vstack([SEEN, added]) if flitting else SEEN, pose)
+        return Outcome(subset, 0.5, Verdict.CONSENSUS, boxes, from_world(SEEN, pose), pose, frame)
+
+    def last(self, defense, count=12):
+        rng, state = np.random.default_rng(0), defense.initial_state(TEAM)
+        for _, frame in zip(range(count), self.frames, strict=False):
+            decision, _ = run_frame(
+                defense, state, TEAM, [], rng, judge=lambda s, _, frame=frame: self.outcome(frame, s)
+            )
+            state = json.loads(json.dumps(decision.state))
+        return decision
+
+
+def test_boxes_that_come_and_go_give_an_attacker_away():
+    decision = Flitting().last(DEFENSE)
+    assert max(decision.suspicion, key=decision.suspicion.get) == "car-4"
+    assert decision.suspicion["car-4"] > 0.9
+    assert set(decision.accepted) == set(TEAM) - {"car-4"}
+    changes = [i for i in decision.state["memory"]["evidence"]["car-4"] if i["test"] == "change"]
+    against = [i for i in changes if "car-4" in i["teammates"]]
+    assert against
+    assert all((i["boxes"], i["changes"]) == (14, 12) and i["log_likelihood_ratio"] > 0 for i in against)
+
+
+def test_honest_boxes_stay_where_they_are():
+    honest = Flitting(attackers=()).last(DEFENSE)
+    apart = Flitting(attackers=()).last(GroupTesting(MODEL, compare_frames=False))
+    assert set(honest.accepted) == set(TEAM)
+    assert max(honest.suspicion.values()) < max(apart.suspicion.values())
+
+
+@pytest.mark.parametrize(
+    ("defense", "frames"),
+    [(GroupTesting(MODEL, compare_frames=False), range(100)), (DEFENSE, range(0, 100, 2)), (DEFENSE, [7] * 100)],
+)
+def test_frames_that_do_not_follow_on_one_another_are_not_compared(defense, frames):
+    decision = Flitting(frames).last(defense)
+    assert max(decision.suspicion.values()) < 0.5
+    assert set(decision.accepted) == set(TEAM)
+    assert bool(decision.state["memory"]["shown"]) == defense.compare_frames
+
+
+def test_an_empty_fusion_has_nothing_that_could_change():
+    def suspicion(defense):
+        state = defense.initial_state(TEAM)
+        for frame in range(3):
+            here = pose_matrix(0, 0, 0, 0), frame
+            decision, _ = run_frame(
+                defense,
+                state,
+                TEAM,
+                [],
+                np.random.default_rng(0),
+                judge=lambda subset, _, here=here: Outcome(subset, 0.0, Verdict.DISSENSUS, SEEN[:0], SEEN[:0], *here),
+            )
+            state = decision.state
+        return decision.suspicion
+
+    assert suspicion(DEFENSE) == suspicion(GroupTesting(MODEL, compare_frames=False))
+
+
+def test_what_an_older_version_remembered_is_taken_over(rng):
+    known, _ = run(DEFENSE, ["car-3"], 5, rng)
+    memory = {key: value for key, value in known.state["memory"].items() if not key.startswith("shown")}
+    later, _ = run(DEFENSE, ["car-3"], 1, rng, {**known.state, "memory": memory})
+    assert named(later) == {"car-3"}
+
+
 def test_an_ego_that_sees_nothing_falls_back_on_whom_it_trusts(rng):
     def blind(subset, attackers):
         return Outcome(subset, 0.0, Verdict.DISSENSUS, SEEN[:0], SEEN[:0])
@@ -159,7 +238,7 @@ def test_a_team_that_changes(rng):
     assert "car-3" not in back["trusted"]
     long_ago = {**without, "memory": {**without["memory"], "frame": int(20 * FORGETTING_FRAMES)}}
     stranger = DEFENSE.change_team(without, [*without["suspicion"], "new"])["suspicion"]["new"]
-    assert DEFENSE.change_team(long_ago, TEAM)["suspicion"]["car-3"] == pytest.approx(stranger, abs=1e-3)
+    assert DEFENSE.change_team(long_ago, TEAM)["suspicion"]["car-3"] == pytest.approx(stranger, abs=5e-3)
     assert 0.05 < stranger < 0.25
 
 

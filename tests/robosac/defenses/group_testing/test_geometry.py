@@ -1,7 +1,8 @@
 import numpy as np
 import pytest
 
-from robosac.defenses.group_testing.geometry import measure
+from robosac.boxes import pose_matrix
+from robosac.defenses.group_testing.geometry import changes, crowd, followed, measure
 from tests.robosac.defenses.group_testing.conversing import SEEN
 
 
@@ -32,3 +33,46 @@ def test_two_few_witnesses_are_no_evidence():
     faint = SEEN * [1, 1, 1, 1, 1, 0.4]
     assert measure(SEEN[:1], SEEN) is None
     assert measure(faint, SEEN) is None
+
+
+def kept(boxes=SEEN, pose=(0.0, 0.0, 0.0, 0.0)):
+    return followed(boxes, pose_matrix(*pose))
+
+
+def test_nothing_changes_for_an_ego_that_drives_past():
+    """What stands still in the world moves in the ego's frame."""
+    driven = SEEN - [6.0, 0, 0, 0, 0, 0]
+    assert changes(kept(), kept(driven, (6.0, 0.0, 0.0, 0.0))) == 0
+    assert changes(kept(), kept(driven)) == 2 * len(SEEN)
+
+
+def test_vehicles_drive_along_themselves_and_not_sideways():
+    forward, sideways, turned = SEEN + [2.9, 0, 0, 0, 0, 0], SEEN + [0, 0.9, 0, 0, 0, 0], SEEN + [0, 0, 0, 0, 0.5, 0]
+    assert changes(kept(), kept(forward)) == 0
+    assert changes(kept(), kept(sideways)) == 2 * len(SEEN)
+    assert changes(kept(), kept(turned)) == 2 * len(SEEN)
+    backward = SEEN + [0, 0, 0, 0, np.pi, 0]
+    assert changes(kept(), kept(backward)) == 0
+    north = SEEN * [0, 1, 1, 1, 1, 1] + [0, 0, 0, 0, np.pi / 2, 0]
+    assert changes(kept(north[:1]), kept(north[:1] + [0, 2.9, 0, 0, 0, 0])) == 0
+    assert changes(kept(north[:1]), kept(north[:1] + [2.9, 0, 0, 0, 0, 0])) == 2
+
+
+@pytest.mark.parametrize(("score", "came", "went", "counted"), [(0.6, 2, 2, 2), (0.4, 2, 0, 2), (0.2, 0, 0, 0)])
+def test_what_comes_and_goes_counts_from_a_score_on(score, came, went, counted):
+    more = np.vstack([SEEN, SEEN[:2] * [1, 1, 1, 1, 1, 0] + [0, 40.0, 0, 0, 0, score]])
+    assert changes(kept(), kept(more)) == came
+    assert changes(kept(more), kept()) == went
+    assert crowd(kept(more)) == len(SEEN) + counted
+
+
+def test_what_was_hardly_there_before_has_not_come():
+    faint = SEEN * [1, 1, 1, 1, 1, 0] + [0, 0, 0, 0, 0, 0.15]
+    assert changes(kept(faint), kept()) == 0
+    assert changes(kept(), kept(faint)) == 0
+    assert changes(kept(faint * [1, 1, 1, 1, 1, 0.5]), kept()) == len(SEEN)
+
+
+def test_nothing_changes_where_there_is_nothing():
+    assert changes(kept(SEEN[:0]), kept(SEEN[:0])) == 0
+    assert changes(kept(SEEN[:0]), kept()) == len(SEEN)

@@ -2,7 +2,20 @@ import numpy as np
 import pytest
 
 from robosac.defenses.group_testing import model as likelihoods
-from robosac.defenses.group_testing.model import BINS, CELLS, CLEAN, SIZES, EvidenceModel, size_row
+from robosac.defenses.group_testing.model import (
+    BINS,
+    CELLS,
+    CHANGE_BINS,
+    CHANGE_EDGES,
+    CHANGE_SIZES,
+    CLEAN,
+    CROWD_BINS,
+    CROWD_EDGES,
+    SIZES,
+    CalibrationError,
+    EvidenceModel,
+    size_row,
+)
 from tests.robosac.defenses.group_testing.conversing import make_model
 
 KINDS = 3
@@ -13,7 +26,8 @@ ROWS = CLEAN + CELLS * KINDS
 def model(rng, monkeypatch):
     """Likelihoods without any order, reckoned with bin by bin."""
     monkeypatch.setattr(likelihoods, "COARSE", (1, 1))
-    return EvidenceModel(0.0, ("x", "y", "z"), rng.dirichlet(np.ones(BINS), (ROWS, len(SIZES))))
+    changes = rng.dirichlet(np.ones(CHANGE_BINS), (1 + KINDS, CHANGE_SIZES, CROWD_BINS))
+    return EvidenceModel(0.0, ("x", "y", "z"), rng.dirichlet(np.ones(BINS), (ROWS, len(SIZES))), changes)
 
 
 def mutual_information(table, cells):
@@ -38,7 +52,7 @@ def test_coarser_bins_promise_less_but_not_nothing(model, rng, monkeypatch):
     a, d = np.full(12, 2), np.ones(12, dtype=int)
     exact = model.information(a, d, cells)
     monkeypatch.setattr(likelihoods, "COARSE", (2, 2))
-    coarse = EvidenceModel(0.0, model.kinds, model.pairs).information(a, d, cells)
+    coarse = EvidenceModel(0.0, model.kinds, model.pairs, model.changes).information(a, d, cells)
     assert (coarse <= exact).all()
     assert (coarse > 0).all()
 
@@ -60,3 +74,34 @@ def test_neither_the_kind_nor_whose_view_is_complementary_is_worth_knowing(model
 def test_larger_sizes_count_as_the_largest_told_apart():
     a, d = np.array([0, 0, 1, 3, 9]), np.array([1, 7, 3, 2, 9])
     assert [SIZES[row] for row in size_row(a, d)] == [(0, 1), (0, 5), (1, 3), (3, 2), (3, 2)]
+
+
+@pytest.mark.parametrize("size", [1, 3, 5, 9])
+def test_changes_are_as_likely_as_calibrated(model, size):
+    boxes, changes = CROWD_EDGES[1], CHANGE_EDGES[2] + 1
+    likelihood = model.change(size, boxes, changes)
+    table = model.changes[:, min(size, CHANGE_SIZES) - 1, 2, 3]
+    assert likelihood[:CLEAN] == pytest.approx([table[0]] * CLEAN)
+    assert likelihood[CLEAN:].reshape(KINDS, CELLS) == pytest.approx(np.repeat(table[1:, None], CELLS, axis=1))
+
+
+def test_what_changes_promise_is_the_mutual_information(model, rng):
+    cells = rng.dirichlet(np.full(ROWS, 0.3), 12)
+    cells.reshape(12, ROWS)[:, [c for c in range(CLEAN, ROWS) if (c - CLEAN) % CELLS]] = 0.0  # nobody is in a
+    cells /= cells.sum(axis=1, keepdims=True)
+    sizes, boxes = rng.integers(1, 9, 12), rng.integers(0, 50, 12)
+    expected = []
+    for size, number, cell in zip(sizes, boxes, cells, strict=True):
+        table = np.array([model.change(size, number, c) for c in (0, *CHANGE_EDGES)]).T
+        expected.append(mutual_information(table, cell))
+    assert model.change_information(sizes, boxes, cells) == pytest.approx(expected)
+    assert max(expected) > 0.1
+
+
+@pytest.mark.parametrize("table", ["pairs", "changes"])
+def test_tables_that_are_none_are_refused(model, table):
+    tables = {"pairs": model.pairs, "changes": model.changes}
+    with pytest.raises(CalibrationError, match=f"{table} must have the shape"):
+        EvidenceModel(0.0, model.kinds, **{**tables, table: tables[table][1:]})
+    with pytest.raises(CalibrationError, match=f"{table} must hold positive probabilities that sum to 1"):
+        EvidenceModel(0.0, model.kinds, **{**tables, table: tables[table] * 2})
