@@ -152,6 +152,16 @@ def test_boxes_that_come_and_go_give_an_attacker_away():
     assert all((i["boxes"], i["changes"]) == (14, 12) and i["log_likelihood_ratio"] > 0 for i in against)
 
 
+def test_only_what_the_latest_frame_showed_is_kept():
+    world, rng, state = Flitting(), np.random.default_rng(0), DEFENSE.initial_state(TEAM)
+    for frame in range(3):
+        decision, tested = run_frame(DEFENSE, state, TEAM, [], rng, judge=lambda s, _, f=frame: world.outcome(f, s))
+        state = decision.state
+        assert (len(state["memory"]["shown"]), state["memory"]["shown_in"]) == (len(tested), frame)
+    unseen, _ = run_frame(DEFENSE, state, TEAM, [], rng, most=0)
+    assert unseen.state["memory"]["shown"] == {}
+
+
 def test_honest_boxes_stay_where_they_are():
     honest = Flitting(attackers=()).last(DEFENSE)
     apart = Flitting(attackers=()).last(GroupTesting(MODEL, compare_frames=False))
