@@ -72,6 +72,11 @@ def test_a_defence_sees_what_was_decoded_and_what_it_was_compared_with():
     np.testing.assert_array_equal(outcome.reference, SEEN)
 
 
+def test_a_defence_is_told_where_the_ego_was_and_when():
+    result = run(FakeDetector(), frame=41)
+    assert all(o.frame == 41 and o.pose is EGO.pose for o in result.hypotheses)
+
+
 class Suspicious(Undefended):
     """Suspects one."""
 

@@ -5,10 +5,11 @@ import numpy as np
 import pytest
 from typer.testing import CliRunner
 
+from robosac.attacks import GaussianNoise
 from robosac.boxes import pose_matrix
 from robosac.calibration import Recipe, calibration_of
 from robosac.calibration.making import check
-from robosac.calibration.verdicts import Verdicts, complementary
+from robosac.calibration.verdicts import Verdicts, complementary, validation_stretches
 from robosac.cli import app
 from robosac.defenses import GroupTesting
 from robosac.defenses.group_testing import Calibration, CalibrationError
@@ -18,6 +19,7 @@ from robosac.evaluation.encounters import LiveFrame
 from robosac.evaluation.frames import EvaluationFrame
 from robosac.evaluation.playing import play
 from robosac.evaluation.recordings import RecordedFrame
+from robosac.scenes import IntersectionScene
 from tests.robosac.defenses.group_testing.conversing import SEEN, make_model, shifted
 
 INFO = DetectorInfo("fake", {"ego": {}, "teammate": {}}, (-32, -32, 32, 32), 2.0, "0", 0.5)
@@ -54,6 +56,18 @@ def test_successive_frames_show_what_comes_and_goes():
     boxes = {s: b + [0, 9.0, 0, 0, 0, 0] if "a" in s else b for s, b in moved.boxes.items()}
     attacked.add_stretch([moved, replace(moved, boxes=boxes)], "pgd")
     assert attacked.changes == {("pgd", 0, 0, 6): 1, ("pgd", 1, 0, 6): 2, ("pgd", 2, 0, 6): 1}
+
+
+def test_a_stretch_is_the_same_ego_and_attackers_in_successive_frames(detector):
+    scene, rng = IntersectionScene(1000), np.random.default_rng(0)
+    stretches = list(validation_stretches(detector, [1000], 2, {"noise": GaussianNoise()}, [2], 0.0, rng))
+    assert [kind for kind, _ in stretches] == [None, "noise"] * 2
+    for number, (_, stretch) in enumerate(stretches):
+        start, ego = number // 2 * 10, f"car-{number // 2 + 1}"
+        for offset, frame in enumerate(stretch):
+            np.testing.assert_array_equal(frame.pose, scene.frame(start + offset).views[ego].pose)
+            assert frame.attackers == stretch[0].attackers
+            assert len(frame.attackers) == (2 if number % 2 else 0)
 
 
 def test_a_calibration_survives_a_file(tmp_path):
