@@ -162,7 +162,8 @@ class GroupTestingSettings(_DefenseSettings):
     compare_frames: bool | None = Field(
         None,
         description="Whether boxes that come and go from frame to frame are evidence, as calibrated at 5 frames a "
-        f"second; by default if frame_period_ms is at most {COMPARABLE_PERIOD_MS:g}.",
+        "second and with exact poses of the ego; by default if frame_period_ms is at most "
+        f"{COMPARABLE_PERIOD_MS:g}.",
     )
 
     def at_period(self, frame_period_ms: float) -> Self:

@@ -297,7 +297,8 @@ class Sessions:
         if detector is None:
             raise Problem(503, "detector-unavailable", f"the session's detector {record.detector} is not served now")
         try:
-            defense = read_defense(record.defense).build(detector.info)
+            kept = read_defense(record.defense).at_period(record.frame_period_ms)
+            defense = kept.build(detector.info)
         except DomainError as error:
             detail = f"the session's detector {record.detector} no longer serves its defence: {error}"
             raise Problem(503, "detector-unavailable", detail) from error

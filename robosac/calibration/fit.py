@@ -32,9 +32,9 @@ UNIFORM_SHARE = 0.05
 PROJECTIONS = 50
 """Rounds of alternating projections."""
 LARGEST_RATIO = 4.0
-"""No comparison within a frame says more than this, as a natural logarithm of a likelihood ratio."""
+"""Logarithms of likelihood ratios are clipped here, before the rows are made to sum to 1 again."""
 LARGEST_CHANGE_RATIO = 3.0
-"""Nor one with the frame before more than this: it is made again and again."""
+"""Those of comparisons with the frame before, which are made again and again, are clipped here."""
 _FEW = 1e-12
 _KERNEL = (0.25, 0.5, 0.25)
 
@@ -48,13 +48,13 @@ def fit(verdicts: Verdicts, kinds: Sequence[str], pose_error_m: float) -> Eviden
 
     1. A histogram of attacked fusions, and of unattacked ones, is smoothed along each axis by [1/4 1/2 1/4], and mixed
        with a uniform one.
-    2. The ratio of attacked to unattacked is kept within ``exp(+-4)``.
+    2. The ratio of attacked to unattacked is clipped to ``exp(+-4)``.
     3. Beside the ego alone it is made not to fall with loss or novelty (isotonic regression): a fusion that agrees with
        the ego never incriminates, whatever attackers in the calibration did.
     4. The kind `OPEN` has a uniform histogram for every attacked pair.
     5. Where nobody was complementary, the histogram of all unattacked pairs stands.
     6. Of boxes that come and go there is a histogram for each number of boxes, smoothed over the neighbouring numbers.
-       Its ratio is kept within ``exp(+-3)`` and made not to fall with the changes, and `OPEN` shows what nobody's
+       Its ratio is clipped to ``exp(+-3)`` and made not to fall with the changes, and `OPEN` shows what nobody's
        attack shows: an attacker that is not among the kinds may well hold its boxes.
 
     Parameters

@@ -2,6 +2,7 @@ import pytest
 
 from robosac import wire
 from robosac.detectors.embedded import SHIPPED_WEIGHTS
+from service.schemas import GroupTestingSettings, read_defense
 from tests.service.conftest import TEAM, problem, serve
 
 
@@ -194,6 +195,12 @@ async def test_frames_far_apart_are_compared_only_if_asked_for(served, ego_messa
     state = await served.ego(session).state()
     assert state["defense"]["compare_frames"] is compared
     assert bool(state["state"]["memory"]["shown"]) is compared
+
+
+@pytest.mark.parametrize(("period_ms", "compared"), [(200.0, True), (500.0, False)])
+def test_a_session_stored_before_frames_were_compared_is_served_by_its_period(period_ms, compared):
+    stored = GroupTestingSettings().model_dump(mode="json", exclude={"compare_frames"})
+    assert read_defense(stored).at_period(period_ms).compare_frames is compared
 
 
 async def test_other_defences_have_no_suspicion(served, ego_message, benign):

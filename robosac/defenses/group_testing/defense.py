@@ -63,8 +63,9 @@ class GroupTesting:
     consensus_threshold : float
         Jaccard index from which on a subset may be answered without trust.
     compare_frames : bool
-        Whether what comes and goes from one frame to the next is evidence. Calibrated at 5 frames a second: where
-        they are farther apart, honest teammates would seem to attack.
+        Whether what comes and goes from one frame to the next is evidence. Calibrated at 5 frames a second, with an
+        ego that knows its own pose: where frames are farther apart, or the ego's pose jumps, honest teammates would
+        seem to attack.
 
     Raises
     ------

@@ -118,6 +118,8 @@ class JudgedFrame:
         self._team = team
         self._trusted = trusted
         self._compare_frames = compare_frames
+        if not compare_frames:
+            memory.shown = {}
         self._outcomes: list[Outcome] = []
         self._shown: dict[int, FloatArray] = {}
         self._ego_sees = self._ego_witnesses = True
@@ -162,6 +164,8 @@ class JudgedFrame:
         """Take in a decoded subset: the pairs it makes with the ego alone and with what this frame has shown already,
         and what has changed in it since the frame before.
         """
+        if outcome.frame != self._memory.shown_in + 1:  # nothing to compare with, nor to be promised
+            self._memory.shown = {}
         self._ego_sees = outcome.reference is not None and len(outcome.reference) >= MIN_WITNESSES
         findings = self._pairs(outcome)
         if outcome.reference is not None and outcome.boxes is not None:
@@ -194,7 +198,7 @@ class JudgedFrame:
             return []
         (key,) = (self._rows([outcome.teammates]) @ self._identities).tolist()
         self._shown[key] = now = followed(outcome.boxes, outcome.pose)
-        before = self._memory.shown.get(key) if outcome.frame == self._memory.shown_in + 1 else None
+        before = self._memory.shown.get(key)
         if before is None or max(crowd(before), crowd(now)) < MIN_WITNESSES:
             return []
         boxes, changed = crowd(now), changes(before, now)

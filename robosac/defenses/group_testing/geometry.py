@@ -78,9 +78,10 @@ def followed(boxes: FloatArray, pose: FloatArray) -> FloatArray:
     Returns
     -------
     (m, 4) ndarray
-        x, y, yaw, score, rounded to 1e-6, of the boxes with score >= .1.
+        x, y, yaw (up to half a turn, from -pi / 8 on), score, rounded to 1e-6, of the boxes with score >= .1.
     """
     placed = to_world(boxes[boxes[:, 5] >= KNOWN_SCORE], pose)
+    placed[:, 4] = (placed[:, 4] + np.pi / 8) % np.pi - np.pi / 8  # the seam where few vehicles head
     kept: FloatArray = placed[:, [0, 1, 4, 5]].round(6)
     return kept
 
@@ -93,8 +94,8 @@ def crowd(now: FloatArray) -> int:
 def changes(before: FloatArray, now: FloatArray) -> int:
     """Boxes that came or went between two frames of one fusion, (n, 4) and (m, 4), as `followed` gives them.
 
-    A box has come if it has a score >= .3 and before there was none of any score where it can have been; it has gone if
-    it had a score >= .5 and there is none where it can be. It can get as far as `ALONG_M`, `ACROSS_M` and `TURN_RAD`
+    A box has come if it has a score >= .3 and before none was kept where it can have been; it has gone if it had a
+    score >= .5 and none is kept where it can be. It can get as far as `ALONG_M`, `ACROSS_M` and `TURN_RAD`
     say; front and rear are not told apart. What is there stays, or drives on: made-up boxes, and boxes that a
     perturbed map shakes, come and go.
     """

@@ -6,6 +6,7 @@ from robosac.attacks import Erase, EraseStill, Invent, InventSteady, InventStill
 from robosac.attacks.adaptive import SPACING_M
 from robosac.boxes import pairwise_iou
 from robosac.consensus import at_least, compare
+from robosac.defenses.group_testing.geometry import changes, followed
 from robosac.detectors import GeometricSurface
 from robosac.evaluation.frames import encode_all
 from robosac.scenes import IntersectionScene
@@ -78,6 +79,21 @@ def test_a_steady_inventor_puts_cars_on_a_grid(fused):
 
     assert on_grid(InventSteady) >= 3
     assert on_grid(Invent) <= 1
+
+
+def test_what_a_steady_inventor_invents_is_still_there_in_the_next_frame(detector):
+    def changed(attack):
+        shown = []
+        for frame in IntersectionScene(8).frames(2):
+            benign = encode_all(detector, frame)
+            ego = benign.pop("car-1")
+            surface = detector.attack_surface(ego, benign)
+            sent = attack().run(surface, ["car-2"], np.random.default_rng(0))
+            received = {**benign, "car-2": detector.perturbed(benign["car-2"], sent["car-2"])}
+            shown.append(followed(detector.prepare(ego, received).detect(["car-2"]), ego.pose))
+        return changes(*shown)
+
+    assert changed(InventSteady) < 0.7 * changed(Invent)
 
 
 def test_without_anything_seen_a_steady_inventor_has_the_whole_grid():

@@ -73,6 +73,12 @@ def test_what_was_hardly_there_before_has_not_come():
     assert changes(kept(faint * [1, 1, 1, 1, 1, 0.5]), kept()) == len(SEEN)
 
 
+def test_rounding_does_not_turn_a_box_around():
+    west = SEEN + [0, 0, 0, 0, np.pi, 0]
+    np.testing.assert_array_equal(kept(west + [0, 0, 0, 0, 1e-9, 0]), kept(west - [0, 0, 0, 0, 1e-9, 0]))
+    assert changes(kept(west), kept(west)) == 0
+
+
 def test_nothing_changes_where_there_is_nothing():
     assert changes(kept(SEEN[:0]), kept(SEEN[:0])) == 0
     assert changes(kept(SEEN[:0]), kept()) == len(SEEN)
