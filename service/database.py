@@ -12,6 +12,7 @@ import asyncio
 import logging
 import os
 import sqlite3
+import time
 from collections.abc import Callable, Iterator
 from concurrent.futures import ThreadPoolExecutor
 from contextlib import contextmanager, suppress
@@ -34,6 +35,8 @@ Work = Callable[[Connection], T]
 
 BUSY_TIMEOUT_S = 5.0
 """How long SQLite waits for another process that writes."""
+BUSY_PAUSE_S = 0.01
+"""Between two attempts of what SQLite does not wait for by itself."""
 COMMAND_TIMEOUT_S = 10.0
 """How long PostgreSQL may take for a statement."""
 CONNECT_TIMEOUT_S = 5.0
@@ -224,9 +227,24 @@ def _prepare(connection: Any, _: object) -> None:
     """Leave transactions to us, and see that what is committed survives a power cut."""
     connection.isolation_level = None
     cursor = connection.cursor()
-    for setting in ("journal_mode = WAL", "synchronous = FULL", "foreign_keys = ON"):
+    _keep_a_journal(cursor)
+    for setting in ("synchronous = FULL", "foreign_keys = ON"):
         cursor.execute(f"PRAGMA {setting}")
     cursor.close()
+
+
+def _keep_a_journal(cursor: sqlite3.Cursor) -> None:
+    """WAL mode. Where several gateways set it at once in a new file, SQLite refuses all but one without waiting."""
+    until = time.monotonic() + BUSY_TIMEOUT_S
+    while True:
+        try:
+            cursor.execute("PRAGMA journal_mode = WAL")
+        except sqlite3.OperationalError as error:
+            if error.sqlite_errorcode != sqlite3.SQLITE_BUSY or time.monotonic() >= until:
+                raise
+            time.sleep(BUSY_PAUSE_S)
+        else:
+            return
 
 
 def _begin_immediate(connection: Connection) -> None:

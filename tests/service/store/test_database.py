@@ -4,6 +4,7 @@ import asyncio
 import contextlib
 import os
 import sqlite3
+import threading
 from pathlib import Path
 
 import pytest
@@ -17,7 +18,7 @@ from sqlalchemy import text
 
 from clients.errors import SessionNotFound
 from service import migrations
-from service.database import connect
+from service.database import _keep_a_journal, connect
 from service.sql_store import SqlStore
 from service.store import StoreUnavailable
 from service.tables import metadata
@@ -186,3 +187,31 @@ async def test_a_write_goes_on_when_who_asked_has_gone(store):
         await asking
     await store.log(sid, {"event": "note"})
     assert len(await check_chain(store, sid)) in (2, 3)
+
+
+def test_the_journal_is_waited_for_where_sqlite_does_not(tmp_path):
+    path = tmp_path / "robosac.db"
+    other = sqlite3.connect(path, check_same_thread=False)
+    other.execute("BEGIN EXCLUSIVE")
+    cursor = sqlite3.connect(path, timeout=0).cursor()
+    with pytest.raises(sqlite3.OperationalError, match="database is locked"):
+        cursor.execute("PRAGMA journal_mode = WAL")
+    release = threading.Timer(0.1, other.rollback)
+    release.start()
+    _keep_a_journal(cursor)
+    release.join()
+    assert cursor.execute("PRAGMA journal_mode").fetchone() == ("wal",)
+    cursor.connection.close()
+    other.close()
+
+
+def test_what_is_no_lock_is_not_waited_for(tmp_path):
+    path = tmp_path / "robosac.db"
+    path.touch()
+    attempts = []
+    connection = sqlite3.connect(f"file:{path}?mode=ro", uri=True)
+    connection.set_trace_callback(attempts.append)
+    with pytest.raises(sqlite3.OperationalError, match="readonly"):
+        _keep_a_journal(connection.cursor())
+    assert len(attempts) == 1
+    connection.close()
