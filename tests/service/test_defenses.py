@@ -1,8 +1,9 @@
+from dataclasses import replace
+
 import pytest
 
 from robosac import wire
 from robosac.detectors.embedded import SHIPPED_WEIGHTS
-from service.schemas import GroupTestingSettings, read_defense
 from tests.service.conftest import TEAM, problem, serve
 
 
@@ -198,9 +199,12 @@ async def test_frames_far_apart_are_compared_only_if_asked_for(served, ego_messa
 
 
 @pytest.mark.parametrize(("period_ms", "compared"), [(200.0, True), (500.0, False)])
-def test_a_session_stored_before_frames_were_compared_is_served_by_its_period(period_ms, compared):
-    stored = GroupTestingSettings().model_dump(mode="json", exclude={"compare_frames"})
-    assert read_defense(stored).at_period(period_ms).compare_frames is compared
+async def test_a_session_stored_before_frames_were_compared_is_served_by_its_period(served, period_ms, compared):
+    session = await served.open(defense={"kind": "group_testing"}, frame_period_ms=period_ms)
+    sessions = served.gateway.sessions
+    record = await sessions._store.get(session.session_id)
+    older = {name: value for name, value in record.defense.items() if name != "compare_frames"}
+    assert sessions._revive(replace(record, defense=older)).defense.compare_frames is compared
 
 
 async def test_other_defences_have_no_suspicion(served, ego_message, benign):
