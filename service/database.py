@@ -12,6 +12,7 @@ import asyncio
 import logging
 import os
 import sqlite3
+import threading
 import time
 from collections.abc import Callable, Iterator
 from concurrent.futures import ThreadPoolExecutor
@@ -47,6 +48,7 @@ _DRIVERS = {
     "postgresql": "postgresql+asyncpg",
     "postgresql+asyncpg": "postgresql+asyncpg",
 }
+_creating = threading.Lock()
 
 
 class Database(Protocol):
@@ -84,6 +86,8 @@ def read_url(text: str) -> URL:
         raise ValueError("not a database URL") from error
     if url.drivername not in _DRIVERS:
         raise ValueError(f"a database must be one of {', '.join(_DRIVERS)}, not {url.drivername}")
+    if url.get_backend_name() == "sqlite" and "uri" in url.query:  # which can turn locks off, and name no file
+        raise ValueError("a SQLite database is named by its path, not by a URI")
     return url.set(drivername=_DRIVERS[url.drivername])
 
 
@@ -253,10 +257,16 @@ def _begin_immediate(connection: Connection) -> None:
 
 
 def _create_for_us_alone(_dialect: object, _record: object, arguments: list[str], _options: object) -> None:
-    """The file holds secrets; SQLite would let everybody read it, and gives its own files the same rights."""
+    """The file holds secrets; SQLite would let everybody read it, and gives its own files the same rights.
+
+    A file that is there is never opened here. To close any descriptor of it drops all locks that this process holds on
+    it (POSIX), SQLite's too, and another process then takes the journal for left behind and deletes it
+    (https://sqlite.org/howtocorrupt.html, section 2.2). So nobody may connect between this creation and its close.
+    """
     if arguments[0] != ":memory:":
-        with suppress(OSError):  # SQLite explains it better
-            os.close(os.open(arguments[0], os.O_CREAT | os.O_RDWR, 0o600))
+        with _creating, suppress(OSError):  # it is there already, or SQLite explains it better
+            path = os.path.realpath(arguments[0])  # since a link that leads nowhere yet counts as there
+            os.close(os.open(path, os.O_CREAT | os.O_EXCL | os.O_WRONLY, 0o600))
 
 
 @contextmanager

@@ -4,6 +4,8 @@ import asyncio
 import contextlib
 import os
 import sqlite3
+import subprocess
+import sys
 import threading
 from pathlib import Path
 
@@ -106,7 +108,69 @@ async def test_the_file_is_its_owners_and_survives_a_power_cut(tmp_path):
         os.umask(before)
 
 
-@pytest.mark.parametrize("url", ["", "nonsense", "mysql://u:secret@h/d", "sqlite+pysqlite:///x"])
+ASKS_FOR_THE_FILE = """
+import fcntl, sys
+with open(sys.argv[1], "r+b") as file:
+    try:
+        fcntl.lockf(file, fcntl.LOCK_EX | fcntl.LOCK_NB)
+    except OSError:
+        print("held")
+"""
+
+
+def is_held(path):
+    """Whether this process holds a lock on a file; another one asks, since to close it here would drop all locks."""
+    command = [sys.executable, "-c", ASKS_FOR_THE_FILE, str(path)]
+    return subprocess.run(command, check=True, capture_output=True, text=True).stdout == "held\n"
+
+
+async def test_the_file_is_locked_as_long_as_it_is_open(tmp_path):
+    path = tmp_path / "robosac.db"
+    for number in range(2):
+        async with opened(f"sqlite:///{path}") as store:
+            assert is_held(path)
+            sid = await added(store, number)
+            await asyncio.gather(*(store.get(sid) for _ in range(20)))  # each reader opens the file
+            await asyncio.gather(*(store.log(sid, {"event": "note"}) for _ in range(20)))
+            assert is_held(path)
+            for threads in (store._database._writer, store._database._readers):
+                threads.engine.dispose()  # as after a fault: all connections are opened again
+            await store.get(sid)
+            await store.log(sid, {"event": "note"})
+            assert is_held(path)
+            async with opened(f"sqlite:///{path}") as second:
+                await second.get(sid)
+            assert is_held(path)
+        assert not is_held(path)
+
+
+async def test_what_another_process_reads_costs_no_decision(tmp_path):
+    """It would take itself for the last user and delete the journal, if nobody held a lock."""
+    path, copy = tmp_path / "robosac.db", tmp_path / "killed.db"
+    async with opened(f"sqlite:///{path}") as store:
+        sid = await added(store)
+        await store.get(sid)
+        reads = "import sqlite3, sys; sqlite3.connect(sys.argv[1]).execute('SELECT * FROM sessions').fetchall()"
+        subprocess.run([sys.executable, "-c", reads, str(path)], check=True)
+        for _ in range(3):
+            await store.log(sid, {"event": "note"})
+        for suffix in ("", "-wal"):  # what a kill would leave
+            subprocess.run(["cp", f"{path}{suffix}", f"{copy}{suffix}"], check=True)
+    with contextlib.closing(sqlite3.connect(copy)) as connection:
+        assert connection.execute("SELECT COUNT(*) FROM audit_lines").fetchone() == (4,)
+        assert connection.execute("PRAGMA integrity_check").fetchone() == ("ok",)
+
+
+async def test_a_new_file_behind_a_link_is_its_owners_too(tmp_path):
+    (tmp_path / "robosac.db").symlink_to(tmp_path / "kept.db")
+    async with opened(f"sqlite:///{tmp_path}/robosac.db") as store:
+        await added(store)
+        assert (tmp_path / "kept.db").stat().st_mode & 0o777 == 0o600
+
+
+@pytest.mark.parametrize(
+    "url", ["", "nonsense", "sqlite:///file:secret.db?uri=true", "mysql://u:secret@h/d", "sqlite+pysqlite:///x"]
+)
 def test_other_urls_are_refused_without_showing_them(url):
     with pytest.raises(ValueError, match="database") as caught:
         connect(url)
