@@ -1,4 +1,7 @@
+import contextlib
 import json
+import sqlite3
+from pathlib import Path
 
 import numpy as np
 import pytest
@@ -6,7 +9,9 @@ import typer
 from typer.testing import CliRunner
 
 from clients.client import FrameAnswer, OpenedSession
-from clients.crash_test import Driven, main
+from clients.crash_test import sqlite
+from clients.crash_test.__main__ import main
+from clients.crash_test.driven import Driven
 from robosac.audit import commitment, digest, seal
 
 SEEDS = ["ab" * 32, "cd" * 32]
@@ -39,14 +44,15 @@ def complaints(driven, lines):
     return [complaint for line in lines for complaint in driven.follow(line)]
 
 
-def test_two_kills_lose_nothing(tmp_path):
+def test_no_incident_loses_anything(tmp_path):
     app = typer.Typer()
     app.command()(main)
-    result = CliRunner().invoke(app, ["--kills", "2", "--out", str(tmp_path)])
+    result = CliRunner().invoke(app, ["--kills", "3", "--out", str(tmp_path)])
     assert result.exit_code == 0, result.output
     kills = json.loads((tmp_path / "crash_test.json").read_text())["kills"]
-    assert [kill["wrong"] for kill in kills] == [[], []]
-    assert sum(kill["acknowledged"] for kill in kills) >= 4
+    assert [kill["incident"] for kill in kills] == ["kill", "backup", "pair"]
+    assert [kill["wrong"] for kill in kills] == [[], [], []]
+    assert sum(kill["acknowledged"] for kill in kills) >= 6
     assert all(kill["unacknowledged"] >= 0 for kill in kills)
 
 
@@ -76,3 +82,34 @@ def test_boxes_count_too(driven):
     answer = FrameAnswer.parse({**ANSWER, "frame": 0, "boxes": np.ones((1, 6))})
     driven.acknowledged = {0: answer}
     assert any("another result" in one for one in complaints(driven, log(0)))
+
+
+def test_a_damaged_file_is_found_out(tmp_path):
+    path, copy = tmp_path / "robosac.db", tmp_path / "copy.db"
+    with contextlib.closing(sqlite3.connect(path)) as database:
+        database.execute("CREATE TABLE audit_lines (line)")
+        database.execute("CREATE INDEX by_line ON audit_lines (line)")
+        database.executemany("INSERT INTO audit_lines VALUES (?)", [(f"{n:0500}",) for n in range(50)])
+        database.commit()
+    assert sqlite.read_and_back_up(path, copy) == sqlite.integrity(copy) == sqlite.integrity(path) == []
+    content = bytearray(path.read_bytes())
+    content[5000:9000] = bytes(4000)
+    path.write_bytes(content)
+    assert sqlite.integrity(path)
+    assert sqlite.read_and_back_up(path, copy)
+    path.write_bytes(b"no database" * 500)
+    (complaint,) = sqlite.integrity(path)
+    assert "not a database" in complaint
+    (complaint,) = sqlite.read_and_back_up(path, copy)
+    assert "could not be backed up" in complaint
+
+
+def test_only_a_sqlite_file_is_backed_up(tmp_path):
+    assert sqlite.path_of("sqlite:////data/robosac.db?timeout=3") == Path("/data/robosac.db")
+    url = "postgresql://nobody@/x"
+    assert sqlite.path_of(url) is None
+    app = typer.Typer()
+    app.command()(main)
+    result = CliRunner().invoke(app, ["--incident", "backup", "--database-url", url])
+    assert result.exit_code == 2
+    assert "--incident" in result.output
