@@ -76,6 +76,7 @@ class Figures:
     steps: list[int] = field(default_factory=list)
     within_budget: int = 0
     deadline_met: int = 0
+    degraded: int = 0
     errors: Counter[str] = field(default_factory=Counter)
     stages: defaultdict[str, list[float]] = field(default_factory=lambda: defaultdict(list))
 
@@ -85,6 +86,7 @@ class Figures:
         self.steps.append(answer.sampling_steps)
         self.within_budget += latency_ms <= budget_ms
         self.deadline_met += answer.deadline_met
+        self.degraded += answer.degraded_by is not None
         for stage, milliseconds in answer.timings_ms.items():
             self.stages[stage].append(milliseconds)
 
@@ -101,6 +103,7 @@ class Figures:
             "latency_ms": {"p50": p50, "p95": p95, "p99": p99},
             "within_budget_share": self.within_budget / max(sent, 1),
             "deadline_met_share": self.deadline_met / max(sent, 1),
+            "degraded": self.degraded,
             "sampling_steps_mean": float(np.mean(self.steps)) if answered else None,
             "errors": dict(self.errors),
             "stages_ms": {stage: float(np.median(values)) for stage, values in self.stages.items()},

@@ -23,16 +23,17 @@ KEY_SETTINGS = ("ROBOSAC_API_KEYS", "ROBOSAC_API_KEYS_FILE")
 
 
 @contextlib.asynccontextmanager
-async def local_gateway(log: Path) -> AsyncIterator[str]:
+async def local_gateway(log: Path, api_key: str | None = None) -> AsyncIterator[str]:
     """Start ``uvicorn service.app:app``, wait until it is ready, yield its URL, and stop it.
 
-    It asks for no API key, whatever the environment says: it serves loopback only. It keeps its sessions where
-    ``ROBOSAC_DATABASE_URL`` says, else in a temporary folder that is removed afterwards.
+    It keeps its sessions where ``ROBOSAC_DATABASE_URL`` says, else in a temporary folder that is removed afterwards.
 
     Parameters
     ----------
     log : Path
         Takes what the gateway prints.
+    api_key : str, optional
+        As for `start_gateway`.
 
     Raises
     ------
@@ -41,7 +42,7 @@ async def local_gateway(log: Path) -> AsyncIterator[str]:
     """
     with tempfile.TemporaryDirectory(prefix="robosac-") as folder:
         database_url = os.environ.get("ROBOSAC_DATABASE_URL", f"sqlite:///{folder}/robosac.db")
-        process, url = start_gateway(log, database_url)
+        process, url = start_gateway(log, database_url, api_key)
         try:
             with _cancelled_by_sigterm():
                 await until_ready(url, process, log)
@@ -55,7 +56,7 @@ async def local_gateway(log: Path) -> AsyncIterator[str]:
                 process.wait()
 
 
-def start_gateway(log: Path, database_url: str) -> tuple[subprocess.Popen[bytes], str]:
+def start_gateway(log: Path, database_url: str, api_key: str | None = None) -> tuple[subprocess.Popen[bytes], str]:
     """Start a gateway on a free loopback port; its process and its URL.
 
     Parameters
@@ -63,12 +64,16 @@ def start_gateway(log: Path, database_url: str) -> tuple[subprocess.Popen[bytes]
     log : Path
         What the gateway prints is added to it.
     database_url : str
+    api_key : str, optional
+        The one that it asks for; by default it asks for none, whatever the environment says, and serves loopback only.
     """
     with socket.socket() as probe:
         probe.bind(("127.0.0.1", 0))
         port = probe.getsockname()[1]
     command = [sys.executable, "-m", "uvicorn", "service.app:app", "--host", "127.0.0.1", "--port", str(port)]
     environment = {name: value for name, value in os.environ.items() if name not in KEY_SETTINGS}
+    if api_key is not None:
+        environment["ROBOSAC_API_KEYS"] = api_key
     log.parent.mkdir(parents=True, exist_ok=True)
     with log.open("ab") as output:
         process = subprocess.Popen(

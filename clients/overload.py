@@ -30,6 +30,7 @@ from clients.client import MSGPACK, GatewayClient, VehicleClient
 from clients.errors import GatewayError
 from clients.load_test import DEFENSE, Bodies, Load, prepare, run_load
 from clients.local_gateway import local_gateway
+from clients.raw_http import read_response
 from clients.simulation import make_folder
 from robosac import wire
 from robosac.scenes import IntersectionScene
@@ -109,12 +110,12 @@ async def _ask(url: str, ego: VehicleClient, body: bytes, figures: OverloadFigur
         }
         lines = "".join(f"{name}: {value}\r\n" for name, value in head.items())
         writer.write(f"POST /v1/sessions/{ego.session_id}/frames HTTP/1.1\r\n{lines}\r\n".encode())
-        status, answer = await _response(reader)
+        status, answer = await read_response(reader)
         if status == 100:
             writer.write(body)
             await writer.drain()
             started = time.perf_counter()
-            status, answer = await _response(reader)
+            status, answer = await read_response(reader)
     except (OSError, asyncio.IncompleteReadError, ValueError) as error:
         figures.others[type(error).__name__] += 1
         return
@@ -128,13 +129,6 @@ async def _ask(url: str, ego: VehicleClient, body: bytes, figures: OverloadFigur
         figures.refused_ms.append(elapsed_ms)
     else:
         figures.others[str(status)] += 1
-
-
-async def _response(reader: asyncio.StreamReader) -> tuple[int, bytes]:
-    head = (await reader.readuntil(b"\r\n\r\n")).decode("latin-1").split("\r\n")
-    fields = {name.lower(): value.strip() for name, _, value in (line.partition(":") for line in head[1:] if line)}
-    status = int(head[0].split(" ", 2)[1])
-    return status, await reader.readexactly(int(fields.get("content-length", 0)))
 
 
 async def run_overload(

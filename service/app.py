@@ -21,10 +21,10 @@ from service.engine import Engine  # noqa: E402
 from service.frames import Frames  # noqa: E402
 from service.gateway import Gateway  # noqa: E402
 from service.identity import ApiKeys, LoopbackOnly, Tokens  # noqa: E402
-from service.limits import BodyLimit  # noqa: E402
+from service.limits import BodyLimit, HeadLimit  # noqa: E402
 from service.logs import logging_to_stderr  # noqa: E402
 from service.metrics import Metrics  # noqa: E402
-from service.routes import keyed, operations, v1  # noqa: E402
+from service.routes import operations, v1  # noqa: E402
 from service.sessions import Sessions  # noqa: E402
 from service.settings import Settings  # noqa: E402
 from service.sql_store import SqlStore  # noqa: E402
@@ -106,7 +106,7 @@ def create_app(
     if not api_keys:
         app.add_middleware(LoopbackOnly)
     app.add_middleware(Traced, tracing=tracing)
-    app.include_router(keyed)
+    app.add_middleware(HeadLimit)
     app.include_router(v1)
     app.include_router(operations)
     return app

@@ -1,4 +1,4 @@
-"""Bounds on request bodies, in bytes and in time, kept while they are read."""
+"""Bounds on requests: on the head, before anything looks at it, and on the body, in bytes and in time."""
 
 from __future__ import annotations
 
@@ -6,11 +6,14 @@ import asyncio
 
 from fastapi import Request
 from starlette.datastructures import Headers
-from starlette.exceptions import HTTPException
 from starlette.requests import ClientDisconnect
 from starlette.types import ASGIApp, Message, Receive, Scope, Send
 
 from service.problems import Problem
+
+TARGET_BYTES = 2048
+HEADERS = 128
+HEADER_BYTES = 32 * 1024
 
 
 def too_large(limit: int) -> Problem:
@@ -43,6 +46,30 @@ async def read_bounded(request: Request, limit: int) -> bytes:
     except ClientDisconnect as error:
         raise Problem(400, "incomplete-body", "the body ended before its announced length") from error
     return bytes(body)
+
+
+class HeadLimit:
+    """Refuses a request whose path, query or headers are absurdly long, since all that looks at them costs time."""
+
+    def __init__(self, app: ASGIApp) -> None:
+        self._app = app
+
+    async def __call__(self, scope: Scope, receive: Receive, send: Send) -> None:
+        problem = _absurd_head(scope) if scope["type"] == "http" else None
+        if problem is None:
+            await self._app(scope, receive, send)
+        else:
+            await problem.response()(scope, receive, send)
+
+
+def _absurd_head(scope: Scope) -> Problem | None:
+    headers, close = scope["headers"], {"Connection": "close"}
+    if len(scope["path"]) + len(scope["query_string"]) > TARGET_BYTES:
+        return Problem(414, "uri-too-long", f"a path and its query may have {TARGET_BYTES} bytes", headers=close)
+    if len(headers) > HEADERS or sum(len(name) + len(value) for name, value in headers) > HEADER_BYTES:
+        detail = f"at most {HEADERS} headers of {HEADER_BYTES} bytes together are read"
+        return Problem(431, "headers-too-large", detail, headers=close)
+    return None
 
 
 class BodyLimit:
@@ -84,11 +111,13 @@ class BodyLimit:
                     message = await receive()
             except TimeoutError as error:
                 # connection: close, as the rest of the body may still come, or never
-                raise HTTPException(408, "the body did not come in time", {"Connection": "close"}) from error
+                raise Problem(
+                    408, "slow-body", "the body did not come in time", headers={"Connection": "close"}
+                ) from error
             complete = not message.get("more_body", False)
             taken += len(message.get("body", b""))
             if taken > self._limit:
-                raise HTTPException(413, too_large(self._limit).detail)  # FastAPI lets no other pass here
+                raise too_large(self._limit)
             return message
 
         await self._app(scope, bounded, send)

@@ -118,9 +118,7 @@ def install(app: FastAPI) -> None:
 
     @app.exception_handler(HTTPException)
     async def _http(_: Request, error: HTTPException) -> JSONResponse:
-        phrase = HTTPStatus(error.status_code).phrase.lower().replace(" ", "-")
-        # 400 comes only from bodies that FastAPI cannot parse; Python 3.13 renamed the phrase of 413
-        slug = {400: "malformed-json", 408: "slow-body", 413: "too-large"}.get(error.status_code, phrase)
+        slug = HTTPStatus(error.status_code).phrase.lower().replace(" ", "-")  # of 404 and 405, where no route fits
         return Problem(error.status_code, slug, str(error.detail), headers=error.headers).response()
 
     @app.exception_handler(Exception)

@@ -8,11 +8,10 @@ from typing import Annotated, Any
 
 from fastapi import APIRouter, Depends, Header, Path, Query, Request, Response
 from fastapi.security import HTTPAuthorizationCredentials, HTTPBearer
-from starlette.exceptions import HTTPException
 
 from robosac import wire
+from service.bodies import MSGPACK, MSGPACK_TYPES, check_type, described, read_json
 from service.gateway import Gateway
-from service.identity import KeyedRoute
 from service.limits import read_bounded
 from service.live import Caller
 from service.problems import Problem, documented
@@ -29,11 +28,7 @@ from service.schemas import (
     TokenRenewed,
 )
 
-MSGPACK = "application/vnd.msgpack"
-MSGPACK_TYPES = (MSGPACK, "application/msgpack", "application/x-msgpack")
-
 v1 = APIRouter(prefix="/v1", responses=documented(422, 503))
-keyed = APIRouter(prefix="/v1", responses=documented(422, 503), route_class=KeyedRoute)
 operations = APIRouter()
 _bearer = HTTPBearer(auto_error=False, scheme_name="Token", description="A vehicle's token.")
 _api_key = HTTPBearer(auto_error=False, scheme_name="ApiKey", description="An API key, where the gateway has any.")
@@ -48,6 +43,12 @@ GatewayDep = Annotated[Gateway, Depends(_gateway)]
 Credentials = Annotated[HTTPAuthorizationCredentials | None, Depends(_bearer)]
 
 
+async def _opener(
+    gateway: GatewayDep, credentials: Annotated[HTTPAuthorizationCredentials | None, Depends(_api_key)]
+) -> None:
+    gateway.api_keys.check(credentials.credentials if credentials else None)
+
+
 async def _vehicle(sid: str, gateway: GatewayDep, credentials: Credentials) -> Caller:
     return await gateway.sessions.authenticate(sid, credentials.credentials if credentials else None)
 
@@ -59,6 +60,15 @@ async def _ego(sid: str, gateway: GatewayDep, credentials: Credentials) -> Calle
 Vehicle = Annotated[Caller, Depends(_vehicle)]
 Ego = Annotated[Caller, Depends(_ego)]
 
+
+async def _session_request(request: Request, _: Annotated[None, Depends(_opener)]) -> SessionRequest:
+    return await read_json(request, SessionRequest)
+
+
+async def _enrolment_request(request: Request, _: Ego) -> EnrolmentRequest:
+    return await read_json(request, EnrolmentRequest)
+
+
 _TENSOR_SCHEMA = {
     "type": "string",
     "format": "binary",
@@ -67,8 +77,9 @@ _TENSOR_SCHEMA = {
 }
 _TENSOR_BODY: dict[str, Any] = {"requestBody": {"required": True, "content": {MSGPACK: {"schema": _TENSOR_SCHEMA}}}}
 _EGO_PROBLEMS = documented(401, 403, 404)
+_JSON_PROBLEMS = (400, 408, 413, 415)
 _FRAME_RESPONSES: dict[int | str, dict[str, Any]] = {
-    **documented(400, 401, 403, 404, 409, 413, 415),
+    **documented(400, 401, 403, 404, 408, 409, 413, 415),
     200: {"model": FrameResult, "description": "The answer to the frame, as JSON or msgpack by `Accept`."},
 }
 
@@ -79,8 +90,15 @@ async def list_detectors(gateway: GatewayDep) -> DetectorList:
     return DetectorList(detectors=[DetectorEntry.of(detector.info) for detector in gateway.engine.detectors.values()])
 
 
-@keyed.post("/sessions", status_code=201, responses=documented(400, 401, 413), dependencies=[Depends(_api_key)])
-async def open_session(request: SessionRequest, gateway: GatewayDep) -> SessionCreated:
+@v1.post(
+    "/sessions",
+    status_code=201,
+    openapi_extra=described(SessionRequest),
+    responses=documented(*_JSON_PROBLEMS, 401),
+)
+async def open_session(
+    request: Annotated[SessionRequest, Depends(_session_request)], gateway: GatewayDep
+) -> SessionCreated:
     """Open a session of one ego with its teammates. The tokens are shown only in this answer."""
     return await gateway.sessions.open(request)
 
@@ -103,8 +121,15 @@ async def renew_token(caller: Vehicle, gateway: GatewayDep) -> TokenRenewed:
     return await gateway.teams.renew(caller)
 
 
-@v1.post("/sessions/{sid}/teammates", status_code=201, responses={**_EGO_PROBLEMS, **documented(400, 409)})
-async def enrol_teammates(request: EnrolmentRequest, caller: Ego, gateway: GatewayDep) -> TeamChanged:
+@v1.post(
+    "/sessions/{sid}/teammates",
+    status_code=201,
+    openapi_extra=described(EnrolmentRequest),
+    responses={**_EGO_PROBLEMS, **documented(*_JSON_PROBLEMS, 409)},
+)
+async def enrol_teammates(
+    request: Annotated[EnrolmentRequest, Depends(_enrolment_request)], caller: Ego, gateway: GatewayDep
+) -> TeamChanged:
     """Let teammates join from the next frame on. Their tokens are shown only in this answer."""
     return await gateway.teams.enrol(caller, request.teammates, request.public_keys)
 
@@ -190,18 +215,10 @@ async def metrics(gateway: GatewayDep) -> Response:
 async def _read_body(request: Request, caller: Caller, gateway: Gateway, *, whole_frame: bool) -> bytes:
     """The body of a tensor request, read only as far as the detector's layout allows; a refusal goes on record."""
     try:
-        media_type = request.headers.get("content-type", "").split(";")[0].strip().lower()
-        if media_type not in MSGPACK_TYPES:
-            raise Problem(415, "unsupported-media-type", f"send {MSGPACK}, not {media_type[:64] or 'an untyped body'}")
-        if "content-encoding" in request.headers:
-            raise Problem(415, "unsupported-encoding", "bodies must not be compressed", "content-encoding")
+        check_type(request, *MSGPACK_TYPES)
         return await read_bounded(request, gateway.frames.body_limit(caller, whole_frame=whole_frame))
     except Problem as problem:
         await gateway.frames.note_unread(caller, problem)
-        raise
-    except HTTPException as error:
-        slug = "slow-body" if error.status_code == 408 else "too-large"
-        await gateway.frames.note_unread(caller, Problem(error.status_code, slug, str(error.detail)))
         raise
 
 

@@ -2,6 +2,7 @@
 
 OpenMP threads that spin while they wait make a decoder pass several times slower on a machine with few, shared cores;
 and glibc's allocator, by default, returns every body of some MiB to the system and faults it in again for the next one.
+The number of open files is often bound to 1024, which as many idle connections would use up.
 """
 
 from __future__ import annotations
@@ -9,14 +10,19 @@ from __future__ import annotations
 import ctypes
 import os
 import sys
+from contextlib import suppress
 
 _M_TRIM_THRESHOLD = -1
 _M_MMAP_THRESHOLD = -3
 _KEEP_BYTES = 64 * 1024 * 1024
+_OPEN_FILES = 65_536
 
 
 def tune_process() -> None:
-    """Let idle OpenMP threads sleep, and keep freed memory; what the environment says already is left alone."""
+    """Let idle OpenMP threads sleep, keep freed memory, and allow as many open files as the system grants.
+
+    What the environment says already is left alone.
+    """
     os.environ.setdefault("OMP_WAIT_POLICY", "PASSIVE")
     os.environ.setdefault("KMP_BLOCKTIME", "0")
     if sys.platform == "linux" and not any(name.startswith("MALLOC_") for name in os.environ):
@@ -24,3 +30,11 @@ def tune_process() -> None:
         if mallopt is not None:
             mallopt(_M_MMAP_THRESHOLD, _KEEP_BYTES)
             mallopt(_M_TRIM_THRESHOLD, _KEEP_BYTES)
+    if sys.platform != "win32":
+        import resource  # noqa: PLC0415 (not there on Windows)
+
+        granted, most = resource.getrlimit(resource.RLIMIT_NOFILE)
+        wanted = _OPEN_FILES if most == resource.RLIM_INFINITY else min(_OPEN_FILES, most)
+        if granted != resource.RLIM_INFINITY and granted < wanted:
+            with suppress(OSError, ValueError):  # some systems grant less than they say
+                resource.setrlimit(resource.RLIMIT_NOFILE, (wanted, most))

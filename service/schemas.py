@@ -8,6 +8,7 @@ from typing import Annotated, Any, Literal, Self
 from pydantic import (
     AfterValidator,
     BaseModel,
+    BeforeValidator,
     ConfigDict,
     Field,
     StringConstraints,
@@ -35,6 +36,7 @@ from robosac.signatures import read_public_key
 
 COMPARABLE_PERIOD_MS = 250.0
 """Longest period of frames of which one is like the next, as calibrated at 200 ms."""
+MAX_KEYS = 1025
 VehicleId = Annotated[str, StringConstraints(pattern=r"^[A-Za-z0-9][A-Za-z0-9._:-]{0,63}$")]
 
 
@@ -216,9 +218,18 @@ def _check_key(key: str) -> str:
     return key
 
 
+def _check_number(keys: object) -> object:
+    if isinstance(keys, dict) and len(keys) > MAX_KEYS:  # else each of too many would be looked at first
+        raise ValueError(f"at most {MAX_KEYS} keys are allowed")
+    return keys
+
+
 PublicKeys = Annotated[
     dict[VehicleId, Annotated[str, AfterValidator(_check_key)]],
-    Field(max_length=1025, description="Ed25519 public keys, base64, of those vehicles that sign all their messages."),
+    BeforeValidator(_check_number),
+    Field(
+        max_length=MAX_KEYS, description="Ed25519 public keys, base64, of those vehicles that sign all their messages."
+    ),
 ]
 
 

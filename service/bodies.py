@@ -1,0 +1,86 @@
+"""What a request's body is read into, once its sender is known: every route asks for the credential first.
+
+FastAPI would read a body that it knows of before it asks for anything, and parse it on the event loop. So the routes
+declare none, and read theirs here.
+"""
+
+from __future__ import annotations
+
+import asyncio
+from typing import Any, TypeVar
+
+from fastapi import Request
+from fastapi.exceptions import RequestValidationError
+from pydantic import BaseModel, ValidationError
+
+from service.limits import read_bounded
+from service.problems import Problem
+
+JSON = "application/json"
+JSON_BYTES = 256 * 1024
+"""The largest JSON body: a team of 1024 with keys, or a defence's calibration, with room to spare."""
+SMALL_BYTES = 4 * 1024
+"""What is parsed on the event loop: for less than it costs to change threads."""
+MSGPACK = "application/vnd.msgpack"
+MSGPACK_TYPES = (MSGPACK, "application/msgpack", "application/x-msgpack")
+
+Model = TypeVar("Model", bound=BaseModel)
+
+
+def check_type(request: Request, *types: str) -> None:
+    """Refuse a body of another type than the first, or its other names.
+
+    Raises
+    ------
+    Problem
+        415.
+    """
+    media_type = request.headers.get("content-type", "").split(";")[0].strip().lower()
+    if media_type not in types:
+        detail = f"send {types[0]}, not {media_type[:64] or 'an untyped body'}"
+        raise Problem(415, "unsupported-media-type", detail, "content-type")
+    if "content-encoding" in request.headers:
+        raise Problem(415, "unsupported-encoding", "bodies must not be compressed", "content-encoding")
+
+
+async def read_json(request: Request, model: type[Model]) -> Model:
+    """A JSON body, checked against a model; a large one off the event loop.
+
+    Raises
+    ------
+    Problem
+        413, 415, or as `service.limits.read_bounded`.
+    RequestValidationError
+        If it is not JSON, or not what the model says.
+    """
+    check_type(request, JSON)
+    body = await read_bounded(request, JSON_BYTES)
+    if len(body) <= SMALL_BYTES:
+        return _parsed(body, model)
+    return await asyncio.to_thread(_parsed, body, model)
+
+
+def described(model: type[BaseModel]) -> dict[str, Any]:
+    """A JSON body in the OpenAPI description of a route that reads it with `read_json`."""
+    schema = model.model_json_schema()
+    definitions = schema.pop("$defs", {})
+    return {"requestBody": {"required": True, "content": {JSON: {"schema": _in_full(schema, definitions)}}}}
+
+
+def _parsed(body: bytes, model: type[Model]) -> Model:
+    try:
+        return model.model_validate_json(body)
+    except ValidationError as error:
+        raise RequestValidationError(error.errors(include_url=False, include_input=False)) from None
+
+
+def _in_full(node: Any, definitions: dict[str, Any]) -> Any:
+    """A schema with its definitions in the place of references, which OpenAPI would look for elsewhere."""
+    if isinstance(node, list):
+        return [_in_full(part, definitions) for part in node]
+    if not isinstance(node, dict):
+        return node
+    parts = {name: _in_full(part, definitions) for name, part in node.items() if name not in ("$ref", "discriminator")}
+    if "$ref" in node:
+        parts = _in_full(definitions[node["$ref"].rpartition("/")[2]], definitions) | parts
+    return parts

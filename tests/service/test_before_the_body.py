@@ -1,0 +1,201 @@
+"""Nobody's body is read before its sender is known, and no request costs much before it is looked at."""
+
+import asyncio
+import json
+import sys
+import threading
+
+import pytest
+from cryptography.hazmat.primitives.asymmetric.ed25519 import Ed25519PrivateKey
+
+from robosac.signatures import show_public_key
+from service import bodies, schemas
+from service.app import create_app
+from service.limits import HEADER_BYTES, HEADERS, TARGET_BYTES
+from service.settings import Settings
+from tests.service.conftest import problem, serve
+from tests.service.test_identity import ANYBODY, EGO_ONLY, KEY, KEY_HOLDER, OTHER_KEY, RULES, bearer
+
+JSON = {"Content-Type": "application/json"}
+
+
+async def unread():
+    pytest.fail("the body was asked for")
+    yield b""
+
+
+async def head(served, method, path, media_type, size, credential=None):
+    """Ask with headers that announce a body, which must not be asked for."""
+    headers = {"Content-Type": media_type, "Content-Length": str(size), **bearer(credential)}
+    return await served.http.request(method, path, headers=headers, content=unread())
+
+
+@pytest.mark.parametrize("media_type", ["application/json", "application/vnd.msgpack"])
+@pytest.mark.parametrize("route", [route for route, rule in RULES.items() if rule != ANYBODY])
+async def test_strangers_are_refused_from_their_headers_alone(route, media_type):
+    method, path = route.split()
+    async with serve(api_key=KEY, api_keys=KEY) as served:
+        session, other = await served.open(), await served.open()
+        path = path.format(sid=session.session_id, vehicle_id="car-3", frame=0)
+        strangers = [None, "x", "y" * 5000, other.ego_token, other.teammate_tokens["car-2"]]
+        strangers += [session.ego_token, OTHER_KEY] if RULES[route] == KEY_HOLDER else [KEY]
+        for size in (100, bodies.JSON_BYTES, Settings().max_body_bytes):
+            for credential in strangers:
+                problem(await head(served, method, path, media_type, size, credential), 401, "unauthenticated")
+        if RULES[route] == EGO_ONLY:
+            token = session.teammate_tokens["car-2"]
+            problem(await head(served, method, path, media_type, size, token), 403, "ego-only")
+
+
+@pytest.mark.parametrize("route", [route for route, rule in RULES.items() if rule == ANYBODY])
+async def test_a_body_that_nobody_needs_is_not_read(route, served):
+    assert (await head(served, *route.split(), "application/json", Settings().max_body_bytes)).status_code == 200
+
+
+def test_no_route_leaves_its_body_to_the_framework():
+    """Which reads it before the credential is asked for."""
+
+    def bodies_of(router):
+        for route in getattr(router, "original_router", router).routes:
+            if hasattr(getattr(route, "original_router", route), "routes"):
+                yield from bodies_of(route)
+            else:
+                yield route.path, getattr(route, "body_field", None) is not None
+
+    app = create_app(Settings())
+
+    @app.post("/an-example")
+    async def example(fields: dict[str, int]) -> None: ...
+
+    found = list(bodies_of(app.router))
+    assert {path for path, _ in found} == {route.split()[1] for route in RULES} | {"/an-example"}
+    assert [path for path, has_body in found if has_body] == ["/an-example"]
+
+
+def enrolment(number):
+    names = [f"{i:04d}" + "x" * 60 for i in range(number)]
+    return {"teammates": names, "public_keys": dict.fromkeys(names, show_public_key(Ed25519PrivateKey.generate()))}
+
+
+async def test_the_largest_honest_requests_are_taken_and_larger_ones_not_read():
+    async with serve(max_teammates=1024) as served:
+        opening = {"ego_id": "e" * 64, **enrolment(1024)}
+        response = await served.http.post("/v1/sessions", json=opening)
+        assert response.status_code == 201, response.text
+        calibration = [i / 10_000 + 1e-9 for i in range(10_000)]
+        defense = {"kind": "conformal", "calibration": calibration}
+        response = await served.http.post("/v1/sessions", json={"ego_id": "a", "teammates": ["b"], "defense": defense})
+        assert response.status_code == 201, response.text
+        session = await served.client.open_session("a", [])
+        path, ego = f"/v1/sessions/{session.session_id}/teammates", bearer(session.ego_token)
+        response = await served.http.post(path, json=enrolment(1024), headers=ego)
+        assert response.status_code == 201, response.text
+        for where, credential in (("/v1/sessions", None), (path, session.ego_token)):
+            refused = await head(served, "POST", where, "application/json", bodies.JSON_BYTES + 1, credential)
+            assert str(bodies.JSON_BYTES) in problem(refused, 413, "too-large")["detail"]
+
+            async def endless():
+                while True:
+                    yield b"[" * 10_000
+
+            refused = await served.http.post(where, content=endless(), headers=JSON | bearer(credential))
+            problem(refused, 413, "too-large")
+
+
+@pytest.mark.parametrize(("number", "on_the_loop"), [(2, True), (200, False)])
+async def test_large_json_is_parsed_off_the_event_loop(number, on_the_loop, monkeypatch):
+    threads = set()
+
+    def noting(key, check=schemas.read_public_key):
+        threads.add(threading.current_thread())
+        return check(key)
+
+    monkeypatch.setattr("service.schemas.read_public_key", noting)
+    async with serve(max_teammates=1024) as served:
+        response = await served.http.post("/v1/sessions", json={"ego_id": "a", **enrolment(number)})
+        assert response.status_code == 201
+    assert (threading.current_thread() in threads) is on_the_loop
+    assert len(threads) == 1
+
+
+@pytest.mark.parametrize("path", ["/v1/sessions", "/v1/sessions/{sid}/teammates"])
+@pytest.mark.parametrize(
+    ("headers", "slug"),
+    [
+        ({}, "unsupported-media-type"),
+        ({"Content-Type": "text/plain"}, "unsupported-media-type"),
+        ({"Content-Type": "application/vnd.msgpack"}, "unsupported-media-type"),
+        (JSON | {"Content-Encoding": "gzip"}, "unsupported-encoding"),
+    ],
+)
+async def test_json_is_asked_for_by_name(served, path, headers, slug):
+    session = await served.open()
+    body = json.dumps({"ego_id": "a", "teammates": ["b"]})
+    where = path.format(sid=session.session_id)
+    refused = await served.http.post(where, content=body, headers=headers | bearer(session.ego_token))
+    detail = problem(refused, 415, slug)["detail"]
+    assert slug == "unsupported-encoding" or "send application/json" in detail
+    charset = {"Content-Type": "Application/JSON; charset=utf-8"}
+    assert (await served.http.post("/v1/sessions", content=body, headers=charset)).status_code == 201
+
+
+@pytest.mark.parametrize(
+    ("body", "status", "slug", "field"),
+    [
+        (b"", 400, "malformed-json", None),
+        (b"{", 400, "malformed-json", None),
+        (b"\xff", 400, "malformed-json", None),
+        (b'"\\ud800"', 400, "malformed-json", None),
+        (b"[" * 100_000, 400, "malformed-json", None),
+        (b'{"ego_id": "a", "teammates": []} []', 400, "malformed-json", None),
+        (b"null", 422, "invalid-request", "body"),
+        (b'{"ego_id": "a"}', 422, "invalid-request", "teammates"),
+        (b'{"ego_id": "a", "teammates": ["b", 3]}', 422, "invalid-request", "teammates.1"),
+        (b'{"ego_id": "a", "teammates": [], "gather_ms": NaN}', 422, "invalid-request", "gather_ms"),
+        (b'{"ego_id": "a", "teammates": [], "defense": {"kind": "a2cp", "ratios": 3}}',
+         422, "invalid-request", "defense.ratios"),
+        (json.dumps({"ego_id": "a", "teammates": ["b"], "public_keys": {str(i): "" for i in range(2000)}}).encode(),
+         422, "invalid-request", "public_keys"),
+    ],
+)  # fmt: skip
+async def test_bad_json_is_told_where(served, body, status, slug, field):
+    refused = await served.http.post("/v1/sessions", content=body, headers=JSON)
+    assert problem(refused, status, slug).get("field") == field
+
+
+async def test_the_description_says_what_to_send(served):
+    paths = (await served.http.get("/openapi.json")).json()["paths"]
+    for path, name in (("/v1/sessions", "ego_id"), ("/v1/sessions/{sid}/teammates", "teammates")):
+        schema = paths[path]["post"]["requestBody"]["content"]["application/json"]["schema"]
+        assert name in schema["required"]
+        assert "$ref" not in json.dumps(schema)
+    kinds = paths["/v1/sessions"]["post"]["requestBody"]["content"]["application/json"]["schema"]
+    assert "group_testing" in json.dumps(kinds["properties"]["defense"])
+
+
+@pytest.mark.parametrize(
+    ("target", "headers", "status"),
+    [
+        ("/healthz?" + "a&" * (TARGET_BYTES // 2), {}, 414),
+        ("/v1/sessions/" + "a" * TARGET_BYTES, {}, 414),
+        ("/healthz", {f"x-{i}": "y" for i in range(HEADERS)}, 431),
+        ("/healthz", {"Authorization": "Bearer " + "x" * HEADER_BYTES}, 431),
+    ],
+)
+async def test_absurd_heads_are_refused(served, target, headers, status):
+    refused = await served.http.get(target, headers=headers)
+    problem(refused, status, {414: "uri-too-long", 431: "headers-too-large"}[status])
+    assert refused.headers["connection"] == "close"
+    assert (await served.http.get("/healthz?" + "a&" * 500, headers={"x": "y" * 10_000})).status_code == 200
+
+
+@pytest.mark.skipif(sys.platform == "win32", reason="no such limit")
+async def test_idle_connections_do_not_use_up_a_small_limit_of_open_files():
+    """The limit of 1024 that many systems begin with is raised as far as they grant."""
+    code = (
+        "import resource as r\n_, most = r.getrlimit(r.RLIMIT_NOFILE)\nr.setrlimit(r.RLIMIT_NOFILE, (256, most))\n"
+        "from service.runtime import tune_process\ntune_process()\n"
+        "granted, most = r.getrlimit(r.RLIMIT_NOFILE)\nprint(granted == (65536 if most < 0 else min(65536, most)))"
+    )
+    process = await asyncio.create_subprocess_exec(sys.executable, "-c", code, stdout=asyncio.subprocess.PIPE)
+    assert (await process.communicate())[0].strip() == b"True"
