@@ -18,6 +18,7 @@ from robosac.boxes import FloatArray
 from robosac.consensus import Verdict, at_least, compare
 from robosac.defenses import Decision, Defense, Hypothesis, Outcome, Reason, Reference, Rejection, Source, State
 from robosac.detectors import Message, PreparedFrame, Preparer
+from robosac.faults import describe
 from robosac.previous import PreviousAnswer
 
 logger = logging.getLogger(__name__)
@@ -52,7 +53,7 @@ class FusionResult:
     out_of_time : bool
         Whether the defence was cut short to meet the deadline.
     fault : str or None
-        What went wrong inside, if anything; the boxes are then the ego's own.
+        What went wrong inside (`robosac.faults.describe`), if anything; the boxes are then the ego's own.
     timings_ms : mapping of stage to float
         ``prepare``, ``ego_only``, ``hypotheses`` (decoding), ``consensus`` (matching).
     state : mapping
@@ -160,7 +161,7 @@ class _FrameRun:
             boxes = self._decode(prepared, decision.accepted)
         except Exception as error:
             logger.exception("fusion failed; answering with the ego's own perception")
-            self.fault = f"{type(error).__name__}: {error}"
+            self.fault = describe(error)
             rejected = {name: Rejection(Reason.NOT_SAMPLED, {"fault": self.fault}) for name in team}
             decision = Decision((), Source.EGO_ONLY, rejected, None, state)
             boxes = self._decode(self._prepare({}), ())

@@ -59,7 +59,8 @@ def create_app(
     engine = Engine(settings.torch_threads, settings.extra_detectors)
     metrics = Metrics()
     store = SqlStore(settings.database_url)
-    api_keys, tokens = ApiKeys.configured(settings), Tokens.configured(settings)
+    keys = ApiKeys.read(settings)
+    api_keys, tokens = ApiKeys(keys), Tokens.configured(settings)
     sessions = Sessions(settings, store, engine, metrics, tokens, seeds)
     teams = Teams(settings, sessions, store, tokens)
     admission = Admission()
@@ -69,7 +70,8 @@ def create_app(
 
     @contextlib.asynccontextmanager
     async def lifespan(_: FastAPI) -> AsyncIterator[None]:
-        with logging_to_stderr(settings):
+        secrets = [*keys, *(secret.get_secret_value() for secret in settings.token_secrets)]
+        with logging_to_stderr(settings, secrets):
             if not api_keys:
                 logger.warning("no API key is set (ROBOSAC_API_KEYS): only requests from this machine are served")
             try:

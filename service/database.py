@@ -27,6 +27,7 @@ from sqlalchemy.exc import ArgumentError, SQLAlchemyError
 from sqlalchemy.ext.asyncio import create_async_engine
 from sqlalchemy.pool import QueuePool
 
+from robosac.faults import describe
 from service.store import StoreUnavailable
 
 logger = logging.getLogger(__name__)
@@ -274,5 +275,6 @@ def _unavailable() -> Iterator[None]:
     try:
         yield
     except (SQLAlchemyError, asyncpg.PostgresError, asyncpg.InterfaceError, sqlite3.Error, OSError) as error:
-        logger.error("the database failed: %s: %s", type(error).__name__, getattr(error, "orig", error))
+        cause = getattr(error, "orig", None) or error
+        logger.error("the database failed: %s", describe(cause))
         raise StoreUnavailable(type(error).__name__) from error

@@ -55,8 +55,8 @@ class ApiKeys:
     def __init__(self, keys: Sequence[str]) -> None:
         self._digests = [sha256(key.encode()).digest() for key in keys]
 
-    @classmethod
-    def configured(cls, settings: Settings) -> ApiKeys:
+    @staticmethod
+    def read(settings: Settings) -> list[str]:
         """The keys of the settings and of the file that they name.
 
         Raises
@@ -80,7 +80,7 @@ class ApiKeys:
                 raise ValueError(f"{where} has fewer than {API_KEY_LENGTH} characters")
             if not _BEARER_TOKEN.fullmatch(key):
                 raise ValueError(f"{where} has characters other than A-Z a-z 0-9 . _ ~ + / - and = at the end")
-        return cls([key for _, key in named])
+        return [key for _, key in named]
 
     def __bool__(self) -> bool:
         return bool(self._digests)

@@ -1,17 +1,33 @@
-"""Structured logs: one event a line, with its fields; never tensors, tokens or keys."""
+"""Structured logs: one event a line, with its fields; never tensors, tokens or keys.
+
+An exception is logged without local variables, and all of a line in bounded size: the innermost calls of the latest
+exceptions of a chain, each with its message in short (`robosac.faults`).
+"""
 
 from __future__ import annotations
 
 import logging
+import re
 import sys
-from collections.abc import Iterator
+import traceback
+from collections.abc import Iterator, Sequence
 from contextlib import contextmanager
+from types import TracebackType
 
 import structlog
 
+from robosac.faults import describe, in_short
 from service.settings import Settings
 
+CHAIN = 3
+"""Exceptions that are shown of a chain, from the latest."""
+CALLS = 8
+"""Calls that are shown of each, from the innermost."""
+CALL_CHARS = 240
+VALUE_CHARS = 1024
+"""What is kept of any other field."""
 _OWN = ("service", "robosac")
+_RUNTIME = ("asyncio", "concurrent.futures", "sqlalchemy")
 _SERVER = ("uvicorn", "uvicorn.error", "uvicorn.access")
 _SHARED: list[structlog.types.Processor] = [
     structlog.stdlib.add_log_level,
@@ -42,24 +58,33 @@ class _Stderr(logging.StreamHandler):  # type: ignore[type-arg]
 
 
 @contextmanager
-def logging_to_stderr(settings: Settings) -> Iterator[None]:
-    """Write the gateway's and the server's events to standard error for the length of a block."""
+def logging_to_stderr(settings: Settings, secrets: Sequence[str] = ()) -> Iterator[None]:
+    """Write the gateway's and the server's events to standard error for the length of a block, but no such secret."""
     renderer: structlog.types.Processor = (
         structlog.processors.JSONRenderer() if settings.log_format == "json" else structlog.dev.ConsoleRenderer()
     )
-    final: list[structlog.types.Processor] = [structlog.stdlib.ProcessorFormatter.remove_processors_meta]
-    if settings.log_format == "json":
-        final.append(structlog.processors.dict_tracebacks)
     handler = _Stderr()
-    handler.setFormatter(structlog.stdlib.ProcessorFormatter(foreign_pre_chain=_SHARED, processors=[*final, renderer]))
-    loggers = [logging.getLogger(name) for name in (*_OWN, *_SERVER)]
+    handler.setFormatter(
+        structlog.stdlib.ProcessorFormatter(
+            foreign_pre_chain=[*_SHARED, _message_in_short],
+            processors=[
+                structlog.stdlib.ProcessorFormatter.remove_processors_meta,
+                structlog.processors.ExceptionRenderer(_traceback),
+                _Bounded(secrets),
+                renderer,
+            ],
+        )
+    )
+    loggers = [logging.getLogger(name) for name in (*_OWN, *_RUNTIME, *_SERVER)]
     before = [(logger, list(logger.handlers), logger.level, logger.propagate) for logger in loggers]
     for logger in loggers:
-        if logger.name in _OWN:
-            logger.setLevel(settings.log_level.upper())
+        if logger.name in _SERVER:
+            if logger.handlers or logger.name == "uvicorn":
+                logger.handlers = [handler]
+        else:
             logger.addHandler(handler)
-        elif logger.handlers or logger.name == "uvicorn":
-            logger.handlers = [handler]
+            if logger.name in _OWN:
+                logger.setLevel(settings.log_level.upper())
     try:
         yield
     finally:
@@ -67,3 +92,46 @@ def logging_to_stderr(settings: Settings) -> Iterator[None]:
             logger.handlers = handlers
             logger.setLevel(level)
             logger.propagate = propagate
+
+
+class _Bounded:
+    """Cuts what is long, and takes known secrets out."""
+
+    def __init__(self, secrets: Sequence[str]) -> None:
+        longest_first = sorted(filter(None, secrets), key=len, reverse=True)
+        self._secrets = re.compile("|".join(map(re.escape, longest_first))) if longest_first else None
+
+    def __call__(self, _: object, __: str, event: structlog.types.EventDict) -> structlog.types.EventDict:
+        return {
+            name: self._clean(value, VALUE_CHARS if name != "exception" else CHAIN * (CALLS + 1) * CALL_CHARS)
+            for name, value in event.items()
+        }
+
+    def _clean(self, value: object, most: int) -> object:
+        if not isinstance(value, str):
+            return value
+        if self._secrets is not None:
+            value = self._secrets.sub("<...>", value)
+        return value if len(value) <= most else value[: most - 3] + "..."
+
+
+def _message_in_short(_: object, __: str, event: structlog.types.EventDict) -> structlog.types.EventDict:
+    """What the runtime says of a failure holds the failure's own message."""
+    return {**event, "event": in_short(event["event"])}
+
+
+def _traceback(exc_info: tuple[type[BaseException], BaseException, TracebackType | None]) -> str:
+    """The latest exceptions of a chain, each above its innermost calls, the innermost last."""
+    parts: list[str] = []
+    error: BaseException | None = exc_info[1]
+    for _ in range(CHAIN):
+        if error is None:
+            break
+        calls = traceback.extract_tb(error.__traceback__, limit=-CALLS)
+        shown = (f"  {call.filename}:{call.lineno} in {call.name}: {call.line}" for call in calls)
+        parts.append("\n".join([describe(error), *(line[:CALL_CHARS] for line in shown)]))
+        if isinstance(error, BaseExceptionGroup):
+            error = error.exceptions[0]
+        else:
+            error = error.__cause__ or (None if error.__suppress_context__ else error.__context__)
+    return "\nfrom ".join(parts)

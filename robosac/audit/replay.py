@@ -16,6 +16,7 @@ from robosac.audit.records import FrameAnswered, RecordError, SessionOpened, Tea
 from robosac.calibration import calibration_digest, calibration_of
 from robosac.defenses import Conversation, Decision, Defense, GroupTesting, Outcome, State, build
 from robosac.detectors import Message, Preparer
+from robosac.faults import in_short
 from robosac.fusion import FusionResult, fuse
 from robosac.previous import PreviousAnswer
 
@@ -243,7 +244,7 @@ def _compare(logged: FrameAnswered, made: FusionResult) -> list[Difference]:
     differences = [
         Difference(what, f"{_shown(now)}, logged {_shown(then)}")
         for what, now, then in (
-            ("fault", made.fault, logged.fault),
+            ("fault", made.fault, None if logged.fault is None else in_short(logged.fault)),
             ("out_of_time", made.out_of_time, logged.out_of_time),
             ("source", made.source.value, logged.source.value),
             ("accepted", list(made.accepted), list(logged.accepted)),

@@ -1,6 +1,18 @@
+import asyncio
+import gc
+import itertools
 import json
 import logging
+import os
+import re
+import socket
+import sqlite3
+import subprocess
+import sys
+import time
+from pathlib import Path
 
+import httpx
 import pytest
 import structlog
 from opentelemetry.sdk.trace import TracerProvider
@@ -11,6 +23,7 @@ from robosac import wire
 from service.settings import Settings
 from service.tracing import provider_from_environment
 from tests.service.conftest import EGO, problem, serve
+from tests.service.test_identity import bearer
 
 
 async def test_events_are_logged_as_json_without_secrets(capsys, messages, benign):
@@ -45,6 +58,183 @@ async def test_faults_are_logged_with_their_trace_and_for_the_eye_if_wanted(caps
     assert "RuntimeError" in text
     assert "from the library" in text
     assert "not at this level" not in text
+
+
+KEY, OTHER_KEY, SECRET = "an-api-key-0123456789", "another-key-9876543210", "not-for-the-log-" * 3
+LOG_BYTES = 10_000
+
+
+async def a_faulty_frame(served, monkeypatch, messages, benign):
+    """A fault inside the detector, whose calls hold messages and the frame's draws."""
+
+    def broken(*arguments):
+        if arguments[-1]:
+            raise ValueError(f"{arguments}") from RuntimeError(arguments)
+        return prepare(*arguments)
+
+    session = await served.open(defense={"kind": "none"})
+    detector = served.gateway.engine.detectors["intersection-mean"]
+    prepare = detector.prepare
+    monkeypatch.setattr(detector, "prepare", broken)
+    answer = await served.ego(session).post_frame(0, messages[EGO], benign)
+    assert (answer.source, answer.degraded_by) == ("ego_only", "fault")
+    return session
+
+
+async def a_faulty_store(served, monkeypatch, messages, benign):
+    """A fault beneath a route, in calls that hold tokens, seeds and tensors."""
+    session = await served.open(defense={"kind": "none"})
+
+    def broken(*arguments, **options):
+        raise KeyError(arguments, options, session)
+
+    monkeypatch.setattr(served.gateway.sessions._store, "decide", broken)
+    body = wire.pack_frame(0, messages[EGO], benign)
+    problem(await served.post(session, "frames", body), 500, "internal-error")
+    return session
+
+
+async def a_faulty_opening(served, monkeypatch, messages, benign):
+    """A fault with the caller's credential in its message, and causes without end."""
+    session = await served.open()
+
+    def broken(*arguments):
+        error = RuntimeError(f"{KEY}, {OTHER_KEY}, {SECRET} and {session}" + " and so on" * 10_000)
+        for _ in range(50):
+            error.__cause__, error = RuntimeError(bytes(range(256)) * 10), error.__cause__ or error
+        raise error
+
+    monkeypatch.setattr(served.gateway.sessions, "open", broken)
+    opening = await served.http.post("/v1/sessions", json={"ego_id": "a", "teammates": []}, headers=bearer(KEY))
+    problem(opening, 500, "internal-error")
+    return session
+
+
+async def a_faulty_task(served, monkeypatch, messages, benign):
+    """A fault that nobody waits for: asyncio tells of it."""
+    session = await served.open()
+
+    async def broken(tensor):
+        raise RuntimeError(session, tensor)
+
+    task = asyncio.create_task(broken(messages["rsu"]))
+    await asyncio.wait([task])
+    del task
+    gc.collect()
+    return session
+
+
+@pytest.mark.parametrize("log_format", ["json", "console"])
+@pytest.mark.parametrize("fault", [a_faulty_frame, a_faulty_store, a_faulty_opening, a_faulty_task])
+async def test_a_fault_leaves_no_secret_in_the_log_and_little_of_it(
+    fault, log_format, messages, benign, capsys, monkeypatch, tmp_path
+):
+    file = tmp_path / "keys"
+    file.write_text(OTHER_KEY)
+    settings = {"api_keys": KEY, "api_keys_file": file, "token_secrets": SECRET, "log_format": log_format}
+    async with serve(itertools.repeat(12345678901234567890123456789), api_key=KEY, **settings) as served:
+        await served.client.ready()
+        capsys.readouterr()
+        session = await fault(served, monkeypatch, messages, benign)
+        text = capsys.readouterr().err
+    assert "Error" in text
+    assert len(text.encode()) < LOG_BYTES
+    tokens = [session.ego_token, *session.teammate_tokens.values()]
+    seed = f"{12345678901234567890123456789:064x}"
+    for secret in (KEY, OTHER_KEY, SECRET, seed, "12345678901234567890123456789", *tokens):
+        assert secret[8:] not in text
+        assert secret.rpartition(".")[2][:20] not in text
+    assert not re.search(r"(?:[-+]?\d*\.\d+[\s,\]\[]+){6}", text)
+    assert "\\x00" not in text
+    if log_format == "json":
+        assert all("level" in json.loads(line) for line in text.splitlines())
+
+
+async def test_a_fault_is_told_with_the_calls_that_led_to_it(served, monkeypatch, capsys):
+    def inner(token):
+        raise LookupError("what went wrong")
+
+    def outer(*_):
+        try:
+            inner("not-for-the-log")
+        except LookupError as error:
+            raise RuntimeError("what came of it") from error
+
+    monkeypatch.setattr("service.routes.DetectorEntry.of", outer)
+    problem(await served.http.get("/v1/detectors"), 500, "internal-error")
+    (event,) = [json.loads(line) for line in capsys.readouterr().err.splitlines() if "unhandled" in line]
+    assert (event["level"], event["path"]) == ("error", "/v1/detectors")
+    late, early = event["exception"].split("\nfrom ")
+    assert late.startswith("RuntimeError: what came of it\n")
+    assert early.startswith("LookupError: what went wrong\n")
+    assert "in list_detectors:" in late
+    assert "in inner: raise LookupError" in early
+    assert "not-for-the-log" not in late.replace('inner("not-for-the-log")', "")
+
+
+async def test_a_database_that_fails_tells_of_no_row(caplog, tmp_path, monkeypatch):
+    async with serve(database_url=f"sqlite:///{tmp_path}/robosac.db") as served:
+        session = await served.open()
+        token = session.ego_token
+
+        def broken(*_):
+            raise sqlite3.IntegrityError(f"failing row: {token}, {'ab' * 32}")
+
+        monkeypatch.setattr("service.sql_store.seal", broken)
+        path = f"/v1/sessions/{session.session_id}/token"
+        problem(await served.http.post(path, headers=bearer(token)), 503, "store-unavailable")
+    (record,) = [r for r in caplog.records if "database failed" in r.getMessage()]
+    assert "IntegrityError: failing row: " in record.getMessage()
+    assert "ab" * 32 not in caplog.text
+    assert token.split(".")[2] not in caplog.text
+
+
+FAULTY = """
+from service.app import create_app
+app = create_app()
+def broken(*arguments, **options):
+    raise RuntimeError("broken")
+app.state.gateway.sessions.describe = broken
+"""
+
+
+def test_a_running_gateway_writes_no_more_either(tmp_path):
+    """The server logs a fault, too."""
+    (tmp_path / "faulty.py").write_text(FAULTY)
+    with socket.socket() as probe:
+        probe.bind(("127.0.0.1", 0))
+        port = probe.getsockname()[1]
+    environment = os.environ | {"ROBOSAC_API_KEYS": KEY, "PYTHONPATH": str(Path(__file__).parents[2])}
+    with (tmp_path / "log").open("wb") as log:
+        command = [sys.executable, "-m", "uvicorn", "faulty:app", "--port", str(port)]
+        process = subprocess.Popen(command, cwd=tmp_path, env=environment, stdout=log, stderr=log)
+    try:
+        with httpx.Client(base_url=f"http://127.0.0.1:{port}", trust_env=False) as http:
+            end = time.monotonic() + 60
+            while not _ready(http):
+                assert process.poll() is None, (tmp_path / "log").read_text()
+                assert time.monotonic() < end
+                time.sleep(0.1)
+            opened = http.post("/v1/sessions", json={"ego_id": "a", "teammates": ["b"]}, headers=bearer(KEY)).json()
+            before = (tmp_path / "log").stat().st_size
+            path = f"/v1/sessions/{opened['session_id']}"
+            problem(http.get(path, headers=bearer(opened["ego_token"])), 500, "internal-error")
+    finally:
+        process.terminate()
+        process.wait(30)
+    text = (tmp_path / "log").read_text()
+    assert "RuntimeError: broken" in text
+    assert "Exception in ASGI application" in text
+    assert len(text.encode()) - before < LOG_BYTES
+    for secret in (KEY, opened["ego_token"], opened["teammate_tokens"]["b"]):
+        assert secret not in text
+
+
+def _ready(http):
+    try:
+        return http.get("/readyz").status_code == 200
+    except httpx.TransportError:
+        return False
 
 
 @pytest.fixture

@@ -1,0 +1,37 @@
+"""Exceptions in words that may be kept: short, and without what belongs in no log."""
+
+from __future__ import annotations
+
+import re
+
+MESSAGE_CHARS = 240
+"""What is kept of an exception's message."""
+_LOOKED_AT_CHARS = 2048
+_UNKEPT = (
+    re.compile(r"[A-Za-z0-9_-]{40,}"),  # keys, tokens, seeds and digests, whole or in part
+    re.compile(r"\bb(['\"])(?:\\.|(?!\1)[^\\]){24,}+\1?"),  # tensors as bytes
+    re.compile(r"(?:[-+]?\d[\w.+-]*+[\s,;\[\](){}]++){6,}"),  # and as numbers
+)
+_PART_OF_A_WORD = re.compile(r"[\w.~+/=-]*+$")
+
+
+def in_short(text: str) -> str:
+    """At most `MESSAGE_CHARS` of a text, without long words, bytes and rows of numbers; of such a text again itself."""
+    text = _cut(text, _LOOKED_AT_CHARS)
+    for unkept in _UNKEPT:
+        text = unkept.sub("<...>", text)
+    return _cut(text, MESSAGE_CHARS)
+
+
+def _cut(text: str, most: int) -> str:
+    """At most so many characters; no part of a word is left, since by its part a secret would not be known."""
+    return text if len(text) <= most else _PART_OF_A_WORD.sub("", text[: most - 3]) + "..."
+
+
+def describe(error: BaseException) -> str:
+    """Type and message of an exception, in short."""
+    try:
+        message = str(error)
+    except Exception as failure:
+        message = f"no message, for a {type(failure).__name__}"
+    return in_short(f"{type(error).__name__}: {message}")
