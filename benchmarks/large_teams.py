@@ -18,8 +18,8 @@ import torch
 import typer
 
 from robosac import attacks
+from robosac.answers import Verdict
 from robosac.calibration import calibration_of
-from robosac.consensus import Verdict
 from robosac.defenses import GroupTesting, Outcome
 from robosac.defenses.group_testing import frame as judging
 from robosac.defenses.group_testing import model as likelihoods

@@ -9,12 +9,12 @@ from types import TracebackType
 from typing import Any
 
 import httpx
-import numpy as np
 from cryptography.hazmat.primitives.asymmetric.ed25519 import Ed25519PrivateKey
+from pydantic import ValidationError
 
 from clients.errors import GatewayError, GatewayUnreachable, ProtocolError, refusal
 from robosac import wire
-from robosac.boxes import FloatArray
+from robosac.answers import FrameAnswer
 from robosac.detectors import Message
 from robosac.signatures import sign
 
@@ -42,78 +42,6 @@ class RenewedToken:
 
     token: str
     expires_at: str
-
-
-@dataclass(frozen=True)
-class FrameAnswer:
-    """The gateway's answer to a frame.
-
-    Attributes
-    ----------
-    frame : int
-    boxes : (n, 6) float64 ndarray
-        x, y, length, width, yaw, score; ego frame.
-    source : str
-        ``consensus``, ``trusted`` or ``ego_only``.
-    accepted : tuple of str
-    rejected : mapping of vehicle id to mapping
-        ``reason`` and evidence.
-    hypotheses : list of mapping
-        ``teammates``, ``jaccard_index``, ``verdict``.
-    sampling_steps : int
-    attacker_ratio : float or None
-    suspicion : mapping of vehicle id to float, or None
-        Probability that each teammate attacks, where the defence knows it.
-    deadline_met : bool
-    degraded_by : str or None
-        ``deadline`` or ``fault``, if the defence was cut short.
-    timings_ms : mapping of stage to float
-    """
-
-    frame: int
-    boxes: FloatArray
-    source: str
-    accepted: tuple[str, ...]
-    rejected: Mapping[str, Mapping[str, Any]]
-    hypotheses: list[Mapping[str, Any]]
-    sampling_steps: int
-    attacker_ratio: float | None
-    suspicion: Mapping[str, float] | None
-    deadline_met: bool
-    degraded_by: str | None
-    timings_ms: Mapping[str, float]
-
-    @property
-    def named(self) -> tuple[str, ...]:
-        """Teammates that the defence names as attackers."""
-        return tuple(name for name, entry in self.rejected.items() if "evidence" in entry)
-
-    @classmethod
-    def parse(cls, fields: Mapping[str, Any]) -> FrameAnswer:
-        """Read a frame result.
-
-        Raises
-        ------
-        ProtocolError
-            If a field is missing or of the wrong kind.
-        """
-        try:
-            return cls(
-                frame=int(fields["frame"]),
-                boxes=np.array(fields["boxes"], dtype=np.float64).reshape(-1, 6),
-                source=str(fields["source"]),
-                accepted=tuple(fields["accepted"]),
-                rejected={entry["vehicle_id"]: entry for entry in fields["rejected"]},
-                hypotheses=list(fields["hypotheses"]),
-                sampling_steps=int(fields["sampling_steps"]),
-                attacker_ratio=fields["attacker_ratio"],
-                suspicion=fields.get("suspicion"),
-                deadline_met=bool(fields["deadline_met"]),
-                degraded_by=fields["degraded_by"],
-                timings_ms=dict(fields["timings_ms"]),
-            )
-        except (KeyError, TypeError, ValueError, OverflowError) as error:
-            raise ProtocolError(f"not a frame result: {error!r}") from error
 
 
 class GatewayClient:
@@ -360,10 +288,9 @@ def _bearer(credential: str) -> dict[str, str]:
 
 def _answer(response: httpx.Response) -> FrameAnswer:
     try:
-        fields = wire.unpack(response.content, trusted=True)
-    except wire.WireError as error:
-        raise ProtocolError(str(error)) from error
-    return FrameAnswer.parse(fields)
+        return FrameAnswer.model_validate(wire.unpack(response.content, trusted=True))
+    except (wire.WireError, ValidationError) as error:
+        raise ProtocolError(f"not a frame result: {error}") from error
 
 
 def _json(response: httpx.Response) -> Mapping[str, Any]:

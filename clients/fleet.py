@@ -17,11 +17,12 @@ from rich.live import Live
 from rich.progress import BarColumn, MofNCompleteColumn, Progress, TextColumn, TimeRemainingColumn
 from rich.table import Table
 
-from clients.client import API_KEY_VARIABLE, FrameAnswer, GatewayClient, OpenedSession
+from clients.client import API_KEY_VARIABLE, GatewayClient, OpenedSession
 from clients.errors import FrameConflict, GatewayError
 from clients.simulation import EgoFrame, Fleet, make_folder
 from clients.summary import FleetSummary
 from robosac import attacks, detectors
+from robosac.answers import FrameAnswer, Reason
 from robosac.attacks import CAMPAIGN_HELP
 from robosac.detectors import DEFAULT_DETECTOR
 from robosac.scenes import FRAME_PERIOD_S, IntersectionScene
@@ -90,8 +91,8 @@ class _Screen:
         def names(vehicles: Any) -> str:
             return " ".join(f"[red]{v}[/red]" if v in frame.attackers else v for v in vehicles) or "-"
 
-        dissent = [v for v, entry in answer.rejected.items() if entry["reason"] == "dissensus"]
-        best = max((h["jaccard_index"] for h in answer.hypotheses), default=float("nan"))
+        dissent = [v for v, entry in answer.rejected.items() if entry.reason is Reason.DISSENSUS]
+        best = max((h.jaccard_index for h in answer.hypotheses), default=float("nan"))
         self._rows.append(
             (
                 str(scene),

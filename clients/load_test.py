@@ -29,11 +29,12 @@ from rich.console import Console
 from rich.progress import track
 from rich.table import Table
 
-from clients.client import API_KEY_VARIABLE, FrameAnswer, GatewayClient, VehicleClient
+from clients.client import API_KEY_VARIABLE, GatewayClient, VehicleClient
 from clients.errors import GatewayError
 from clients.local_gateway import local_gateway
 from clients.simulation import Fleet, make_folder
 from robosac import wire
+from robosac.answers import FrameAnswer
 from robosac.attacks import PGD
 from robosac.detectors import load
 from robosac.scenes import FRAME_PERIOD_S, IntersectionScene

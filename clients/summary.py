@@ -12,8 +12,8 @@ import numpy as np
 from rich.console import Console
 from rich.table import Table
 
-from clients.client import FrameAnswer
 from clients.simulation import EgoFrame
+from robosac.answers import FrameAnswer
 from robosac.boxes import FloatArray
 from robosac.consensus import at_least
 from robosac.detectors import Detector
@@ -93,7 +93,7 @@ class FleetSummary:
         self.ap["no defence"].add(undefended, frame.truth)
         self.latencies_ms.append(latency_ms)
         self.steps.append(answer.sampling_steps)
-        self.sources[answer.source] += 1
+        self.sources[answer.source.value] += 1
         self.with_attacker += not frame.attackers.isdisjoint(answer.accepted)
         self.in_time += answer.deadline_met
         for vehicle in frame.attackers:
@@ -104,7 +104,7 @@ class FleetSummary:
         for role, members in (("attackers", frame.attackers), ("honest", set(team) - frame.attackers)):
             tally = self.participation.setdefault(role, Counter())
             for vehicle in members:
-                tally["accepted" if vehicle in answer.accepted else str(answer.rejected[vehicle]["reason"])] += 1
+                tally["accepted" if vehicle in answer.accepted else answer.rejected[vehicle].reason.value] += 1
         self._keep_example(frame, undefended, answer)
 
     def _keep_example(self, frame: EgoFrame, undefended: FloatArray, answer: FrameAnswer) -> None:

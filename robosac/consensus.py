@@ -3,24 +3,15 @@
 from __future__ import annotations
 
 from dataclasses import dataclass
-from enum import StrEnum
 
 import numpy as np
 from scipy.optimize import linear_sum_assignment
 
+from robosac.answers import Verdict
 from robosac.boxes import FloatArray, IntArray, pairwise_iou
 
 MATCH_IOU = 0.5
 DEFAULT_THRESHOLD = 0.3
-
-
-class Verdict(StrEnum):
-    """What a comparison of two perceptions says about the hypothesis behind one of them."""
-
-    CONSENSUS = "consensus"
-    DISSENSUS = "dissensus"
-    NO_EVIDENCE = "no_evidence"
-    """Both perceptions are empty: they agree on nothing, which speaks neither for nor against anybody."""
 
 
 @dataclass(frozen=True)

@@ -14,9 +14,10 @@ from dataclasses import dataclass, field
 
 import numpy as np
 
+from robosac.answers import FrameAnswer, Reason, RejectedTeammate, Source, TestedHypothesis, Verdict
 from robosac.boxes import FloatArray
-from robosac.consensus import Verdict, at_least, compare
-from robosac.defenses import Decision, Defense, Hypothesis, Outcome, Reason, Reference, Rejection, Source, State
+from robosac.consensus import at_least, compare
+from robosac.defenses import Decision, Defense, Hypothesis, Outcome, Reference, Rejection, State
 from robosac.detectors import Message, PreparedFrame, Preparer
 from robosac.faults import describe
 from robosac.previous import PreviousAnswer
@@ -82,6 +83,37 @@ class FusionResult:
     def sampling_steps(self) -> int:
         """Hypotheses tested."""
         return len(self.hypotheses)
+
+    def answer(self, frame: int, left_out: Mapping[str, Rejection], timings_ms: Mapping[str, float]) -> FrameAnswer:
+        """What is answered about the frame.
+
+        Parameters
+        ----------
+        frame : int
+        left_out : mapping of vehicle id to Rejection
+            Those who were not among the teammates of the fusion.
+        timings_ms : mapping of stage to float
+        """
+        return FrameAnswer(
+            frame=frame,
+            boxes=self.boxes,
+            source=self.source,
+            accepted=self.accepted,
+            rejected={
+                name: RejectedTeammate(vehicle_id=name, reason=why.reason, distrust=why.distrust, **why.evidence)
+                for name, why in {**left_out, **self.rejected}.items()
+            },
+            hypotheses=tuple(
+                TestedHypothesis(teammates=o.teammates, jaccard_index=o.jaccard_index, verdict=o.verdict)
+                for o in self.hypotheses
+            ),
+            sampling_steps=self.sampling_steps,
+            attacker_ratio=self.attacker_ratio,
+            suspicion=None if self.suspicion is None else dict(self.suspicion),
+            deadline_met=self.deadline_met,
+            degraded_by="fault" if self.fault is not None else "deadline" if self.out_of_time else None,
+            timings_ms={stage: round(milliseconds, 3) for stage, milliseconds in timings_ms.items()},
+        )
 
 
 def fuse(

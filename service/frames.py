@@ -8,21 +8,22 @@ import time
 from collections.abc import Mapping
 from typing import Any
 
-import numpy as np
 import structlog
 
 from robosac import wire
-from robosac.defenses import Reason, Rejection
+from robosac.answers import FrameAnswer, Reason
+from robosac.audit import commitment
+from robosac.audit.events import FrameAnswered, Proof
+from robosac.defenses import Rejection
 from robosac.detectors import Role
-from robosac.fusion import FusionResult
 from robosac.signatures import is_valid, read_public_key
-from service import audit
 from service.admission import Admission
 from service.engine import Engine
 from service.gathering import Equivocation, Received, Refused
 from service.live import Caller
 from service.metrics import Metrics
 from service.problems import Problem
+from service.schemas import Receipt
 from service.sessions import Sessions
 from service.settings import Settings
 from service.store import SessionChanged
@@ -82,10 +83,8 @@ class Frames:
         self._engine = engine
         self._metrics = metrics
 
-    async def post_message(self, caller: Caller, body: bytes) -> tuple[int, dict[str, Any]]:
-        """A vehicle's own message: kept for a teammate (202 and a receipt), answered for the ego (200 and the
-        result).
-        """
+    async def post_message(self, caller: Caller, body: bytes) -> FrameAnswer | Receipt:
+        """A vehicle's own message: kept for a teammate, answered for the ego."""
         arrived = time.perf_counter()
         frame = None
         try:
@@ -100,7 +99,7 @@ class Frames:
             raise await self._unusable(caller, error, frame) from error
         if not caller.is_ego:
             await self._keep(caller, frame, received)
-            return 202, {"frame": frame, "vehicle_id": caller.vehicle_id, "status": "accepted"}
+            return Receipt(frame=frame, vehicle_id=caller.vehicle_id)
         timings = {"receive": (time.perf_counter() - arrived) * 1e3}
         with self._admission.frame(caller.record.session_id, caller.live.budget_s):
             async with caller.live.lock:
@@ -108,9 +107,9 @@ class Frames:
                 gathering = time.perf_counter()
                 messages = await caller.live.gathering.collect(frame, arrived + caller.record.gather_ms / 1e3)
                 timings["gather"] = (time.perf_counter() - gathering) * 1e3
-                return 200, await self._answer(caller, frame, received, messages, {}, arrived, timings)
+                return await self._answer(caller, frame, received, messages, {}, arrived, timings)
 
-    async def post_frame(self, caller: Caller, body: bytes) -> dict[str, Any]:
+    async def post_frame(self, caller: Caller, body: bytes) -> FrameAnswer:
         """A whole frame from the ego; a teammate whose part is malformed is left out, and the frame is answered."""
         arrived = time.perf_counter()
         frame = None
@@ -164,7 +163,7 @@ class Frames:
             reason = Reason.REPLAYED if frame == record.last_frame else Reason.STALE
             before = caller.live.ego_digest if reason is Reason.REPLAYED else None
             if before not in (None, ego.digest):
-                await self._sessions.journal.equivocation(caller, frame, {"digest": str(before)}, ego)
+                await self._sessions.journal.equivocation(caller, frame, Proof(digest=str(before)), ego)
             detail = f"frames must increase; the latest answered is {record.last_frame}"
             await self._refuse(caller, reason, detail, frame, "frame")
             raise Problem(409, "stale-frame", detail, "frame")
@@ -212,7 +211,7 @@ class Frames:
         unusable: Mapping[str, Rejection],
         arrived: float,
         timings: dict[str, float],
-    ) -> dict[str, Any]:
+    ) -> FrameAnswer:
         """Fuse, keep the decision, and build the frame result. The session's lock is held.
 
         What was worked out from a session that another process has changed by then is worked out again.
@@ -233,7 +232,7 @@ class Frames:
         absences: dict[str, Rejection],
         arrived: float,
         timings: dict[str, float],
-    ) -> dict[str, Any]:
+    ) -> FrameAnswer:
         """As `_answer`, from the session as this process knows it.
 
         The team is the one of this moment, whoever was in it when the messages came; ``unusable`` says why parts of the
@@ -270,37 +269,40 @@ class Frames:
         )
         timings.update(result.timings_ms)
         timings["total"] = (time.perf_counter() - arrived) * 1e3
-        answer = _frame_result(frame, result, {**left_out, **result.rejected}, timings)
+        answer = result.answer(frame, left_out, timings)
+        next_seed = self._sessions.draw_seed()
         with live.unlogged() as unlogged:
-            event = audit.frame_answered(
-                answer,
-                result,
+            event = FrameAnswered(
+                **dict(answer),
                 seed=record.seed,
                 ego_pose=ego.message.pose,
                 messages={name: received.proof for name, received in {record.ego_id: ego, **present}.items()},
                 previous_frame=None if live.previous is None else live.previous.frame,
-                unlogged=unlogged,
+                out_of_time=result.out_of_time,
+                fault=result.fault,
+                state=dict(result.state),
+                unlogged_refusals=unlogged,
+                next_seed_commitment=commitment(next_seed),
             )
-            await self._sessions.decide(record, frame, result.state, event, self._to_keep(frame, ego, present))
+            await self._sessions.decide(record, event, next_seed, self._to_keep(frame, ego, present))
         done = time.perf_counter()
         timings["store"] = (done - arrived) * 1e3 - timings["total"]
         self._admission.learn(arrived + timings.get("gather", 0.0) / 1e3, done, timings["store"] / 1e3)
         live.answered, live.previous, live.ego_digest = frame, result.previous, ego.digest
         for name, received in {record.ego_id: ego, **present}.items():
             live.motion.moved(name, frame, received.message.pose)
-        reasons = [entry["reason"] for entry in answer["rejected"]]
-        self._metrics.frame(result, reasons, answer["degraded_by"], timings)
+        self._metrics.frame(answer, timings)
         self._tracing.frame(record.session_id, answer, timings)
         logger.log(
-            logging.DEBUG if answer["degraded_by"] is None and answer["deadline_met"] else logging.WARNING,
+            logging.DEBUG if answer.degraded_by is None and answer.deadline_met else logging.WARNING,
             "frame answered",
             session_id=record.session_id,
             frame=frame,
-            source=answer["source"],
-            accepted=answer["accepted"],
-            degraded_by=answer["degraded_by"],
+            source=answer.source.value,
+            accepted=answer.accepted,
+            degraded_by=answer.degraded_by,
             fault=result.fault,
-            deadline_met=answer["deadline_met"],
+            deadline_met=answer.deadline_met,
             total_ms=round(timings["total"], 1),
         )
         return answer
@@ -334,26 +336,3 @@ def _check(caller: Caller, vehicle: str, frame: int, payload: Any, path: str) ->
         if not is_valid(read_public_key(key), caller.record.session_id, received.digest, signature):
             raise _Forged(field, f"not the signature of {vehicle} over this message for this session")
     return received
-
-
-def _frame_result(
-    frame: int, result: FusionResult, rejected: Mapping[str, Rejection], timings: Mapping[str, float]
-) -> dict[str, Any]:
-    degraded_by = "fault" if result.fault is not None else "deadline" if result.out_of_time else None
-    return {
-        "frame": frame,
-        "boxes": np.asarray(result.boxes, dtype=np.float64).tolist(),
-        "source": result.source.value,
-        "accepted": list(result.accepted),
-        "rejected": [{"vehicle_id": name, "reason": r.reason.value, **r.evidence} for name, r in rejected.items()],
-        "hypotheses": [
-            {"teammates": list(o.teammates), "jaccard_index": o.jaccard_index, "verdict": o.verdict.value}
-            for o in result.hypotheses
-        ],
-        "sampling_steps": result.sampling_steps,
-        "attacker_ratio": result.attacker_ratio,
-        "suspicion": None if result.suspicion is None else dict(result.suspicion),
-        "deadline_met": result.deadline_met,
-        "degraded_by": degraded_by,
-        "timings_ms": {stage: round(milliseconds, 3) for stage, milliseconds in timings.items()},
-    }

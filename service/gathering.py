@@ -3,12 +3,13 @@
 from __future__ import annotations
 
 import asyncio
-import base64
 import time
-from collections.abc import Mapping, Sequence
+from collections.abc import Sequence
 from dataclasses import dataclass
 
-from robosac.defenses import Reason, Rejection
+from robosac.answers import Distrust, Reason
+from robosac.audit.events import Proof
+from robosac.defenses import Rejection
 from robosac.detectors import Message
 
 REMEMBERED_FRAMES = 8
@@ -37,11 +38,9 @@ class Received:
         return sum(tensor.nbytes for tensor in self.message.tensors.values())
 
     @property
-    def proof(self) -> dict[str, str]:
+    def proof(self) -> Proof:
         """What the audit log says of it."""
-        if self.signature is None:
-            return {"digest": self.digest}
-        return {"digest": self.digest, "signature": base64.b64encode(self.signature).decode()}
+        return Proof(digest=self.digest, signature=self.signature)
 
 
 class Refused(Exception):
@@ -58,11 +57,11 @@ class Equivocation(Exception):
 
     Attributes
     ----------
-    first : mapping
-        Proof of what it said before.
+    first : Proof
+        Of what it said before.
     """
 
-    def __init__(self, first: Mapping[str, str]) -> None:
+    def __init__(self, first: Proof) -> None:
         super().__init__("another message with other content came for this frame; neither is used")
         self.first = first
 
@@ -101,7 +100,7 @@ class Gathering:
 
     def __init__(self, team: Sequence[str], max_ahead: int, backlog: Backlog, closed: int = -1) -> None:
         self._pending: dict[str, dict[int, Received | None]] = {name: {} for name in team}
-        self._said: dict[str, dict[int, Mapping[str, str]]] = {name: {} for name in team}
+        self._said: dict[str, dict[int, Proof]] = {name: {} for name in team}
         self._refusals: dict[str, tuple[int | None, Rejection]] = {}
         self._max_ahead = max_ahead
         self._backlog = backlog
@@ -130,7 +129,7 @@ class Gathering:
             raise Refused(Reason.UNAUTHENTICATED, f"{sender} has left the session")
         said = self._said[sender].get(frame)
         if said is not None:
-            if said["digest"] == received.digest:
+            if said.digest == received.digest:
                 detail = f"this message of {sender} for frame {frame} is in already"
                 if frame <= self._closed:
                     self.refuse(sender, frame, Reason.REPLAYED, detail)
@@ -179,7 +178,8 @@ class Gathering:
     def absence(self, teammate: str, frame: int) -> Rejection:
         """Why there is no message of a teammate for a frame."""
         if self._pending[teammate].get(frame, ...) is None:
-            return Rejection(Reason.DISTRUSTED, {"detail": "it sent different messages for this frame"})
+            detail = "it sent different messages for this frame"
+            return Rejection(Reason.DISTRUSTED, {"detail": detail}, Distrust.EQUIVOCATION)
         refused_for, rejection = self._refusals.get(teammate, (None, Rejection(Reason.MISSING)))
         return rejection if refused_for is None or refused_for <= frame else Rejection(Reason.MISSING)
 

@@ -5,17 +5,16 @@ one vehicle, and of all strangers together, only so many records are kept betwee
 from __future__ import annotations
 
 import contextlib
-from collections.abc import Mapping
 
 import structlog
 
-from robosac.defenses import Reason
-from service import audit
+from robosac.answers import Reason
+from robosac.audit.events import AccessRefused, Equivocation, Event, MessageRefused, Proof
 from service.gathering import Received
 from service.identity import TokenRefused
 from service.live import REFUSALS_LOGGED, STRANGERS, Caller, LiveSession
 from service.metrics import Metrics
-from service.store import AuditEvent, SessionOver, Store
+from service.store import SessionOver, Store
 
 logger = structlog.stdlib.get_logger(__name__)
 
@@ -45,21 +44,23 @@ class Journal:
                 detail=detail,
                 frame=frame,
             )
-            await self._append(session_id, audit.message_refused(vehicle_id, reason, detail, frame=frame, field=field))
+            event = MessageRefused(vehicle_id=vehicle_id, frame=frame, reason=reason, detail=detail, field=field)
+            await self._append(session_id, event)
 
-    async def equivocation(self, caller: Caller, frame: int, first: Mapping[str, str], second: Received) -> None:
+    async def equivocation(self, caller: Caller, frame: int, first: Proof, second: Received) -> None:
         """A vehicle said two different things about one frame."""
         session_id, vehicle_id = caller.record.session_id, caller.vehicle_id
         if self._counted(caller.live, vehicle_id, Reason.REPLAYED):
             logger.warning("equivocation", session_id=session_id, vehicle_id=vehicle_id, frame=frame)
-            await self._append(session_id, audit.equivocation(vehicle_id, frame, first, second.proof))
+            event = Equivocation(vehicle_id=vehicle_id, frame=frame, first=first, second=second.proof)
+            await self._append(session_id, event)
 
     async def stranger(self, session_id: str, live: LiveSession | None, refused: TokenRefused) -> None:
         """Somebody came without a token that counts; ``live`` is None for a session not served."""
         if live is None:
             self._metrics.refused(Reason.UNAUTHENTICATED.value)
         elif self._counted(live, STRANGERS, Reason.UNAUTHENTICATED):
-            await self._append(session_id, audit.access_refused(refused.vehicle_id, refused.problem.detail))
+            await self._append(session_id, AccessRefused(vehicle_id=refused.vehicle_id, detail=refused.problem.detail))
 
     def _counted(self, live: LiveSession, who: str, reason: Reason) -> bool:
         """Count a refusal; whether it gets a record."""
@@ -67,6 +68,6 @@ class Journal:
         live.refusals[who] += 1
         return live.refusals[who] <= REFUSALS_LOGGED
 
-    async def _append(self, session_id: str, event: AuditEvent) -> None:
+    async def _append(self, session_id: str, event: Event) -> None:
         with contextlib.suppress(SessionOver):
-            await self._store.log(session_id, event)
+            await self._store.log(session_id, event.as_json())

@@ -6,7 +6,7 @@ from collections.abc import Mapping
 
 from prometheus_client import CollectorRegistry, Counter, Gauge, Histogram, generate_latest
 
-from robosac.fusion import FusionResult
+from robosac.answers import FrameAnswer
 
 _SECONDS = (0.001, 0.0025, 0.005, 0.01, 0.025, 0.05, 0.1, 0.2, 0.5, 1.0, 2.5)
 
@@ -31,19 +31,17 @@ class Metrics:
             "robosac_stage_seconds", "Time of a frame by stage", ["stage"], buckets=_SECONDS, registry=self.registry
         )
 
-    def frame(
-        self, result: FusionResult, reasons: list[str], degraded_by: str | None, timings_ms: Mapping[str, float]
-    ) -> None:
+    def frame(self, answer: FrameAnswer, timings_ms: Mapping[str, float]) -> None:
         """Count an answered frame."""
-        self._frames.labels(result.source.value).inc()
-        if degraded_by is not None:
-            self._degraded.labels(degraded_by).inc()
-        if not result.deadline_met:
+        self._frames.labels(answer.source.value).inc()
+        if answer.degraded_by is not None:
+            self._degraded.labels(answer.degraded_by).inc()
+        if not answer.deadline_met:
             self._late.inc()
-        for outcome in result.hypotheses:
-            self._hypotheses.labels(outcome.verdict.value).inc()
-        for reason in reasons:
-            self._rejected.labels(reason).inc()
+        for hypothesis in answer.hypotheses:
+            self._hypotheses.labels(hypothesis.verdict.value).inc()
+        for rejected in answer.rejected.values():
+            self._rejected.labels(rejected.reason.value).inc()
         for stage, milliseconds in timings_ms.items():
             self._stages.labels(stage).observe(milliseconds / 1e3)
 

@@ -2,30 +2,30 @@
 
 from __future__ import annotations
 
-import json
 import re
 from typing import Annotated, Any
 
 from fastapi import APIRouter, Depends, Header, Path, Query, Request, Response
 from fastapi.security import HTTPAuthorizationCredentials, HTTPBearer
+from pydantic import BaseModel
 
 from robosac import wire
+from robosac.answers import FrameAnswer
 from service.bodies import MSGPACK, MSGPACK_TYPES, check_type, described, read_json
 from service.gateway import Gateway
 from service.limits import read_bounded
 from service.live import Caller
 from service.problems import Problem, documented
 from service.schemas import (
+    ChangedTeam,
     DetectorEntry,
     DetectorList,
     EnrolmentRequest,
-    FrameResult,
     Receipt,
+    RenewedToken,
     SessionCreated,
     SessionRequest,
     SessionState,
-    TeamChanged,
-    TokenRenewed,
 )
 
 v1 = APIRouter(prefix="/v1", responses=documented(422, 503))
@@ -80,7 +80,7 @@ _EGO_PROBLEMS = documented(401, 403, 404)
 _JSON_PROBLEMS = (400, 408, 413, 415)
 _FRAME_RESPONSES: dict[int | str, dict[str, Any]] = {
     **documented(400, 401, 403, 404, 408, 409, 413, 415),
-    200: {"model": FrameResult, "description": "The answer to the frame, as JSON or msgpack by `Accept`."},
+    200: {"model": FrameAnswer, "description": "The answer to the frame, as JSON or msgpack by `Accept`."},
 }
 
 
@@ -116,7 +116,7 @@ async def delete_session(caller: Ego, gateway: GatewayDep, response: Response) -
 
 
 @v1.post("/sessions/{sid}/token", status_code=201, responses=documented(401, 404, 429))
-async def renew_token(caller: Vehicle, gateway: GatewayDep) -> TokenRenewed:
+async def renew_token(caller: Vehicle, gateway: GatewayDep) -> RenewedToken:
     """A fresh token for the vehicle that asks; the one it asks with is worth nothing any more."""
     return await gateway.teams.renew(caller)
 
@@ -129,7 +129,7 @@ async def renew_token(caller: Vehicle, gateway: GatewayDep) -> TokenRenewed:
 )
 async def enrol_teammates(
     request: Annotated[EnrolmentRequest, Depends(_enrolment_request)], caller: Ego, gateway: GatewayDep
-) -> TeamChanged:
+) -> ChangedTeam:
     """Let teammates join from the next frame on. Their tokens are shown only in this answer."""
     return await gateway.teams.enrol(caller, request.teammates, request.public_keys)
 
@@ -167,8 +167,8 @@ async def post_message(
 ) -> Response:
     """A vehicle's own message. The ego's starts the fusion and is answered with the frame result."""
     body = await _read_body(request, caller, gateway, whole_frame=False)
-    status, answer = await gateway.frames.post_message(caller, body)
-    return _negotiated(answer, accept, status)
+    answer = await gateway.frames.post_message(caller, body)
+    return _negotiated(answer, accept, 202 if isinstance(answer, Receipt) else 200)
 
 
 @v1.post("/sessions/{sid}/frames", openapi_extra=_TENSOR_BODY, responses=_FRAME_RESPONSES, response_class=Response)
@@ -222,14 +222,14 @@ async def _read_body(request: Request, caller: Caller, gateway: Gateway, *, whol
         raise
 
 
-def _negotiated(answer: dict[str, Any], accept: str | None, status: int = 200) -> Response:
+def _negotiated(answer: BaseModel, accept: str | None, status: int = 200) -> Response:
     """msgpack where the client names it before JSON, else JSON."""
     for media_range in (accept or "").lower().split(","):
         media_type, *parameters = (part.strip() for part in media_range.split(";"))
         if any(re.fullmatch(r"q=0(\.0*)?", parameter) for parameter in parameters):
             continue
         if media_type in MSGPACK_TYPES:
-            return Response(wire.pack(answer), status, media_type=MSGPACK)
+            return Response(wire.pack(answer.model_dump(mode="json")), status, media_type=MSGPACK)
         if media_type in ("application/json", "application/*", "*/*"):
             break
-    return Response(json.dumps(answer, allow_nan=False), status, media_type="application/json")
+    return Response(answer.model_dump_json(), status, media_type="application/json")

@@ -335,7 +335,7 @@ class SessionCreated(BaseModel):
     frame_period_ms: float
 
 
-class TeamChanged(BaseModel):
+class ChangedTeam(BaseModel):
     """The team after some joined, and the tokens of those; they are shown only here."""
 
     teammates: list[str]
@@ -343,7 +343,7 @@ class TeamChanged(BaseModel):
     tokens_expire_at: str
 
 
-class TokenRenewed(BaseModel):
+class RenewedToken(BaseModel):
     """A vehicle's fresh token; it is shown only here."""
 
     token: str
@@ -379,51 +379,3 @@ class Receipt(BaseModel):
     frame: int
     vehicle_id: str
     status: Literal["accepted"] = "accepted"
-
-
-class RejectedTeammate(BaseModel):
-    """Why an enrolled teammate is not in the answer; evidence follows as further fields."""
-
-    model_config = ConfigDict(extra="allow")
-
-    vehicle_id: str
-    reason: Literal[
-        "dissensus",
-        "not_sampled",
-        "distrusted",
-        "missing",
-        "late",
-        "malformed",
-        "stale",
-        "unauthenticated",
-        "replayed",
-    ]
-
-
-class TestedHypothesis(BaseModel):
-    """One tested subset."""
-
-    teammates: list[str]
-    jaccard_index: float
-    verdict: Literal["consensus", "dissensus", "no_evidence"]
-
-
-class FrameResult(BaseModel):
-    """The answer to one frame."""
-
-    frame: int
-    boxes: list[tuple[float, float, float, float, float, float]] = Field(
-        description="x, y, length, width, yaw, score; ego frame, metres and radians, best first"
-    )
-    source: Literal["consensus", "trusted", "ego_only"]
-    accepted: list[str]
-    rejected: list[RejectedTeammate]
-    hypotheses: list[TestedHypothesis]
-    sampling_steps: int
-    attacker_ratio: float | None
-    suspicion: dict[str, float] | None = Field(
-        None, description="Probability that each teammate attacks, where the defence knows it."
-    )
-    deadline_met: bool
-    degraded_by: Literal["deadline", "fault"] | None = Field(description="What cut the defence short, if anything.")
-    timings_ms: dict[str, float]

@@ -6,16 +6,17 @@ import asyncio
 import contextlib
 import secrets
 import time
-from collections.abc import Callable, Mapping, Sequence
-from typing import Any
+from collections.abc import Callable, Sequence
+from importlib.metadata import version
 
 import structlog
 
+from robosac.answers import Reason
 from robosac.audit import commitment
+from robosac.audit.events import FrameAnswered, SessionEnded, SessionOpened, now
 from robosac.budget import DomainError
-from robosac.defenses import Reason
-from robosac.detectors import Detector
-from service import audit
+from robosac.calibration import calibration_digest
+from robosac.detectors import Detector, DetectorInfo
 from service.engine import Engine
 from service.gathering import Backlog, Gathering
 from service.identity import TokenRefused, Tokens
@@ -34,7 +35,6 @@ from service.schemas import (
 )
 from service.settings import Settings
 from service.store import (
-    AuditEvent,
     FrameDecided,
     SessionOver,
     SessionRecord,
@@ -116,11 +116,11 @@ class Sessions:
             frame_period_ms=request.frame_period_ms,
             token_ids={name: token.token_id for name, token in {request.ego_id: own, **others}.items()},
             public_keys=dict(request.public_keys),
-            created_at=audit.now(),
+            created_at=now(),
             seed=self._seeds(),
             state=defense.initial_state(request.teammates),
         )
-        await self._store.create(record, audit.session_opened(record, detector.info))
+        await self._store.create(record, _opening(record, detector.info).as_json())
         self._live[record.session_id] = self._revive(record)
         self._metrics.sessions.set(already_open + 1)
         logger.info(
@@ -245,25 +245,25 @@ class Sessions:
         caller.live.follow(record)
         return record
 
+    def draw_seed(self) -> str:
+        """The seed of a frame to come, hexadecimal."""
+        return self._seeds()
+
     async def decide(
-        self,
-        record: SessionRecord,
-        frame: int,
-        state: Mapping[str, Any],
-        event: AuditEvent,
-        messages: bytes | None = None,
+        self, record: SessionRecord, event: FrameAnswered, next_seed: str, messages: bytes | None = None
     ) -> None:
-        """Keep a decision that was worked out from ``record``, its own record, and the commitment to the next seed.
+        """Keep a decision that was worked out from ``record``, and the next seed, which ``event`` commits to.
 
         Raises
         ------
         SessionChanged
             If the session is another by now: the decision is void, and has to be worked out again.
         """
-        next_seed = self._seeds()
-        event = {**event, "next_seed_commitment": commitment(next_seed)}
+        frame = event.frame
         try:
-            await self._store.decide(record.session_id, record.revision, frame, state, next_seed, event, messages)
+            await self._store.decide(
+                record.session_id, record.revision, frame, event.state, next_seed, event.as_json(), messages
+            )
         except SessionOver as error:
             raise over() from error
         except FrameDecided as error:
@@ -325,9 +325,9 @@ class Sessions:
     async def _end(self, session_id: str, why: str) -> None:
         self._forget(session_id)
         with contextlib.suppress(SessionOver):
-            event = audit.session_ended(why)
+            event = SessionEnded(why=why)
             logger.info("session ended", session_id=session_id, why=why)
-            await self._store.end(session_id, event["time"], event)
+            await self._store.end(session_id, event.time, event.as_json())
         self._metrics.sessions.set(await self._store.count())
 
     def _is_served(self, record: SessionRecord) -> bool:
@@ -351,6 +351,25 @@ class Sessions:
             live = self._live_session(record) if record.ended_at is None and self._is_served(record) else None
             await self.journal.stranger(record.session_id, live, refused)
             raise refused.problem from refused
+
+
+def _opening(record: SessionRecord, info: DetectorInfo) -> SessionOpened:
+    return SessionOpened(
+        time=record.created_at,
+        version=version("robosac"),
+        ego_id=record.ego_id,
+        teammates=record.teammates,
+        detector=record.detector,
+        weights_digest=info.weights_digest,
+        calibration_digest=calibration_digest(info),
+        defense=dict(record.defense),
+        latency_budget_ms=record.latency_budget_ms,
+        gather_ms=record.gather_ms,
+        frame_period_ms=record.frame_period_ms,
+        public_keys=dict(record.public_keys),
+        state=dict(record.state),
+        next_seed_commitment=commitment(record.seed),
+    )
 
 
 def _ego_only(vehicle_id: str) -> Problem:

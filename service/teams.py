@@ -4,12 +4,12 @@ from __future__ import annotations
 
 from collections.abc import Mapping, Sequence
 
+from robosac.audit.events import TeamChanged, TokenRenewed
 from robosac.budget import DomainError
-from service import audit
 from service.identity import Tokens, unauthenticated
 from service.live import Caller
 from service.problems import Problem
-from service.schemas import TeamChanged, TokenRenewed
+from service.schemas import ChangedTeam, RenewedToken
 from service.sessions import Sessions, check_size, over
 from service.settings import Settings
 from service.store import SessionChanged, SessionOver, SessionRecord, Store
@@ -35,7 +35,7 @@ class Teams:
         self._store = store
         self._tokens = tokens
 
-    async def enrol(self, caller: Caller, newcomers: Sequence[str], public_keys: Mapping[str, str]) -> TeamChanged:
+    async def enrol(self, caller: Caller, newcomers: Sequence[str], public_keys: Mapping[str, str]) -> ChangedTeam:
         """Let teammates join, from the next frame on; the answer is the only place where their tokens are shown."""
         async with caller.live.lock:
             record = await self._sessions.current(caller)
@@ -46,7 +46,7 @@ class Teams:
             token_ids = {**record.token_ids, **{name: token.token_id for name, token in tokens.items()}}
             keys = {**record.public_keys, **public_keys}
             await self._change_team(caller, record, (*record.teammates, *newcomers), token_ids, keys)
-            return TeamChanged(
+            return ChangedTeam(
                 teammates=[*record.teammates, *newcomers],
                 teammate_tokens={name: token.text for name, token in tokens.items()},
                 tokens_expire_at=min(token.expires_at for token in tokens.values()),
@@ -63,7 +63,7 @@ class Teams:
             team = tuple(name for name in record.teammates if name != leaver)
             await self._change_team(caller, record, team, token_ids, keys)
 
-    async def renew(self, caller: Caller) -> TokenRenewed:
+    async def renew(self, caller: Caller) -> RenewedToken:
         """A fresh token of the caller; the one it came with is worth nothing any more."""
         vehicle = caller.vehicle_id
         async with caller.live.lock:  # else a team that changes meanwhile would bring the old token back
@@ -75,12 +75,12 @@ class Teams:
                 raise Problem(429, "too-many-renewals", detail, headers={"Retry-After": "1"})
             caller.live.renewals[vehicle] += 1
             token = self._tokens.issue(record.session_id, vehicle, is_ego=caller.is_ego)
-            event = audit.token_renewed(vehicle, token.expires_at)
+            event = TokenRenewed(vehicle_id=vehicle, expires_at=token.expires_at)
             try:
-                await self._store.renew_token(record.session_id, vehicle, token.token_id, event)
+                await self._store.renew_token(record.session_id, vehicle, token.token_id, event.as_json())
             except SessionOver as error:
                 raise over() from error
-            return TokenRenewed(token=token.text, expires_at=token.expires_at)
+            return RenewedToken(token=token.text, expires_at=token.expires_at)
 
     async def _change_team(
         self,
@@ -96,10 +96,16 @@ class Teams:
             state = caller.live.defense.change_team(record.state, team)
         except DomainError as error:
             raise Problem(422, "impossible-defense", str(error), "teammates") from error
-        event = audit.team_changed(record.teammates, team, keys, state)
+        event = TeamChanged(
+            joined=tuple(name for name in team if name not in record.teammates),
+            left=tuple(name for name in record.teammates if name not in team),
+            teammates=tuple(team),
+            public_keys=dict(keys),
+            state=dict(state),
+        )
         try:
             await self._store.change_team(
-                record.session_id, record.revision, tuple(team), token_ids, keys, state, event
+                record.session_id, record.revision, tuple(team), token_ids, keys, state, event.as_json()
             )
         except SessionChanged as error:
             raise Problem(409, "session-changed", "the session was changed at the same time; try again") from error

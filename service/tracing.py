@@ -9,9 +9,11 @@ from __future__ import annotations
 import os
 import time
 from collections.abc import Mapping
-from typing import TYPE_CHECKING, Any
+from typing import TYPE_CHECKING
 
 from starlette.types import ASGIApp, Message, Receive, Scope, Send
+
+from robosac.answers import FrameAnswer
 
 if TYPE_CHECKING:
     from opentelemetry.sdk.trace import TracerProvider
@@ -51,7 +53,7 @@ class Tracing:
         self._provider = provider
         self._tracer: Tracer | None = provider.get_tracer("robosac") if provider else None
 
-    def frame(self, session_id: str, answer: Mapping[str, Any], timings_ms: Mapping[str, float]) -> None:
+    def frame(self, session_id: str, answer: FrameAnswer, timings_ms: Mapping[str, float]) -> None:
         """Add the stages of an answered frame to the request's span, one after another.
 
         Decoding and matching of the hypotheses take turns in truth; each is shown as one stretch.
@@ -63,11 +65,11 @@ class Tracing:
         trace.get_current_span().set_attributes(
             {
                 "robosac.session_id": session_id,
-                "robosac.frame": answer["frame"],
-                "robosac.source": answer["source"],
-                "robosac.sampling_steps": answer["sampling_steps"],
-                "robosac.accepted": len(answer["accepted"]),
-                "robosac.deadline_met": answer["deadline_met"],
+                "robosac.frame": answer.frame,
+                "robosac.source": answer.source.value,
+                "robosac.sampling_steps": answer.sampling_steps,
+                "robosac.accepted": len(answer.accepted),
+                "robosac.deadline_met": answer.deadline_met,
             }
         )
         spent = [(stage, int(timings_ms.get(stage, 0.0) * 1e6)) for stage in _STAGES]

@@ -7,11 +7,10 @@ from collections.abc import Iterator, Mapping
 from dataclasses import dataclass, field
 from typing import Any
 
-import numpy as np
-
-from clients.client import FrameAnswer, GatewayClient, OpenedSession, VehicleClient
+from clients.client import GatewayClient, OpenedSession, VehicleClient
 from clients.errors import AccessDenied, GatewayError
 from clients.load_test import Bodies
+from robosac.answers import FrameAnswer
 from robosac.audit import GENESIS, commitment, digest, seal
 from robosac.scenes import IntersectionScene
 
@@ -69,7 +68,7 @@ class Driven:
             if record["frame"] <= self.last_frame:
                 yield f"frame {record['frame']} was decided after frame {self.last_frame}"
             answer = self.acknowledged.pop(record["frame"], None)
-            if answer is not None and not _same(answer, FrameAnswer.parse(record)):
+            if answer is not None and answer.as_json() != FrameAnswer.model_validate(record).as_json():
                 yield f"frame {record['frame']} is in the log with another result than was acknowledged"
             self.answered, self.last_frame = self.answered + 1, record["frame"]
         self.commitment = record.get("next_seed_commitment", self.commitment)
@@ -108,7 +107,3 @@ class Driven:
         except AccessDenied as error:
             return [] if error.status == 403 else [f"the token of {name} is worth nothing any more"]
         return [f"{name} was taken for the ego"]
-
-
-def _same(one: FrameAnswer, other: FrameAnswer) -> bool:
-    return np.array_equal(one.boxes, other.boxes) and {**vars(one), "boxes": 0} == {**vars(other), "boxes": 0}

@@ -4,9 +4,8 @@ from __future__ import annotations
 
 from collections.abc import Collection, Iterator
 
-from robosac.audit.records import FrameAnswered
-from robosac.consensus import Verdict
-from robosac.defenses import Reason, Source
+from robosac.answers import Reason, Source, Verdict
+from robosac.audit.events import FrameAnswered
 
 
 def contradictions(
@@ -51,7 +50,7 @@ def _of_hypotheses(answer: FrameAnswered, threshold: float | None) -> Iterator[s
     if answer.sampling_steps != len(answer.hypotheses):
         yield f"{answer.sampling_steps} sampling steps, but {len(answer.hypotheses)} hypotheses"
     contradicted: set[str] = set().union(*(o.teammates for o in answer.hypotheses if o.verdict is Verdict.DISSENSUS))
-    blamed = {name for name, reason in answer.rejected.items() if reason == Reason.DISSENSUS} - contradicted
+    blamed = {name for name, why in answer.rejected.items() if why.reason is Reason.DISSENSUS} - contradicted
     if blamed:
         yield f"{_listed(blamed)} rejected for a dissensus, but in no hypothesis of that verdict"
     if threshold is None:

@@ -7,15 +7,24 @@ report about shared feature maps. docs/audit.md has the table, and what of it is
 from __future__ import annotations
 
 import base64
-from collections.abc import Iterable, Mapping
+from collections.abc import Iterable
 from dataclasses import dataclass, field
 from datetime import UTC, datetime, timedelta
 from typing import Any
 
+from robosac.answers import Reason, TestedHypothesis, Verdict
 from robosac.audit.chain import GENESIS, digest
-from robosac.audit.records import Equivocation, FrameAnswered, Proof, RecordError, SessionOpened, TeamChanged, read
-from robosac.consensus import Verdict
-from robosac.defenses import Outcome, Reference
+from robosac.audit.events import (
+    Equivocation,
+    FrameAnswered,
+    Proof,
+    RecordError,
+    SessionOpened,
+    TeamChanged,
+    event_on,
+    read,
+)
+from robosac.defenses import Reference
 
 VERSION = 2
 """Of the report's format, in V2.1.1."""
@@ -111,23 +120,23 @@ class _Case:
         record = read(line)
         self.head = digest(line.decode())
         self.last_seq, self.session_id = int(record["seq"]), str(record["session_id"])
-        match record.get("event"):
-            case "session_opened":
-                self.session = SessionOpened.of(record)
-                self.key = self.session.public_keys.get(self.vehicle)
-            case "team_changed":
-                self.key = TeamChanged.of(record).public_keys.get(self.vehicle)
-            case "frame_answered":
-                self._take_answer(FrameAnswered.of(record), record)
-            case "equivocation":
-                self._take_equivocation(Equivocation.of(record), record)
+        match event_on(line):
+            case SessionOpened() as opened:
+                self.session = opened
+                self.key = opened.public_keys.get(self.vehicle)
+            case TeamChanged() as change:
+                self.key = change.public_keys.get(self.vehicle)
+            case FrameAnswered() as answer:
+                self._take_answer(answer)
+            case Equivocation() as lie:
+                self._take_equivocation(lie)
 
-    def _take_answer(self, answer: FrameAnswered, record: Mapping[str, Any]) -> None:
+    def _take_answer(self, answer: FrameAnswered) -> None:
         proof = answer.messages.get(self.vehicle)
         if proof is None:
             return
         self.proofs[proof.digest] = proof
-        if answer.rejected.get(self.vehicle) != "dissensus":
+        if self.vehicle not in answer.rejected or answer.rejected[self.vehicle].reason is not Reason.DISSENSUS:
             return
         against = [i for i, o in enumerate(answer.hypotheses) if self._contradicted(o)]
         self._observe(
@@ -148,11 +157,11 @@ class _Case:
                 "id": "decision",
                 "evidence": {
                     "seq": self.last_seq,
-                    "time": record.get("time"),
+                    "time": answer.time,
                     "frame": answer.frame,
                     "source": answer.source.value,
                     "accepted": list(answer.accepted),
-                    "rejected": dict(answer.rejected),
+                    "rejected": {name: why.reason.value for name, why in answer.rejected.items()},
                     "hypotheses": [
                         {"teammates": list(o.teammates), "jaccardIndex": o.jaccard_index, "verdict": o.verdict.value}
                         for o in answer.hypotheses
@@ -163,10 +172,10 @@ class _Case:
         )
         self.location = {"frame": answer.frame, "worldFromSensor": answer.ego_pose.reshape(-1).tolist()}
 
-    def _take_equivocation(self, lie: Equivocation, record: Mapping[str, Any]) -> None:
+    def _take_equivocation(self, lie: Equivocation) -> None:
         if lie.vehicle_id == self.vehicle:
             first = lie.first if lie.first.signature else self.proofs.get(lie.first.digest, lie.first)
-            obs = {"frame": lie.frame, "time": record.get("time")}
+            obs = {"frame": lie.frame, "time": lie.time}
             self._observe("message", "equivocation", SAME_STATION, obs, lie.frame, [first, lie.second])
 
     def _observe(
@@ -187,7 +196,7 @@ class _Case:
         )
         self.seqs.append(self.last_seq)
 
-    def _contradicted(self, outcome: Outcome) -> bool:
+    def _contradicted(self, outcome: TestedHypothesis) -> bool:
         return self.vehicle in outcome.teammates and outcome.verdict is Verdict.DISSENSUS
 
     def _followed_previous(self, answer: FrameAnswered) -> bool:

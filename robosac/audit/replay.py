@@ -12,7 +12,7 @@ from typing import Any, cast
 import numpy as np
 
 from robosac import wire
-from robosac.audit.records import FrameAnswered, RecordError, SessionOpened, TeamChanged, read
+from robosac.audit.events import FrameAnswered, RecordError, SessionOpened, TeamChanged, event_on
 from robosac.calibration import calibration_digest, calibration_of
 from robosac.defenses import Conversation, Decision, Defense, GroupTesting, Outcome, State, build
 from robosac.detectors import Message, Preparer
@@ -91,24 +91,19 @@ def find(lines: Iterable[bytes], frame: int) -> LoggedDecision:
     recent: deque[FrameAnswered] = deque(maxlen=2)
     for number, line in enumerate(lines, 1):
         try:
-            record = read(line.removesuffix(b"\n"))
-            event = record.get("event")
-            if event == "session_opened":
-                session = SessionOpened.of(record)
-                state = session.state
-            elif event == "team_changed":
-                state = TeamChanged.of(record).state
-            if event != "frame_answered":
-                continue
-            answer = FrameAnswered.of(record)
+            event = event_on(line.removesuffix(b"\n"))
         except RecordError as error:
             raise ReplayError(f"line {number}: {error}") from error
-        if session is None:
-            raise ReplayError("the log does not begin with the session's opening")
-        if answer.frame == frame:
-            return LoggedDecision(number, session, state, _before(answer, recent), answer)
-        recent.append(answer)
-        state = answer.state
+        if isinstance(event, SessionOpened):
+            session = event
+        if isinstance(event, FrameAnswered):
+            if session is None:
+                raise ReplayError("the log does not begin with the session's opening")
+            if event.frame == frame:
+                return LoggedDecision(number, session, state, _before(event, recent), event)
+            recent.append(event)
+        if isinstance(event, SessionOpened | TeamChanged | FrameAnswered):
+            state = event.state
     raise ReplayError(f"the log holds no answer to frame {frame}")
 
 
@@ -249,7 +244,7 @@ def _compare(logged: FrameAnswered, made: FusionResult) -> list[Difference]:
             ("source", made.source.value, logged.source.value),
             ("accepted", list(made.accepted), list(logged.accepted)),
             *(
-                ("rejected", f"{name} {now.reason.value}", f"{name} {logged.rejected.get(name)}")
+                ("rejected", f"{name} {now.reason.value}", f"{name} {_reason(logged, name)}")
                 for name, now in made.rejected.items()
             ),
             ("state", dict(made.state), dict(logged.state)),
@@ -257,6 +252,10 @@ def _compare(logged: FrameAnswered, made: FusionResult) -> list[Difference]:
         if not _agree(now, then)
     ]
     return [*differences, *_compare_hypotheses(logged, made), *_compare_boxes(logged, made)]
+
+
+def _reason(logged: FrameAnswered, name: str) -> str | None:
+    return logged.rejected[name].reason.value if name in logged.rejected else None
 
 
 def _compare_hypotheses(logged: FrameAnswered, made: FusionResult) -> list[Difference]:

@@ -10,14 +10,15 @@ from typing import Any
 
 from robosac.audit.chain import GENESIS, commitment
 from robosac.audit.contradictions import contradictions
-from robosac.audit.records import (
+from robosac.audit.events import (
     Equivocation,
     FrameAnswered,
     Proof,
-    Record,
     RecordError,
+    SessionEnded,
     SessionOpened,
     TeamChanged,
+    event_on,
     is_canonical,
     read,
 )
@@ -147,7 +148,7 @@ class _Verification:
                 self._history = _History()
             self._history.doubt()
         try:
-            self._check(record)
+            self._check(record, line)
         except RecordError as error:
             self._find(Fault.MALFORMED, str(error))
             self._history.doubt()
@@ -179,7 +180,7 @@ class _Verification:
             return None
         return record
 
-    def _is_linked(self, record: Record, before: str | None) -> bool:
+    def _is_linked(self, record: Mapping[str, Any], before: str | None) -> bool:
         """Whether a record follows the one before; ``before`` is that one's digest, if it can be relied on."""
         found = len(self.findings)
         if self._seq is None:
@@ -199,30 +200,27 @@ class _Verification:
         self._session = session if isinstance(session, str) else self._session
         return len(self.findings) == found
 
-    def _check(self, record: Record) -> None:
-        event = record.get("event")
-        if (event == "session_opened") != (self._line == 1):
+    def _check(self, record: Mapping[str, Any], line: bytes) -> None:
+        if (record.get("event") == "session_opened") != (self._line == 1):
             self._find(Fault.MISPLACED, "the session is opened again" if self._line > 1 else "no session is opened")
         if self._ended:
             self._find(Fault.MISPLACED, "the session has ended before")
             self._ended = False
-        match event:
-            case "session_opened":
-                self._open(SessionOpened.of(record))
-            case "team_changed":
-                change = TeamChanged.of(record)
+        match event_on(line):
+            case SessionOpened() as opened:
+                self._open(opened)
+            case TeamChanged() as change:
                 self._enrol(change.public_keys)
                 self._history.trusted = tuple(change.state.get("trusted", ()))
-            case "frame_answered":
-                self._check_answer(FrameAnswered.of(record))
-            case "equivocation":
-                lie = Equivocation.of(record)
+            case FrameAnswered() as answer:
+                self._check_answer(answer)
+            case Equivocation() as lie:
                 if lie.first.digest == lie.second.digest:
                     self._find(Fault.CONTRADICTION, "an equivocation of one message with itself")
                 if lie.first.signature is not None:
                     self._check_signature(lie.vehicle_id, lie.first)
                 self._check_signature(lie.vehicle_id, lie.second)
-            case "session_ended":
+            case SessionEnded():
                 self._ended = True
 
     def _open(self, opened: SessionOpened) -> None:

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from robosac.answers import Distrust, Reason, Source, Verdict
 from robosac.defenses.a2cp import A2CP
 from robosac.defenses.building import build
 from robosac.defenses.conformal import Conformal
@@ -14,10 +15,8 @@ from robosac.defenses.protocol import (
     Defense,
     Hypothesis,
     Outcome,
-    Reason,
     Reference,
     Rejection,
-    Source,
     State,
 )
 from robosac.defenses.sample_consensus import SampleConsensus
@@ -30,6 +29,7 @@ __all__ = [
     "Conversation",
     "Decision",
     "Defense",
+    "Distrust",
     "Halving",
     "GroupTesting",
     "Hypothesis",
@@ -43,5 +43,6 @@ __all__ = [
     "State",
     "StaticTeam",
     "Undefended",
+    "Verdict",
     "build",
 ]

@@ -9,18 +9,10 @@ from typing import ClassVar
 
 import numpy as np
 
+from robosac.answers import Source, Verdict
 from robosac.budget import DEFAULT_CONFIDENCE, DomainError, eq2_budget
-from robosac.consensus import DEFAULT_THRESHOLD, Verdict
-from robosac.defenses.protocol import (
-    Conversation,
-    Decision,
-    Hypothesis,
-    Outcome,
-    Reference,
-    Source,
-    State,
-    explain_rejections,
-)
+from robosac.consensus import DEFAULT_THRESHOLD
+from robosac.defenses.protocol import Conversation, Decision, Hypothesis, Outcome, Reference, State, explain_rejections
 from robosac.defenses.sampling import check_budget, check_threshold, draw, search
 
 DEFAULT_BUDGET = 5

@@ -8,12 +8,12 @@ from typing import ClassVar
 
 import numpy as np
 
+from robosac.answers import Reason, Verdict
 from robosac.boxes import FloatArray
 from robosac.budget import DomainError
-from robosac.consensus import Verdict
 from robosac.defenses.benign_scores import SINGLE_TEAMMATE
 from robosac.defenses.memoryless import Memoryless, decide, unite
-from robosac.defenses.protocol import Conversation, Hypothesis, Outcome, Reason, Rejection, State
+from robosac.defenses.protocol import Conversation, Hypothesis, Outcome, Rejection, State
 
 DEFAULT_RATE = 0.05
 

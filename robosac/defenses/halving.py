@@ -8,7 +8,7 @@ from typing import ClassVar
 
 import numpy as np
 
-from robosac.consensus import Verdict
+from robosac.answers import Verdict
 from robosac.defenses.memoryless import Memoryless, decide, unite
 from robosac.defenses.protocol import Conversation, Hypothesis, Outcome, State
 

@@ -5,17 +5,9 @@ from __future__ import annotations
 from collections.abc import Collection, Generator, Sequence
 from dataclasses import dataclass
 
-from robosac.consensus import DEFAULT_THRESHOLD, Verdict
-from robosac.defenses.protocol import (
-    Decision,
-    Hypothesis,
-    Outcome,
-    Reference,
-    Rejection,
-    Source,
-    State,
-    explain_rejections,
-)
+from robosac.answers import Source, Verdict
+from robosac.consensus import DEFAULT_THRESHOLD
+from robosac.defenses.protocol import Decision, Hypothesis, Outcome, Reference, Rejection, State, explain_rejections
 from robosac.defenses.sampling import check_threshold
 
 

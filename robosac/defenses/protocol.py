@@ -18,8 +18,8 @@ from typing import Any, ClassVar, Protocol
 
 import numpy as np
 
+from robosac.answers import Distrust, Reason, Source, Verdict
 from robosac.boxes import FloatArray
-from robosac.consensus import Verdict
 
 Hypothesis = tuple[str, ...]
 State = Mapping[str, Any]
@@ -32,32 +32,6 @@ class Reference(StrEnum):
     """The ego's own perception of the frame."""
     PREVIOUS = "previous"
     """The previous frame's answer, moved on by a frame; saves the pass of the ego's own perception."""
-
-
-class Source(StrEnum):
-    """Where the boxes of an answer come from."""
-
-    CONSENSUS = "consensus"
-    TRUSTED = "trusted"
-    EGO_ONLY = "ego_only"
-
-
-class Reason(StrEnum):
-    """Why a teammate was left out of an answer.
-
-    ``not_sampled`` also stands where a teammate was in tested hypotheses but no verdict was reached, because ego and
-    fusion were both empty.
-    """
-
-    DISSENSUS = "dissensus"
-    NOT_SAMPLED = "not_sampled"
-    DISTRUSTED = "distrusted"
-    MISSING = "missing"
-    LATE = "late"
-    MALFORMED = "malformed"
-    STALE = "stale"
-    UNAUTHENTICATED = "unauthenticated"
-    REPLAYED = "replayed"
 
 
 @dataclass(frozen=True)
@@ -99,10 +73,13 @@ class Rejection:
     evidence : mapping
         JSON values; for ``dissensus`` the indices of the hypotheses that speak against the teammate and their lowest
         Jaccard index.
+    distrust : Distrust or None
+        Which kind, for ``distrusted``.
     """
 
     reason: Reason
     evidence: Mapping[str, Any] = field(default_factory=dict)
+    distrust: Distrust | None = None
 
 
 @dataclass(frozen=True)
@@ -172,11 +149,11 @@ def explain_rejections(
     team: Sequence[str],
     accepted: Collection[str],
     outcomes: Sequence[Outcome],
-    otherwise: Reason = Reason.NOT_SAMPLED,
+    otherwise: Rejection = Rejection(Reason.NOT_SAMPLED),
 ) -> dict[str, Rejection]:
     """A reason for every teammate that is not accepted, from the outcomes of the frame.
 
-    Those that no outcome speaks against get the reason ``otherwise``.
+    Those that no outcome speaks against are rejected as ``otherwise`` says.
     """
     rejected = {}
     for teammate in team:
@@ -187,5 +164,5 @@ def explain_rejections(
             lowest = min(outcomes[i].jaccard_index for i in against)
             rejected[teammate] = Rejection(Reason.DISSENSUS, {"hypotheses": against, "lowest_jaccard_index": lowest})
         else:
-            rejected[teammate] = Rejection(otherwise)
+            rejected[teammate] = otherwise
     return rejected

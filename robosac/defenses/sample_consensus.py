@@ -8,7 +8,8 @@ from typing import ClassVar
 
 import numpy as np
 
-from robosac.defenses.protocol import Conversation, Decision, Hypothesis, Outcome, Source, State, explain_rejections
+from robosac.answers import Source
+from robosac.defenses.protocol import Conversation, Decision, Hypothesis, Outcome, State, explain_rejections
 from robosac.defenses.sampling import SamplingSettings, search
 
 

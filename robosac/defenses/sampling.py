@@ -8,6 +8,7 @@ from math import comb
 
 import numpy as np
 
+from robosac.answers import Verdict
 from robosac.budget import (
     DEFAULT_CONFIDENCE,
     DomainError,
@@ -15,7 +16,7 @@ from robosac.budget import (
     exact_budget,
     exact_collaborators,
 )
-from robosac.consensus import DEFAULT_THRESHOLD, Verdict
+from robosac.consensus import DEFAULT_THRESHOLD
 from robosac.defenses.protocol import Hypothesis, Outcome, Reference
 
 DEFAULT_BUDGET = 7

@@ -8,18 +8,9 @@ from typing import ClassVar
 
 import numpy as np
 
+from robosac.answers import Distrust, Reason, Source, Verdict
 from robosac.budget import DomainError
-from robosac.consensus import Verdict
-from robosac.defenses.protocol import (
-    Conversation,
-    Decision,
-    Hypothesis,
-    Outcome,
-    Reason,
-    Source,
-    State,
-    explain_rejections,
-)
+from robosac.defenses.protocol import Conversation, Decision, Hypothesis, Outcome, Rejection, State, explain_rejections
 from robosac.defenses.sampling import SamplingSettings, search
 
 DEFAULT_RECHECK = 10
@@ -103,7 +94,8 @@ class StaticTeam(SamplingSettings):
         trusted: Sequence[str],
         waited: int,
     ) -> Decision:
-        otherwise = Reason.DISTRUSTED if source is Source.TRUSTED else Reason.NOT_SAMPLED
+        untrusted = Rejection(Reason.DISTRUSTED, distrust=Distrust.UNTRUSTED)
+        otherwise = untrusted if source is Source.TRUSTED else Rejection(Reason.NOT_SAMPLED)
         return Decision(
             accepted=accepted,
             source=source,

@@ -8,8 +8,9 @@ from typing import ClassVar
 
 import numpy as np
 
+from robosac.answers import Source
 from robosac.consensus import DEFAULT_THRESHOLD
-from robosac.defenses.protocol import Conversation, Decision, Reference, Source, State
+from robosac.defenses.protocol import Conversation, Decision, Reference, State
 
 
 @dataclass(frozen=True)

@@ -4,7 +4,8 @@ from __future__ import annotations
 
 from collections.abc import Callable, Sequence
 
-from robosac.consensus import Verdict, at_least, compare
+from robosac.answers import Verdict
+from robosac.consensus import at_least, compare
 from robosac.detectors import Detector
 from robosac.evaluation.frames import encode_all
 from robosac.scenes import IntersectionScene

@@ -8,8 +8,9 @@ from itertools import combinations
 
 import numpy as np
 
+from robosac.answers import Verdict
 from robosac.attacks import Attack, Campaign
-from robosac.consensus import Verdict, at_least, compare
+from robosac.consensus import at_least, compare
 from robosac.defenses import SampleConsensus
 from robosac.detectors import Detector, PreparedFrame
 from robosac.evaluation.average_precision import AveragePrecision

@@ -7,7 +7,7 @@ from typing import Any
 
 import numpy as np
 
-from robosac.consensus import Verdict
+from robosac.answers import Verdict
 from robosac.defenses import Decision, Defense, Hypothesis, Outcome, State
 
 

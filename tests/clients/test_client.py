@@ -94,9 +94,9 @@ def test_a_frame_without_boxes_has_an_empty_array():
         "frame": 0, "boxes": [], "source": "ego_only", "accepted": [], "rejected": [], "hypotheses": [],
         "sampling_steps": 0, "attacker_ratio": None, "deadline_met": True, "degraded_by": None, "timings_ms": {},
     }  # fmt: skip
-    assert FrameAnswer.parse(fields).boxes.shape == (0, 6)
+    assert FrameAnswer.model_validate(fields).boxes.shape == (0, 6)
     np.testing.assert_array_equal(
-        FrameAnswer.parse({**fields, "boxes": [[1, 2, 3, 4, 5, 6]]}).boxes, [[1, 2, 3, 4, 5, 6]]
+        FrameAnswer.model_validate({**fields, "boxes": [[1, 2, 3, 4, 5, 6]]}).boxes, [[1, 2, 3, 4, 5, 6]]
     )
 
 

@@ -57,7 +57,7 @@ def test_no_incident_loses_anything(tmp_path):
 
 
 def test_a_good_log_is_followed(driven):
-    driven.acknowledged = {0: FrameAnswer.parse({**ANSWER, "frame": 0})}
+    driven.acknowledged = {0: FrameAnswer.model_validate({**ANSWER, "frame": 0})}
     lines = log(0, 1)
     assert complaints(driven, lines) == []
     assert (driven.seq, driven.head, driven.answered, driven.last_frame) == (3, digest(lines[-1]), 2, 1)
@@ -74,12 +74,12 @@ def test_a_good_log_is_followed(driven):
     ],
 )
 def test_a_bad_log_is_found_out(driven, lines, complaint):
-    driven.acknowledged = {0: FrameAnswer.parse({**ANSWER, "frame": 0})}
+    driven.acknowledged = {0: FrameAnswer.model_validate({**ANSWER, "frame": 0})}
     assert any(complaint in one for one in complaints(driven, lines))
 
 
 def test_boxes_count_too(driven):
-    answer = FrameAnswer.parse({**ANSWER, "frame": 0, "boxes": np.ones((1, 6))})
+    answer = FrameAnswer.model_validate({**ANSWER, "frame": 0, "boxes": np.ones((1, 6))})
     driven.acknowledged = {0: answer}
     assert any("another result" in one for one in complaints(driven, log(0)))
 

@@ -1,8 +1,9 @@
 import numpy as np
 import pytest
 
+from robosac.answers import Verdict
 from robosac.boxes import from_corners, pairwise_iou
-from robosac.consensus import Verdict, compare, match
+from robosac.consensus import compare, match
 from tests.conftest import GOLDEN
 
 EMPTY = np.empty((0, 5))

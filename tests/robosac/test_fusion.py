@@ -5,9 +5,9 @@ from dataclasses import replace
 import numpy as np
 import pytest
 
+from robosac.answers import Reason, Source, Verdict
 from robosac.boxes import from_world, pose_matrix
-from robosac.consensus import Verdict
-from robosac.defenses import Decision, Reason, Reference, SampleConsensus, Source, StaticTeam, Undefended
+from robosac.defenses import Decision, Reference, SampleConsensus, StaticTeam, Undefended
 from robosac.detectors import DetectorInfo, Message
 from robosac.fusion import SAFETY, fuse
 from robosac.previous import PreviousAnswer

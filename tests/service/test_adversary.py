@@ -90,7 +90,7 @@ async def test_two_versions_of_a_message_are_an_equivocation(served, session, me
     for message, status in ((messages["rsu"], 202), (other, 409)):
         body = wire.pack_message(0, "rsu", message)
         assert (await served.post(session, "messages", body, token)).status_code == status
-    assert (await served.ego(session).ask(0, messages[EGO])).rejected["rsu"]["reason"] == "distrusted"
+    assert (await served.ego(session).ask(0, messages[EGO])).rejected["rsu"].reason == "distrusted"
     assert await refusals(served, session) == [("rsu", "equivocation")]
     await still_serves(served, session, messages, benign)
 
@@ -102,7 +102,7 @@ async def test_what_is_no_number_goes_into_no_fusion(value, served, session, mes
     poisoned = {**benign, "rsu": Message(benign["rsu"].pose, {"features": features})}
     answer = await served.ego(session).post_frame(0, messages[EGO], poisoned)
     assert answer.accepted == TEAM[:-1]
-    assert answer.rejected["rsu"]["field"] == "teammates.rsu.tensors.features.data"
+    assert answer.rejected["rsu"].field == "teammates.rsu.tensors.features.data"
     pose = np.array(benign["rsu"].pose)
     pose[0, 3] = value
     body = wire.pack_message(1, "rsu", Message(pose, benign["rsu"].tensors))
@@ -137,8 +137,8 @@ async def test_a_vehicle_that_teleports_is_left_out(served, session, messages, b
     moved = {**benign, "rsu": Message(pose, benign["rsu"].tensors)}
     answer = await served.ego(session).post_frame(1, messages[EGO], moved)
     assert answer.accepted == TEAM[:-1]
-    assert "possible" in answer.rejected["rsu"]["detail"]
-    assert (await served.ego(session).audit())[-1]["rejected"][-1]["detail"] == answer.rejected["rsu"]["detail"]
+    assert "possible" in answer.rejected["rsu"].detail
+    assert (await served.ego(session).audit())[-1]["rejected"][-1]["detail"] == answer.rejected["rsu"].detail
 
 
 async def test_a_flood_of_boxes_costs_little_more_than_a_usual_frame(served, detector, messages, benign):
@@ -192,7 +192,7 @@ async def test_ids_cannot_write_log_lines(name, served, session, messages, capsy
     body = wire.pack_message(0, name, messages["rsu"])
     problem(await served.post(session, "messages", body, session.teammate_tokens["rsu"]), 403, "wrong-vehicle")
     answer = await served.ego(session).post_frame(0, messages[EGO], {name: messages["rsu"]})
-    assert answer.rejected[name]["reason"] == "unauthenticated"
+    assert answer.rejected[name].reason == "unauthenticated"
     lines = (await served.http.get(
         f"/v1/sessions/{session.session_id}/audit", headers={"Authorization": f"Bearer {session.ego_token}"}
     )).content.split(b"\n")  # fmt: skip

@@ -78,7 +78,7 @@ async def test_a_bad_message_is_refused_recorded_and_costs_its_sender_only(
         await served.teammate(session, name).send(0, messages[name])
     answer = await ego.ask(0, messages["car-1"])
     assert answer.source == "consensus"
-    assert answer.rejected["car-2"]["reason"] == "malformed"
+    assert answer.rejected["car-2"].reason == "malformed"
     (refusal,) = [record for record in await ego.audit() if record["event"] == "message_refused"]
     assert (refusal["vehicle_id"], refusal["reason"], refusal["field"]) == ("car-2", "malformed", field)
     await served.teammate(session, "car-2").send(1, messages["car-2"])
@@ -155,8 +155,8 @@ async def test_a_vehicle_cannot_speak_for_another(served, messages):
     problem(await served.post(session, "messages", body, session.ego_token), 403, "wrong-vehicle")
     problem(await served.post(session, "frames", body, thief), 403, "ego-only")
     answer = await ego.ask(0, messages["car-1"])
-    assert answer.rejected["car-2"]["reason"] == "unauthenticated"
-    assert answer.rejected["car-3"]["reason"] == "missing"
+    assert answer.rejected["car-2"].reason == "unauthenticated"
+    assert answer.rejected["car-3"].reason == "missing"
     refused = [r for r in await ego.audit() if r["event"] == "message_refused"]
     assert [r["vehicle_id"] for r in refused] == ["car-2"] * 3 + ["car-1", "car-2"]
     assert {r["reason"] for r in refused} == {"unauthenticated"}
@@ -219,7 +219,7 @@ async def test_a_message_may_be_no_larger_than_its_detector_needs(served, messag
         "unsupported-media-type",
     )
     answer = await served.ego(session).ask(0, messages["car-1"])
-    assert answer.rejected["car-2"]["reason"] == "malformed"
+    assert answer.rejected["car-2"].reason == "malformed"
     refused = [r["detail"] for r in await served.ego(session).audit() if r["event"] == "message_refused"]
     assert len(refused) == 2
 

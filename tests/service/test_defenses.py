@@ -24,7 +24,8 @@ async def test_a_static_team_is_found_once_and_then_trusted(served, ego_message,
     assert all(answer.accepted == answers[0].accepted for answer in answers)
     assert "car-2" not in state["trusted"]
     assert [answer.sampling_steps for answer in answers[1:]] == [0, 0, 1, 0, 0, 1]
-    assert {entry["reason"] for entry in answers[1].rejected.values()} == {"distrusted"}
+    assert {(why.reason, why.distrust) for why in answers[1].rejected.values()} == {("distrusted", "untrusted")}
+    assert answers[1].named == ()
     assert answers[1].timings_ms["ego_only"] == 0
 
 
@@ -40,7 +41,7 @@ async def test_a_hijacked_teammate_is_found_at_the_next_recheck(served, ego_mess
         frame += 1
     struck = await run(served, session, ego_message, attacked, 3, start=1)
     assert [answer.source for answer in struck[:2]] == ["trusted", "trusted"]
-    assert struck[2].hypotheses[0]["verdict"] == "dissensus"
+    assert struck[2].hypotheses[0].verdict == "dissensus"
     assert "car-2" not in struck[2].accepted
     assert "car-2" not in (await served.ego(session).state())["state"]["trusted"]
 
@@ -130,7 +131,7 @@ async def test_teammates_join_and_leave_between_frames(served, messages):
     await served.client.vehicle(session.session_id, "rsu", tokens["rsu"]).send(1, messages["rsu"])
     answer = await ego.ask(1, messages["car-1"])
     assert set(answer.accepted) | set(answer.rejected) == {"car-3", "rsu", "car-4"}
-    assert answer.rejected["car-4"]["reason"] == "missing"
+    assert answer.rejected["car-4"].reason == "missing"
     events = [record for record in await ego.audit() if record["event"] == "team_changed"]
     assert [(event["joined"], event["left"]) for event in events] == [(["rsu", "car-4"], []), ([], ["car-2"])]
 
@@ -140,7 +141,7 @@ async def test_a_frame_is_fused_with_the_team_of_its_moment(served, ego_message,
     await dismiss(served, session, "car-3")
     answer = await served.ego(session).post_frame(0, ego_message, benign)
     assert set(answer.accepted) == set(TEAM) - {"car-3"}
-    assert answer.rejected["car-3"]["reason"] == "unauthenticated"
+    assert answer.rejected["car-3"].reason == "unauthenticated"
 
 
 async def test_a2cp_begins_again_with_a_new_team(served, ego_message, benign):
@@ -175,7 +176,7 @@ async def test_group_testing_names_the_attacker_and_tells_its_suspicion(served, 
     answers = await run(served, session, ego_message, attacked, 4)
     assert all("car-2" not in answer.accepted for answer in answers)
     last = answers[-1].rejected["car-2"]
-    assert last["reason"] == "distrusted"
+    assert (last.reason, last.distrust, answers[-1].named) == ("distrusted", "named", ("car-2",))
     assert {item["test"] for item in last["evidence"]} <= {"ego", "pair", "change"}
     body = wire.pack_frame(9, ego_message, attacked)
     result = (await served.post(session, "frames", body)).json()

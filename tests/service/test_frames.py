@@ -31,9 +31,9 @@ async def test_over_http_and_through_the_library_the_answer_is_the_same(detector
             )
             np.testing.assert_array_equal(answer.boxes, expected.boxes)
             assert answer.accepted == expected.accepted
-            assert [tuple(h["teammates"]) for h in answer.hypotheses] == [o.teammates for o in expected.hypotheses]
-            assert [h["verdict"] for h in answer.hypotheses] == [o.verdict.value for o in expected.hypotheses]
-            assert [h["jaccard_index"] for h in answer.hypotheses] == [o.jaccard_index for o in expected.hypotheses]
+            assert [tuple(h.teammates) for h in answer.hypotheses] == [o.teammates for o in expected.hypotheses]
+            assert [h.verdict for h in answer.hypotheses] == [o.verdict.value for o in expected.hypotheses]
+            assert [h.jaccard_index for h in answer.hypotheses] == [o.jaccard_index for o in expected.hypotheses]
             assert "car-2" not in answer.accepted
             steps.append(answer.sampling_steps)
         assert max(steps) > 1
@@ -107,7 +107,7 @@ async def test_vehicles_send_their_own_messages(served, messages):
     sends = [served.teammate(session, name).send(0, messages[name]) for name in TEAM]
     answer, *_ = await asyncio.gather(served.ego(session).ask(0, messages[EGO]), *sends)
     assert answer.source == "consensus"
-    assert {entry["reason"] for entry in answer.rejected.values()} <= {"not_sampled", "dissensus"}
+    assert {entry.reason for entry in answer.rejected.values()} <= {"not_sampled", "dissensus"}
     assert answer.timings_ms["gather"] >= 0
 
 
@@ -125,7 +125,7 @@ async def test_missing_teammates_are_waited_for_and_then_left_out(served, messag
         await served.teammate(session, name).send(0, messages[name])
     answer = await served.ego(session).ask(0, messages[EGO])
     assert answer.timings_ms["gather"] >= 50
-    assert [answer.rejected[name]["reason"] for name in ("car-4", "car-5", "rsu")] == ["missing"] * 3
+    assert [answer.rejected[name].reason for name in ("car-4", "car-5", "rsu")] == ["missing"] * 3
     assert set(answer.accepted) <= {"car-2", "car-3"}
 
 
@@ -171,9 +171,9 @@ async def test_a_refused_message_counts_for_its_own_frame(served, messages):
     early["pose"] = [0.0] * 16
     problem(await served.post(session, "messages", msgpack.packb(early), token), 422, "bad-pose")
     assert (await ego.ask(0, messages[EGO])).accepted == ("rsu",)
-    assert (await ego.ask(1, messages[EGO])).rejected["rsu"]["reason"] == "missing"
-    assert (await ego.ask(2, messages[EGO])).rejected["rsu"]["reason"] == "malformed"
-    assert (await ego.ask(3, messages[EGO])).rejected["rsu"]["reason"] == "missing"
+    assert (await ego.ask(1, messages[EGO])).rejected["rsu"].reason == "missing"
+    assert (await ego.ask(2, messages[EGO])).rejected["rsu"].reason == "malformed"
+    assert (await ego.ask(3, messages[EGO])).rejected["rsu"].reason == "missing"
 
 
 async def test_a_message_for_a_session_that_has_ended_is_not_accepted(served, messages, monkeypatch):
@@ -206,12 +206,12 @@ async def test_late_stale_and_second_messages_are_refused_and_named(served, mess
     problem(await post(5), 409, "duplicate-message")
     assert (await ego.ask(5, messages[EGO])).accepted == ("car-2",)
     problem(await post(5), 409, "duplicate-message")
-    assert (await ego.ask(6, messages[EGO])).rejected["car-2"]["reason"] == "replayed"
+    assert (await ego.ask(6, messages[EGO])).rejected["car-2"].reason == "replayed"
     problem(await post(6), 409, "stale-frame")
-    assert (await ego.ask(7, messages[EGO])).rejected["car-2"]["reason"] == "late"
+    assert (await ego.ask(7, messages[EGO])).rejected["car-2"].reason == "late"
     problem(await post(3), 409, "stale-frame")
-    assert (await ego.ask(8, messages[EGO])).rejected["car-2"]["reason"] == "stale"
-    assert (await ego.ask(9, messages[EGO])).rejected["car-2"]["reason"] == "missing"
+    assert (await ego.ask(8, messages[EGO])).rejected["car-2"].reason == "stale"
+    assert (await ego.ask(9, messages[EGO])).rejected["car-2"].reason == "missing"
     refused = [r["reason"] for r in await ego.audit() if r["event"] == "message_refused"]
     assert refused == ["replayed", "replayed", "late", "stale"]
 
@@ -322,7 +322,7 @@ async def test_an_empty_street_is_no_evidence_and_earns_nobody_trust(served, ego
     answer = await served.ego(session).post_frame(0, nothing, dict.fromkeys(TEAM, nothing))
     if len(answer.boxes) == 0:
         assert answer.source == "ego_only"
-        assert {h["verdict"] for h in answer.hypotheses} == {"no_evidence"}
+        assert {h.verdict for h in answer.hypotheses} == {"no_evidence"}
 
 
 async def test_the_audit_log_is_json_lines_from_any_point(served, ego_message, attacked):

@@ -35,7 +35,8 @@ async def test_two_different_messages_for_a_frame_are_an_equivocation_and_neithe
     assert (await served.post(session, "messages", first, token)).status_code == 202
     problem(await served.post(session, "messages", second, token), 409, "equivocation")
     answer = await ego.ask(3, messages[EGO])
-    assert answer.rejected["car-2"]["reason"] == "distrusted"
+    assert (answer.rejected["car-2"].reason, answer.rejected["car-2"].distrust) == ("distrusted", "equivocation")
+    assert answer.named == ()
     (record,) = await events(ego, "equivocation")
     assert (record["vehicle_id"], record["frame"]) == ("car-2", 3)
     digests = [wire.content_digest(3, "car-2", m) for m in (messages["car-2"], altered(messages["car-2"]))]
@@ -74,8 +75,8 @@ async def test_a_teammate_that_cannot_be_where_it_says_is_left_out(settings, dx,
         ego = served.ego(session)
         assert (await ego.post_frame(0, messages[EGO], benign)).accepted == TEAM
         answer = await ego.post_frame(1, messages[EGO], {**benign, "rsu": moved(benign["rsu"], dx)})
-        assert answer.rejected["rsu"]["reason"] == "malformed"
-        assert answer.rejected["rsu"]["field"] == "pose"
+        assert answer.rejected["rsu"].reason == "malformed"
+        assert answer.rejected["rsu"].field == "pose"
         assert answer.accepted == TEAM[:-1]
         assert (await ego.post_frame(2, messages[EGO], benign)).accepted == TEAM
 
@@ -117,8 +118,8 @@ async def test_the_ego_cannot_put_words_into_the_mouth_of_a_teammate_that_signs(
     session = await served.open(defense=NONE, public_keys={"rsu": show_public_key(key)})
     ego = served.ego(session)
     invented = await ego.post_frame(0, messages[EGO], benign)
-    assert invented.rejected["rsu"]["reason"] == "unauthenticated"
-    assert invented.rejected["rsu"]["field"] == "teammates.rsu.signature"
+    assert invented.rejected["rsu"].reason == "unauthenticated"
+    assert invented.rejected["rsu"].field == "teammates.rsu.signature"
     signature = sign(key, session.session_id, wire.content_digest(1, "rsu", benign["rsu"]))
     assert (await ego.post_frame(1, messages[EGO], benign, {"rsu": signature})).accepted == TEAM
 

@@ -66,7 +66,7 @@ async def test_the_api_describes_itself(served):
     } <= paths
     body = description["paths"]["/v1/sessions/{sid}/frames"]["post"]
     assert "application/vnd.msgpack" in body["requestBody"]["content"]
-    assert "FrameResult" in str(body["responses"]["200"])
+    assert "FrameAnswer" in str(body["responses"]["200"])
     assert (await served.http.get("/docs")).status_code == 200
 
 

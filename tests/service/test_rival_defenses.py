@@ -9,7 +9,7 @@ async def test_they_answer_without_the_attacker(kind, served, ego_message, attac
     answer = await served.ego(session).post_frame(0, ego_message, attacked)
     assert answer.source == "consensus"
     assert len(answer.accepted) >= 3
-    assert answer.rejected["car-2"]["reason"] == "dissensus"
+    assert answer.rejected["car-2"].reason == "dissensus"
     assert answer.attacker_ratio is None
 
 

@@ -72,7 +72,7 @@ async def test_who_left_at_one_gateway_is_a_stranger_at_the_other(two, messages,
         await other.teammate(session, "rsu").send(1, messages["rsu"])
     answer = await other.ego(session).post_frame(1, messages[EGO], benign)
     assert answer.accepted == TEAM[:-1]
-    assert answer.rejected["rsu"]["reason"] == "unauthenticated"
+    assert answer.rejected["rsu"].reason == "unauthenticated"
     tokens = await one.ego(session).enrol(["rsu"])
     await other.client.vehicle(session.session_id, "rsu", tokens["rsu"]).send(2, messages["rsu"])
     assert (await other.ego(session).ask(2, messages[EGO])).accepted == ("rsu",)
@@ -121,7 +121,7 @@ async def test_a_decision_that_is_worked_out_again_forgets_nothing(two, messages
         problem(await other.http.get(path), 401, "unauthenticated")
     with meanwhile(other, monkeypatch, lambda: one.ego(session).dismiss("car-5")):
         answer = await other.ego(session).ask(0, messages[EGO])
-    reasons = {name: entry["reason"] for name, entry in answer.rejected.items()}
+    reasons = {name: entry.reason for name, entry in answer.rejected.items()}
     assert reasons == {"car-2": "distrusted", "car-3": "missing", "car-4": "missing", "rsu": "malformed"}
     assert (await one.ego(session).audit())[-1]["unlogged_refusals"] == {"rsu": 4, "?": 4}
     await rsu.send(1, messages["rsu"])

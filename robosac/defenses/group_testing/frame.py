@@ -9,8 +9,8 @@ from typing import Any
 
 import numpy as np
 
+from robosac.answers import Distrust, Reason, Source, Verdict
 from robosac.boxes import FloatArray
-from robosac.consensus import Verdict
 from robosac.defenses.group_testing import choice
 from robosac.defenses.group_testing.candidates import WITNESSES, candidates, cleared
 from robosac.defenses.group_testing.geometry import MIN_WITNESSES, PairMeasure, changes, crowd, followed, measure
@@ -25,16 +25,7 @@ from robosac.defenses.group_testing.memory import (
 )
 from robosac.defenses.group_testing.model import CLEAN, EvidenceModel, pair_bin
 from robosac.defenses.group_testing.posterior import EXACT, BoolArray, Posterior
-from robosac.defenses.protocol import (
-    Decision,
-    Hypothesis,
-    Outcome,
-    Reason,
-    Rejection,
-    Source,
-    State,
-    explain_rejections,
-)
+from robosac.defenses.protocol import Decision, Hypothesis, Outcome, Rejection, State, explain_rejections
 
 TRUSTED_BELOW = 0.1
 """Largest suspicion of a teammate on the trust list."""
@@ -290,11 +281,11 @@ class JudgedFrame:
         rejected = {}
         for name, rejection in explain_rejections(self._team, accepted, self._outcomes).items():
             evidence: dict[str, Any] = {**rejection.evidence, "suspicion": round(suspicion[name], 6)}
-            reason = rejection.reason
             if name in named:
-                reason = Reason.DISTRUSTED
                 evidence["evidence"] = [dict(item) for item in self._memory.evidence.get(name, ())]
-            rejected[name] = Rejection(reason, evidence)
+                rejected[name] = Rejection(Reason.DISTRUSTED, evidence, Distrust.NAMED)
+            else:
+                rejected[name] = Rejection(rejection.reason, evidence)
         return rejected
 
     def _suspicion(self) -> dict[str, float]:

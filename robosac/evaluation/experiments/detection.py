@@ -7,9 +7,10 @@ from itertools import combinations
 
 import numpy as np
 
+from robosac.answers import Verdict
 from robosac.attacks import BIM, PGD, Attack, CarliniWagner, Erase, GaussianNoise
 from robosac.boxes import FloatArray
-from robosac.consensus import Verdict, at_least, compare
+from robosac.consensus import at_least, compare
 from robosac.defenses import SampleConsensus
 from robosac.evaluation.experiments import paper
 from robosac.evaluation.experiments.common import Context, Recorded, Section, Table, precision

@@ -9,8 +9,9 @@ from itertools import combinations
 
 import numpy as np
 
+from robosac.answers import Verdict
 from robosac.boxes import FloatArray
-from robosac.consensus import Verdict, at_least, compare
+from robosac.consensus import at_least, compare
 from robosac.defenses import Defense, Reference, SampleConsensus, StaticTeam, Undefended
 from robosac.evaluation.experiments import paper
 from robosac.evaluation.experiments.common import Context, Recorded, Section, Table, precision

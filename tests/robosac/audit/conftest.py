@@ -5,14 +5,20 @@ import numpy as np
 import pytest
 from cryptography.hazmat.primitives.asymmetric.ed25519 import Ed25519PrivateKey
 
+from robosac.answers import Distrust, Reason, Source, Verdict
 from robosac.audit import GENESIS, commitment, digest, seal
-from robosac.consensus import Verdict
-from robosac.defenses import Outcome, Reason, Rejection, Source
+from robosac.audit.events import (
+    Equivocation,
+    FrameAnswered,
+    MessageRefused,
+    Proof,
+    SessionEnded,
+    SessionOpened,
+    TeamChanged,
+)
+from robosac.defenses import Outcome, Rejection
 from robosac.fusion import FusionResult
 from robosac.signatures import show_public_key, sign
-from service import audit
-from service.gathering import Received
-from service.store import SessionRecord
 
 SESSION = "5e5510"
 KEY = Ed25519PrivateKey.from_private_bytes(bytes(31) + b"\x01")
@@ -30,76 +36,71 @@ def head(lines: list[bytes]) -> str:
     return digest(lines[-1].decode().removesuffix("\n"))
 
 
-def proof(name: str, frame: int) -> dict[str, str]:
+def proof(name: str, frame: int) -> Proof:
     content = digest(f"{name} in {frame}")
-    signature = sign(KEY, SESSION, content) if name == "rsu" else None
-    return Received(None, content, signature).proof  # type: ignore[arg-type]
+    return Proof(digest=content, signature=sign(KEY, SESSION, content) if name == "rsu" else None)
 
 
 def answered(frame: int, seed: str, *outcomes: Outcome, trusted: tuple[str, ...] = (), source=Source.CONSENSUS):
     accepted = outcomes[-1].teammates if source is Source.CONSENSUS else trusted
     why = Rejection(Reason.DISSENSUS, {"hypotheses": [0], "lowest_jaccard_index": 0.125})
-    rejected = {"car-2": why if outcomes else Rejection(Reason.DISTRUSTED)}
+    rejected = {"car-2": why if outcomes else Rejection(Reason.DISTRUSTED, distrust=Distrust.UNTRUSTED)}
     state = {"trusted": list(trusted), "frames_since_check": 0}
     boxes = np.array([[1.5, 2.0, 4.0, 2.0, 0.25, 0.75]])
     result = FusionResult(
         boxes, source, accepted, rejected, outcomes, 0.2, True, False, None, {}, state, None
     )  # fmt: skip
-    answer = {
-        "frame": frame,
-        "boxes": boxes.tolist(),
-        "source": source.value,
-        "accepted": list(accepted),
-        "rejected": [{"vehicle_id": n, "reason": r.reason.value, **r.evidence} for n, r in rejected.items()],
-        "hypotheses": [
-            {"teammates": list(o.teammates), "jaccard_index": o.jaccard_index, "verdict": o.verdict.value}
-            for o in outcomes
-        ],
-        "sampling_steps": len(outcomes),
-    }
-    event = audit.frame_answered(
-        answer,
-        result,
+    event = FrameAnswered(
+        **dict(result.answer(frame, {}, {})),
         seed=seed,
         ego_pose=np.eye(4),
         messages={name: proof(name, frame) for name in ("car-1", "car-2", "rsu", "car-3")},
-        previous_frame=None,
-        unlogged={},
+        out_of_time=False,
+        state=state,
+        next_seed_commitment=commitment(f"{int(seed, 16) + 1:064x}"),
     )
-    return {**event, "next_seed_commitment": commitment(f"{int(seed, 16) + 1:064x}")}
+    return event.as_json()
 
 
 @pytest.fixture
 def events(detector) -> list[dict[str, Any]]:
     """A static team: found in frame 0, trusted in frame 1, an equivocation, a newcomer, found again in frame 5."""
     keys = {"rsu": show_public_key(KEY)}
-    record = SessionRecord(
-        session_id=SESSION,
+    opened = SessionOpened(
+        version="0.1.0",
         ego_id="car-1",
         teammates=("car-2", "rsu", "car-3"),
         detector=detector.info.name,
+        weights_digest=detector.info.weights_digest,
         defense={"kind": "static_team", "consensus_threshold": 0.3},
         latency_budget_ms=200.0,
         gather_ms=100.0,
         frame_period_ms=200.0,
-        token_ids={},
-        created_at=audit.now(),
-        seed=f"{0:064x}",
         public_keys=keys,
         state={"trusted": [], "frames_since_check": 0},
+        next_seed_commitment=commitment(f"{0:064x}"),
     )
     against = Outcome(("car-2", "rsu"), 0.125, Verdict.DISSENSUS)
     found = Outcome(("rsu", "car-3"), 0.75, Verdict.CONSENSUS)
-    team = ["car-2", "rsu", "car-3"]
+    team = ("car-2", "rsu", "car-3", "car-4")
+    change = TeamChanged(
+        joined=("car-4",),
+        left=(),
+        teammates=team,
+        public_keys=keys,
+        state={"trusted": ["rsu"], "frames_since_check": 0},
+    )
+    refusal = MessageRefused(vehicle_id="car-2", reason=Reason.MALFORMED, detail="ein Würfel", frame=2, field="pose")
+    first = Proof(digest=proof("rsu", 1).digest)
     return [
-        audit.session_opened(record, detector.info),
+        opened.as_json(),
         answered(0, f"{0:064x}", against, found, trusted=("rsu", "car-3")),
         answered(1, f"{1:064x}", source=Source.TRUSTED, trusted=("rsu", "car-3")),
-        audit.message_refused("car-2", Reason.MALFORMED, "ein Würfel", frame=2, field="pose"),
-        audit.equivocation("rsu", 1, {"digest": proof("rsu", 1)["digest"]}, proof("rsu", 99)),
-        audit.team_changed(team, [*team, "car-4"], keys, {"trusted": ["rsu"], "frames_since_check": 0}),
+        refusal.as_json(),
+        Equivocation(vehicle_id="rsu", frame=1, first=first, second=proof("rsu", 99)).as_json(),
+        change.as_json(),
         answered(5, f"{2:064x}", against, found, trusted=("rsu", "car-3")),
-        audit.session_ended("closed"),
+        SessionEnded(why="closed").as_json(),
     ]
 
 

@@ -37,7 +37,7 @@ def test_a_rejected_vehicle_is_reported_with_its_evidence(lines, events):
     }  # fmt: skip
     assert content["v2xPduEvidence"][0] == {
         "type": "robosac-message",
-        "v2xPdus": [{"frame": 0, "digest": proof("car-2", 0)["digest"], "signature": None}],
+        "v2xPdus": [{"frame": 0, "digest": proof("car-2", 0).digest, "signature": None}],
         "certificate": None,
         "subjectPduIndex": 0,
     }
@@ -48,7 +48,7 @@ def test_a_rejected_vehicle_is_reported_with_its_evidence(lines, events):
         {"teammates": ["car-2", "rsu"], "jaccardIndex": 0.125, "verdict": "dissensus"},
         {"teammates": ["rsu", "car-3"], "jaccardIndex": 0.75, "verdict": "consensus"},
     ]
-    assert evidence["messages"]["rsu"] == proof("rsu", 0)
+    assert evidence["messages"]["rsu"] == proof("rsu", 0).as_json()
     assert evidence["messages"].keys() == events[1]["messages"].keys()
     assert log["evidence"] == {
         "sessionId": SESSION, "egoId": "car-1", "head": head(lines), "lastSeq": 8, "seq": [2, 7]
@@ -60,8 +60,8 @@ def test_an_equivocation_is_reported_with_both_signatures(lines):
     made = misbehaviour.report(lines, "rsu", NOW)
     assert observations(made) == [("message", "equivocation", 2, 1)]
     (stream,) = made["report"]["content"]["v2xPduEvidence"]
-    assert [pdu["digest"] for pdu in stream["v2xPdus"]] == [proof("rsu", f)["digest"] for f in (1, 99)]
-    assert [pdu["signature"] for pdu in stream["v2xPdus"]] == [proof("rsu", f)["signature"] for f in (1, 99)]
+    assert [pdu["digest"] for pdu in stream["v2xPdus"]] == [proof("rsu", f).digest for f in (1, 99)]
+    assert [pdu["signature"] for pdu in stream["v2xPdus"]] == [proof("rsu", f).as_json()["signature"] for f in (1, 99)]
     assert stream["certificate"]["vehicleId"] == "rsu"
     assert read_public_key(stream["certificate"]["ed25519PublicKey"]) == KEY.public_key()
 

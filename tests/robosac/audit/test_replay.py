@@ -84,8 +84,8 @@ async def test_group_testing_comes_out_the_same_with_who_is_missing_and_who_is_n
     assert verify(got.lines, got.head) == []
     assert [got.differences(number, detector) for number, *_ in frames] == [[]] * 6
     answers = [replay.find(got.lines, number).answer for number, *_ in frames]
-    assert answers[3].rejected["car-4"] == "missing"
-    assert answers[2].rejected["car-2"] == "distrusted"
+    assert answers[3].rejected["car-4"].reason == "missing"
+    assert answers[2].rejected["car-2"].distrust == "named"
     lie = {**answers[2].state, "suspicion": {**answers[2].state["suspicion"], "car-2": 0.5}}
     index = next(i for i, line in enumerate(got.lines) if json.loads(line).get("frame") == 2)
     assert "state" in told(got, detector, frame=2, index=index, state=lie)
@@ -162,11 +162,11 @@ def test_other_inputs_are_told_and_nothing_is_recomputed(got, detector, ego_mess
         "messages: that of car-3 is missing",
         "messages: that of car-9 is not in the log",
     ]
-    other = dataclasses.replace(decision.session, weights_digest="0" * 64)
+    other = decision.session.model_copy(update={"weights_digest": "0" * 64})
     (difference,) = replay.replay(dataclasses.replace(decision, session=other), got.bodies[2], detector)
     assert difference.what == "detector"
     testing = {"defense": {"kind": "group_testing"}, "calibration_digest": "0" * 64}
-    other = dataclasses.replace(decision.session, **testing)
+    other = decision.session.model_copy(update=testing)
     (difference,) = replay.replay(dataclasses.replace(decision, session=other), got.bodies[2], detector)
     assert "calibration" in str(difference)
 
@@ -190,7 +190,7 @@ def test_what_cannot_be_replayed_is_explained(got, detector):
     ):
         with pytest.raises(replay.ReplayError, match=complaint):
             replay.find(lines, 2)
-    session = dataclasses.replace(decision.session, defense={"kind": "nonesuch"})
+    session = decision.session.model_copy(update={"defense": {"kind": "nonesuch"}})
     with pytest.raises(replay.ReplayError, match="no defence of kind 'nonesuch'"):
         replay.replay(dataclasses.replace(decision, session=session), got.bodies[2], detector)
 

@@ -181,9 +181,9 @@ def test_every_false_signature_is_told(events):
         changed = list(events)
         changed[index] = json.loads(text.replace(digests["digest"], "0" * 64))
         assert faults(seal_all(changed)) == [(index + 1, Fault.BAD_SIGNATURE)]
-    first = {**proof("rsu", 1), "digest": "0" * 64}
+    first = {**proof("rsu", 1).as_json(), "digest": "0" * 64}
     assert faults(change(events, 4, first=first)) == [(5, Fault.BAD_SIGNATURE)]
-    assert faults(change(events, 4, first=proof("rsu", 1))) == []
+    assert faults(change(events, 4, first=proof("rsu", 1).as_json())) == []
     unsigned = {**events[1]["messages"], "rsu": {"digest": "0" * 64}}
     assert faults(change(events, 1, messages=unsigned)) == [(2, Fault.BAD_SIGNATURE)]
 

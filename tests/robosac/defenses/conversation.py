@@ -2,7 +2,7 @@
 
 from collections.abc import Callable, Iterable
 
-from robosac.consensus import Verdict
+from robosac.answers import Verdict
 from robosac.defenses import Outcome
 
 

@@ -1,9 +1,9 @@
 import numpy as np
 import pytest
 
+from robosac.answers import Source, Verdict
 from robosac.budget import DomainError
-from robosac.consensus import Verdict
-from robosac.defenses import A2CP, Source
+from robosac.defenses import A2CP
 from robosac.evaluation.oracle import converse_with_oracle
 from tests.robosac.defenses.conversation import converse
 

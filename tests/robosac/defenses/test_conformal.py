@@ -4,10 +4,10 @@ import numpy as np
 import pytest
 from typer.testing import CliRunner
 
+from robosac.answers import Reason, Source, Verdict
 from robosac.budget import DomainError
 from robosac.cli import app
-from robosac.consensus import Verdict
-from robosac.defenses import Conformal, Outcome, Reason, Source
+from robosac.defenses import Conformal, Outcome
 from robosac.defenses.benign_scores import SINGLE_TEAMMATE
 from robosac.defenses.conformal import discoveries
 from robosac.evaluation.benign_scores import single_teammate_indices

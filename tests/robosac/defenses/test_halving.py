@@ -4,9 +4,9 @@ from math import ceil, log2
 import numpy as np
 import pytest
 
+from robosac.answers import Reason, Source, Verdict
 from robosac.budget import DomainError
-from robosac.consensus import Verdict
-from robosac.defenses import Halving, Reason, Source
+from robosac.defenses import Halving
 from robosac.evaluation.oracle import converse_with_oracle
 from tests.robosac.defenses.conversation import converse
 

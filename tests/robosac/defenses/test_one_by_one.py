@@ -3,8 +3,8 @@ from itertools import combinations
 import numpy as np
 import pytest
 
-from robosac.consensus import Verdict
-from robosac.defenses import OneByOne, Outcome, Reason, Source
+from robosac.answers import Reason, Source, Verdict
+from robosac.defenses import OneByOne, Outcome
 from robosac.evaluation.oracle import converse_with_oracle
 from tests.robosac.defenses.conversation import converse
 

@@ -1,9 +1,9 @@
 import numpy as np
 import pytest
 
+from robosac.answers import Reason, Source, Verdict
 from robosac.budget import DomainError
-from robosac.consensus import Verdict
-from robosac.defenses import Reason, SampleConsensus, Source
+from robosac.defenses import SampleConsensus
 from robosac.evaluation.oracle import converse_with_oracle
 from tests.robosac.defenses import conversation
 

@@ -1,8 +1,8 @@
 import pytest
 
+from robosac.answers import Reason, Source, Verdict
 from robosac.budget import DomainError
-from robosac.consensus import Verdict
-from robosac.defenses import Reason, Source, StaticTeam
+from robosac.defenses import StaticTeam
 from tests.robosac.defenses.conversation import converse
 
 TEAM = ["a", "b", "c", "d", "e"]

@@ -1,4 +1,5 @@
-from robosac.defenses import Source, Undefended
+from robosac.answers import Source
+from robosac.defenses import Undefended
 from tests.robosac.defenses.conversation import converse
 
 

@@ -4,7 +4,7 @@ from collections.abc import Collection
 
 import numpy as np
 
-from robosac.consensus import Verdict
+from robosac.answers import Verdict
 from robosac.defenses import Outcome
 from robosac.defenses.group_testing import OPEN, EvidenceModel
 from robosac.defenses.group_testing.model import (

@@ -3,10 +3,10 @@ import json
 import numpy as np
 import pytest
 
+from robosac.answers import Reason, Source, Verdict
 from robosac.boxes import from_world, pose_matrix
 from robosac.budget import DomainError
-from robosac.consensus import Verdict
-from robosac.defenses import GroupTesting, Outcome, Reason, Source
+from robosac.defenses import GroupTesting, Outcome
 from robosac.defenses.group_testing import OPEN, Hazards, choice
 from robosac.defenses.group_testing.memory import FORGETTING_FRAMES
 from tests.robosac.defenses.group_testing.conversing import SEEN, TEAM, make_model, outcome, run_frame, shifted

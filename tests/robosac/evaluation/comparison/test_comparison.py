@@ -6,9 +6,10 @@ import pytest
 from matplotlib.image import imread
 from typer.testing import CliRunner
 
+from robosac.answers import Reason, Source
 from robosac.attacks import load_campaign
 from robosac.cli import app, compare
-from robosac.defenses import Decision, OneByOne, Reason, Rejection, SampleConsensus, Source, Undefended
+from robosac.defenses import Decision, OneByOne, Rejection, SampleConsensus, Undefended
 from robosac.evaluation.comparison import (
     DEFENSES,
     FULL,

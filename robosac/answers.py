@@ -1,0 +1,172 @@
+"""What is answered about a frame: the one form that the gateway sends, the client reads and the audit log keeps.
+
+Nothing here computes anything. It needs neither torch nor scipy, so that a client can read answers without them.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Mapping
+from enum import StrEnum
+from typing import Annotated, Any, Literal
+
+import numpy as np
+from pydantic import BaseModel, ConfigDict, Field, PlainSerializer, PlainValidator, WithJsonSchema
+
+from robosac.boxes import FloatArray
+
+
+class Verdict(StrEnum):
+    """What a comparison of two perceptions says about the hypothesis behind one of them."""
+
+    CONSENSUS = "consensus"
+    DISSENSUS = "dissensus"
+    NO_EVIDENCE = "no_evidence"
+    """Both perceptions are empty: they agree on nothing, which speaks neither for nor against anybody."""
+
+
+class Source(StrEnum):
+    """Where the boxes of an answer come from."""
+
+    CONSENSUS = "consensus"
+    TRUSTED = "trusted"
+    EGO_ONLY = "ego_only"
+
+
+class Reason(StrEnum):
+    """Why a teammate was left out of an answer.
+
+    ``not_sampled`` also stands where a teammate was in tested hypotheses but no verdict was reached, because ego and
+    fusion were both empty. For ``distrusted``, `Distrust` says which kind.
+    """
+
+    DISSENSUS = "dissensus"
+    NOT_SAMPLED = "not_sampled"
+    DISTRUSTED = "distrusted"
+    MISSING = "missing"
+    LATE = "late"
+    MALFORMED = "malformed"
+    STALE = "stale"
+    UNAUTHENTICATED = "unauthenticated"
+    REPLAYED = "replayed"
+
+
+class Distrust(StrEnum):
+    """Why a teammate is distrusted."""
+
+    NAMED = "named"
+    """The defence names it as an attacker; the rejection's ``evidence`` says why."""
+    UNTRUSTED = "untrusted"
+    """It is not on the trust list from which the frame was answered."""
+    EQUIVOCATION = "equivocation"
+    """It sent different messages for the frame."""
+
+
+def _array_of(*shape: int) -> Any:
+    """A validator of nested lists of numbers that makes a float64 array of a shape."""
+
+    def check(value: Any) -> FloatArray:
+        try:
+            array = np.asarray(value)
+            if array.size and array.dtype.kind not in "iuf":
+                raise ValueError(array.dtype)
+            return array.astype(np.float64).reshape(shape)
+        except (TypeError, ValueError) as error:
+            raise ValueError(f"must be numbers of shape {shape}") from error
+
+    return PlainValidator(check)
+
+
+_AS_LISTS = PlainSerializer(lambda array: array.tolist(), return_type=list)
+_NUMBER = {"type": "number"}
+Boxes = Annotated[
+    FloatArray,
+    _array_of(-1, 6),
+    _AS_LISTS,
+    WithJsonSchema({"type": "array", "items": {"type": "array", "items": _NUMBER, "minItems": 6, "maxItems": 6}}),
+]
+"""(n, 6) float64; nested lists in JSON."""
+Pose = Annotated[
+    FloatArray,
+    _array_of(4, 4),
+    PlainSerializer(lambda array: array.reshape(-1).tolist(), return_type=list),
+    WithJsonSchema({"type": "array", "items": _NUMBER, "minItems": 16, "maxItems": 16}),
+]
+"""(4, 4) float64 world_from_sensor; 16 numbers in JSON, row-major."""
+
+
+class Typed(BaseModel):
+    """A part of an answer or a record. Fields that a later version adds are read past."""
+
+    model_config = ConfigDict(frozen=True, arbitrary_types_allowed=True, ser_json_inf_nan="constants")
+
+    def as_json(self) -> dict[str, Any]:
+        """JSON values; `model_validate` reads them back."""
+        return self.model_dump(mode="json")
+
+    def __getitem__(self, name: str) -> Any:
+        """A field by its name in JSON, such as evidence, whose names depend on the reason."""
+        try:
+            return getattr(self, name)
+        except AttributeError as error:
+            raise KeyError(name) from error
+
+
+class TestedHypothesis(Typed):
+    """One tested subset."""
+
+    __test__ = False  # no test of pytest's, whatever its name
+
+    teammates: tuple[str, ...]
+    jaccard_index: float
+    verdict: Verdict
+
+
+class RejectedTeammate(Typed):
+    """Why an enrolled teammate is not in the answer; evidence follows as further fields."""
+
+    model_config = ConfigDict(extra="allow")
+
+    vehicle_id: str
+    reason: Reason
+    distrust: Distrust | None = Field(
+        None, exclude_if=lambda value: value is None, description="With the reason distrusted: why."
+    )
+
+
+def _by_vehicle(value: Any) -> dict[str, RejectedTeammate]:
+    entries = value.values() if isinstance(value, Mapping) else value
+    if not isinstance(value, Mapping | list | tuple):
+        raise ValueError("must be a list")
+    rejected = map(RejectedTeammate.model_validate, entries)
+    return {entry.vehicle_id: entry for entry in rejected}
+
+
+class FrameAnswer(Typed):
+    """The answer to one frame.
+
+    In Python ``boxes`` is an (n, 6) float64 ndarray and ``rejected`` a mapping by vehicle id.
+    """
+
+    frame: int
+    boxes: Boxes = Field(description="x, y, length, width, yaw, score; ego frame, metres and radians, best first")
+    source: Source
+    accepted: tuple[str, ...]
+    rejected: Annotated[
+        Mapping[str, RejectedTeammate],
+        PlainValidator(_by_vehicle, json_schema_input_type=list[RejectedTeammate]),
+        PlainSerializer(lambda rejected: list(rejected.values()), return_type=list[RejectedTeammate]),
+    ]
+    hypotheses: tuple[TestedHypothesis, ...]
+    sampling_steps: int
+    attacker_ratio: float | None
+    suspicion: dict[str, float] | None = Field(
+        None, description="Probability that each teammate attacks, where the defence knows it."
+    )
+    deadline_met: bool
+    degraded_by: Literal["deadline", "fault"] | None = Field(description="What cut the defence short, if anything.")
+    timings_ms: dict[str, float]
+
+    @property
+    def named(self) -> tuple[str, ...]:
+        """Teammates that the defence names as attackers."""
+        return tuple(name for name, entry in self.rejected.items() if entry.distrust is Distrust.NAMED)

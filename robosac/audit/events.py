@@ -1,0 +1,223 @@
+"""Every kind of audit record as a type, with one way to JSON and back.
+
+A record on a line holds, besides its event's fields, ``session_id``, ``seq`` and ``previous`` (`robosac.audit.chain`).
+Lines are read strictly: a number is no text, and nothing is filled in but what older versions did not write.
+"""
+
+from __future__ import annotations
+
+import base64
+import json
+from collections.abc import Mapping
+from datetime import UTC, datetime
+from typing import Annotated, Any, Literal, NoReturn, get_args
+
+import rfc8785
+from pydantic import AfterValidator, BeforeValidator, Field, PlainSerializer, ValidationError, field_validator
+
+from robosac.answers import FrameAnswer, Pose, Reason, Typed
+
+
+class RecordError(ValueError):
+    """A line that is no record, or a record without what its event has to say."""
+
+
+def now() -> str:
+    """The time as RFC 3339, UTC."""
+    return datetime.now(UTC).isoformat(timespec="milliseconds").replace("+00:00", "Z")
+
+
+def _decoded(value: Any) -> Any:
+    return base64.b64decode(value, validate=True) if isinstance(value, str) else value
+
+
+class Proof(Typed):
+    """Who said what: the digest of a message (`robosac.wire.content_digest`), and its signature where it has one."""
+
+    digest: str
+    signature: Annotated[
+        bytes | None,
+        BeforeValidator(_decoded),
+        PlainSerializer(lambda raw: base64.b64encode(raw).decode(), return_type=str),
+    ] = Field(None, exclude_if=lambda raw: raw is None)
+
+
+class _Event(Typed):
+    """What all have."""
+
+    time: str = Field(default_factory=now)
+
+
+def _check_trusted(state: dict[str, Any]) -> dict[str, Any]:
+    trusted = state.get("trusted", [])
+    if not (isinstance(trusted, list | tuple) and all(isinstance(name, str) for name in trusted)):
+        raise ValueError("trusted must hold names")
+    return state
+
+
+State = Annotated[dict[str, Any], AfterValidator(_check_trusted)]
+"""A defence's, JSON values."""
+
+
+class SessionOpened(_Event):
+    """A session begins: with whom, which detector, which settings."""
+
+    event: Literal["session_opened"] = "session_opened"
+    version: str
+    ego_id: str
+    teammates: tuple[str, ...]
+    detector: str
+    weights_digest: str
+    calibration_digest: str | None = None
+    defense: dict[str, Any]
+    latency_budget_ms: float
+    gather_ms: float
+    frame_period_ms: float
+    public_keys: dict[str, str]
+    state: State
+    next_seed_commitment: str
+
+
+class TeamChanged(_Event):
+    """Teammates joined or left."""
+
+    event: Literal["team_changed"] = "team_changed"
+    joined: tuple[str, ...]
+    left: tuple[str, ...]
+    teammates: tuple[str, ...]
+    public_keys: dict[str, str]
+    state: State
+
+
+class FrameAnswered(_Event, FrameAnswer):
+    """A frame is decided: the answer, and all that it takes to recompute it.
+
+    ``seed`` is that of the frame's draws, committed to in an earlier record. ``messages`` are those in the frame, the
+    ego's among them. ``previous_frame`` is that of the previous answer which the fusion was given. Of refusals that
+    were too many to get a record each, ``unlogged_refusals`` has the number by vehicle, and under ``?`` those of
+    callers without a token that counts.
+    """
+
+    event: Literal["frame_answered"] = "frame_answered"
+    seed: str
+    ego_pose: Pose
+    messages: dict[str, Proof]
+    previous_frame: int | None = None
+    out_of_time: bool
+    fault: str | None = None
+    state: State
+    unlogged_refusals: dict[str, int] = Field(default_factory=dict)
+    next_seed_commitment: str
+
+    @field_validator("seed")
+    @classmethod
+    def _check_seed(cls, seed: str) -> str:
+        int(seed, 16)
+        bytes.fromhex(seed)
+        return seed
+
+
+class MessageRefused(_Event):
+    """A message was not accepted; ``vehicle_id`` is whose token sent it, whatever the message claims."""
+
+    event: Literal["message_refused"] = "message_refused"
+    vehicle_id: str
+    frame: int | None = None
+    reason: Reason
+    detail: str
+    field: str | None = None
+
+
+class AccessRefused(_Event):
+    """Somebody came without a token that counts; ``vehicle_id`` is whose it was, None if it is none of ours."""
+
+    event: Literal["access_refused"] = "access_refused"
+    vehicle_id: str | None
+    reason: Literal[Reason.UNAUTHENTICATED] = Reason.UNAUTHENTICATED
+    detail: str
+
+
+class TokenRenewed(_Event):
+    """A vehicle took a fresh token; the one before is worth nothing any more."""
+
+    event: Literal["token_renewed"] = "token_renewed"
+    vehicle_id: str
+    expires_at: str
+
+
+class Equivocation(_Event):
+    """A vehicle said two different things about one frame. What the ego said first is signed in its frame's record."""
+
+    event: Literal["equivocation"] = "equivocation"
+    vehicle_id: str
+    frame: int
+    first: Proof
+    second: Proof
+
+
+class SessionEnded(_Event):
+    """A session was closed by its ego, or expired."""
+
+    event: Literal["session_ended"] = "session_ended"
+    why: str
+
+
+Event = (
+    SessionOpened
+    | TeamChanged
+    | FrameAnswered
+    | MessageRefused
+    | AccessRefused
+    | TokenRenewed
+    | Equivocation
+    | SessionEnded
+)
+_KINDS: Mapping[str, type[Event]] = {kind.model_fields["event"].default: kind for kind in get_args(Event)}
+
+
+def read(line: bytes) -> dict[str, Any]:
+    """The record on a line, its line break taken off.
+
+    Raises
+    ------
+    RecordError
+        If it is not a JSON object.
+    """
+    try:
+        record = json.loads(line.decode(), parse_constant=_no_number)
+    except (ValueError, RecursionError) as error:
+        raise RecordError(f"not JSON: {error}") from error
+    if not isinstance(record, dict):
+        raise RecordError("not JSON: no object")
+    return record
+
+
+def event_on(line: bytes) -> Event | None:
+    """The event on a line, its line break taken off; None for a kind that this version does not know.
+
+    Raises
+    ------
+    RecordError
+        If it is not a JSON object, or not what an event of its kind has to be.
+    """
+    kind = _KINDS.get(str(read(line).get("event")))
+    if kind is None:
+        return None
+    try:
+        return kind.model_validate_json(line, strict=True)
+    except ValidationError as error:
+        first = error.errors(include_url=False, include_input=False)[0]
+        raise RecordError(f"{'.'.join(map(str, first['loc']))}: {first['msg']}") from error
+
+
+def is_canonical(line: bytes, record: Mapping[str, Any]) -> bool:
+    """Whether a line is the canonical form (RFC 8785) of its record."""
+    try:
+        canonical: bytes = rfc8785.dumps(dict(record))
+    except (ValueError, RecursionError):
+        return False
+    return canonical == line
+
+
+def _no_number(text: str) -> NoReturn:
+    raise ValueError(f"{text} is no number")

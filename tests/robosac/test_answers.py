@@ -1,0 +1,93 @@
+import json
+import math
+
+import numpy as np
+import pytest
+import rfc8785
+from pydantic import ValidationError
+
+from robosac import wire
+from robosac.answers import Distrust, FrameAnswer, Reason, Source, Verdict
+from robosac.audit import GENESIS, seal
+
+FIELDS = {
+    "frame": 3,
+    "boxes": [[1.0, 2.5, 4.0, 2.0, 0.1, 0.9]],
+    "source": "consensus",
+    "accepted": ["a", "b"],
+    "rejected": [
+        {"vehicle_id": "c", "reason": "dissensus", "hypotheses": [0], "lowest_jaccard_index": 0.125},
+        {"vehicle_id": "d", "reason": "distrusted", "distrust": "named", "suspicion": 1.0, "evidence": [{"test": "e"}]},
+        {"vehicle_id": "e", "reason": "missing"},
+    ],
+    "hypotheses": [{"teammates": ["a", "c"], "jaccard_index": 0.125, "verdict": "dissensus"}],
+    "sampling_steps": 1,
+    "attacker_ratio": None,
+    "suspicion": {"a": 0.5},
+    "deadline_met": True,
+    "degraded_by": None,
+    "timings_ms": {"total": 1.5},
+}  # fmt: skip
+
+
+def test_an_answer_reads_as_python_and_is_the_same_in_json_again():
+    for read in (FrameAnswer.model_validate(FIELDS), FrameAnswer.model_validate_json(json.dumps(FIELDS), strict=True)):
+        assert read.as_json() == FIELDS
+        assert wire.unpack(wire.pack(read.as_json()), trusted=True) == FIELDS
+        assert json.loads(read.model_dump_json()) == FIELDS
+        assert (read.source, read.accepted) == (Source.CONSENSUS, ("a", "b"))
+        assert read.boxes.dtype == np.float64
+        assert read.boxes.tolist() == FIELDS["boxes"]
+        assert read.hypotheses[0].verdict is Verdict.DISSENSUS
+        assert list(read.rejected) == ["c", "d", "e"]
+        assert read.rejected["c"].reason is Reason.DISSENSUS
+        assert read.rejected["d"].distrust is Distrust.NAMED
+        assert (read.rejected["c"].hypotheses, read.rejected["c"]["lowest_jaccard_index"]) == ([0], 0.125)
+        assert read.named == ("d",)
+        with pytest.raises(KeyError):
+            read.rejected["e"]["evidence"]
+
+
+def test_what_a_later_version_adds_is_read_past():
+    assert FrameAnswer.model_validate({**FIELDS, "support": []}).as_json() == FIELDS
+
+
+def test_a_frame_without_boxes_has_an_empty_array():
+    assert FrameAnswer.model_validate({**FIELDS, "boxes": []}).boxes.shape == (0, 6)
+
+
+@pytest.mark.parametrize(
+    "wrong",
+    [
+        {"boxes": [[1.0, 2.0]]},
+        {"boxes": [["1"] * 6]},
+        {"boxes": [[True] * 6]},
+        {"boxes": None},
+        {"boxes": [[1.0] * 6, [1.0]]},
+        {"rejected": None},
+        {"rejected": "c"},
+        {"rejected": [{"vehicle_id": "c"}]},
+        {"rejected": [{"vehicle_id": "c", "reason": "whim"}]},
+        {"source": "hearsay"},
+        {"frame": None},
+        {"accepted": "ab"},
+        {"hypotheses": [{}]},
+    ],
+)
+def test_what_is_no_answer_is_refused(wrong):
+    (name,) = wrong
+    for read in (FrameAnswer.model_validate, lambda fields: FrameAnswer.model_validate_json(json.dumps(fields))):
+        with pytest.raises(ValidationError) as refused:
+            read({**FIELDS, **wrong})
+        assert refused.value.errors()[0]["loc"][0] == name
+    with pytest.raises(ValidationError):
+        FrameAnswer.model_validate({key: value for key, value in FIELDS.items() if key != name})
+
+
+def test_a_number_that_json_does_not_have_is_not_changed_into_something_else():
+    """Whoever writes it then fails, instead of keeping what was not answered."""
+    changed = {"boxes": [[math.inf] * 6], "attacker_ratio": math.inf, "suspicion": {"a": math.inf}}
+    answer = FrameAnswer.model_validate({**FIELDS, **changed})
+    assert {name: answer.as_json()[name] for name in changed} == changed
+    with pytest.raises(rfc8785.FloatDomainError):
+        seal(answer.as_json(), "s", 1, GENESIS)
