@@ -7,9 +7,8 @@ detector decodes them, the consensus test judges, and the defence learns, until 
 from __future__ import annotations
 
 import logging
-import math
-import time
-from collections.abc import Callable, Mapping, Sequence
+from collections.abc import Iterator, Mapping, Sequence
+from contextlib import contextmanager
 from dataclasses import dataclass, field
 
 import numpy as np
@@ -17,15 +16,13 @@ import numpy as np
 from robosac.answers import FrameAnswer, Reason, RejectedTeammate, Source, TestedHypothesis, Verdict
 from robosac.boxes import FloatArray
 from robosac.consensus import at_least, compare
+from robosac.deadline import Deadline
 from robosac.defenses import Decision, Defense, Hypothesis, Outcome, Reference, Rejection, State
 from robosac.detectors import Message, PreparedFrame, Preparer
 from robosac.faults import describe
 from robosac.previous import PreviousAnswer
 
 logger = logging.getLogger(__name__)
-
-SAFETY = 1.2
-"""A hypothesis is begun only if this multiple of the dearest pass so far still fits before the deadline."""
 
 
 class UnverifiedAnswer(Exception):
@@ -126,8 +123,7 @@ def fuse(
     state: State | None = None,
     frame: int = 0,
     previous: PreviousAnswer | None = None,
-    deadline: float = math.inf,
-    clock: Callable[[], float] = time.perf_counter,
+    deadline: Deadline | None = None,
 ) -> FusionResult:
     """Answer one frame.
 
@@ -150,17 +146,15 @@ def fuse(
     previous : PreviousAnswer, optional
         The latest answer's. A defence with the reference ``previous`` compares with it if it is of the frame before
         this one, else with the ego's own perception.
-    deadline : float
-        In the clock's time. No hypothesis is begun that is not expected to end before it. Where nothing is verified or
+    deadline : Deadline, optional
+        No hypothesis is begun that it has no time for; by default there is time for all. Where nothing is verified or
         trusted, the ego's own perception is computed in any case.
-    clock : callable
-        Monotonic, seconds.
 
     Returns
     -------
     FusionResult
     """
-    return _FrameRun(detector, defense, ego, frame, previous, clock, deadline).answer(teammates, rng, state)
+    return _FrameRun(detector, defense, ego, frame, previous, deadline or Deadline()).answer(teammates, rng, state)
 
 
 @dataclass
@@ -172,14 +166,12 @@ class _FrameRun:
     ego: Message
     frame: int
     previous: PreviousAnswer | None
-    clock: Callable[[], float]
-    deadline: float
+    deadline: Deadline
     timings: dict[str, float] = field(
         default_factory=lambda: dict.fromkeys(("prepare", "ego_only", "hypotheses", "consensus"), 0.0)
     )
     outcomes: list[Outcome] = field(default_factory=list)
     boxes: dict[Hypothesis, FloatArray] = field(default_factory=dict)
-    dearest_pass: float = 0.0
     out_of_time: bool = False
     fault: str | None = None
 
@@ -204,7 +196,7 @@ class _FrameRun:
             rejected=decision.rejected,
             hypotheses=tuple(self.outcomes),
             attacker_ratio=decision.attacker_ratio,
-            deadline_met=self.clock() <= self.deadline,
+            deadline_met=self.deadline.is_met,
             out_of_time=self.out_of_time,
             fault=self.fault,
             timings_ms=self.timings,
@@ -214,10 +206,8 @@ class _FrameRun:
         )
 
     def _prepare(self, teammates: Mapping[str, Message]) -> PreparedFrame:
-        started = self.clock()
-        prepared = self.detector.prepare(self.ego, teammates)
-        self._spend("prepare", started)
-        return prepared
+        with self._spending("prepare"):
+            return self.detector.prepare(self.ego, teammates)
 
     def _converse(self, prepared: PreparedFrame, team: list[str], state: State, rng: np.random.Generator) -> Decision:
         conversation = self.defense.converse(team, state, rng)
@@ -252,13 +242,12 @@ class _FrameRun:
         tested: list[Outcome] = []
         for subset in batch:
             reference = self._reference(prepared)
-            if self.clock() + SAFETY * self.dearest_pass > self.deadline:
+            if not self.deadline.another_fits():
                 self.out_of_time = True
                 break
             boxes = self._decode(prepared, subset)
-            started = self.clock()
-            comparison = compare(reference, self._confident(boxes), self.defense.consensus_threshold)
-            self._spend("consensus", started)
+            with self._spending("consensus"):
+                comparison = compare(reference, self._confident(boxes), self.defense.consensus_threshold)
             index, verdict = comparison.jaccard_index, comparison.verdict
             tested.append(Outcome(subset, index, verdict, boxes, reference, self.ego.pose, self.frame))
             self.outcomes.append(tested[-1])
@@ -273,10 +262,8 @@ class _FrameRun:
     def _decode(self, prepared: PreparedFrame, subset: Hypothesis) -> FloatArray:
         """Boxes of a subset; each is decoded once a frame."""
         if subset not in self.boxes:
-            started = self.clock()
-            self.boxes[subset] = prepared.detect(subset)
-            self._spend("hypotheses" if subset else "ego_only", started)
-            self.dearest_pass = max(self.dearest_pass, self.clock() - started)
+            with self._spending("hypotheses" if subset else "ego_only"), self.deadline.a_pass():
+                self.boxes[subset] = prepared.detect(subset)
         return self.boxes[subset]
 
     def _to_remember(self, boxes: FloatArray) -> PreviousAnswer:
@@ -285,5 +272,8 @@ class _FrameRun:
     def _confident(self, boxes: FloatArray) -> FloatArray:
         return at_least(boxes, self.detector.info.consensus_score)
 
-    def _spend(self, stage: str, started: float) -> None:
-        self.timings[stage] += (self.clock() - started) * 1e3
+    @contextmanager
+    def _spending(self, stage: str) -> Iterator[None]:
+        started = self.deadline.clock()
+        yield
+        self.timings[stage] += (self.deadline.clock() - started) * 1e3

@@ -9,6 +9,7 @@ from contextlib import contextmanager
 
 from starlette.types import ASGIApp, Receive, Scope, Send
 
+from robosac.deadline import Deadline
 from service.problems import Problem
 
 SHARE = 0.5
@@ -30,8 +31,7 @@ class Admission:
     """
 
     def __init__(self) -> None:
-        self.store_s = 0.0
-        """What keeping a decision costs, by the latest; the time to leave for it."""
+        self._store_s = 0.0
         self._frames = 0
         self._by_session: dict[str, int] = {}
         self._cost_s = FIRST_GUESS_S
@@ -65,6 +65,10 @@ class Admission:
             if not self._by_session[session_id]:
                 del self._by_session[session_id]
 
+    def deadline(self, arrived: float, budget_s: float) -> Deadline:
+        """Of a frame that arrived then (`time.perf_counter`), with time left for keeping its decision."""
+        return Deadline(arrived + budget_s, self._store_s)
+
     def learn(self, start: float, end: float, store_s: float) -> None:
         """Take a frame into account.
 
@@ -77,7 +81,7 @@ class Admission:
         """
         self._cost_s += SMOOTHING * (end - max(start, self._last_end) - self._cost_s)
         self._last_end = end
-        self.store_s += SMOOTHING * (store_s - self.store_s)
+        self._store_s += SMOOTHING * (store_s - self._store_s)
 
 
 class Gate:

@@ -17,6 +17,7 @@ from fastapi import FastAPI  # noqa: E402
 
 from service import problems  # noqa: E402
 from service.admission import Admission, Gate  # noqa: E402
+from service.deciding import Deciding  # noqa: E402
 from service.engine import Engine  # noqa: E402
 from service.frames import Frames  # noqa: E402
 from service.gateway import Gateway  # noqa: E402
@@ -65,7 +66,8 @@ def create_app(
     teams = Teams(settings, sessions, store, tokens)
     admission = Admission()
     tracing = Tracing(provider_from_environment() if spans is None else spans)
-    frames = Frames(settings, sessions, engine, metrics, admission, tracing)
+    deciding = Deciding(sessions, engine, metrics, admission, tracing)
+    frames = Frames(sessions, deciding, metrics, admission)
     gateway = Gateway(admission, engine, metrics, sessions, teams, frames, api_keys)
 
     @contextlib.asynccontextmanager

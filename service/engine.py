@@ -13,6 +13,7 @@ import numpy as np
 import torch
 
 from robosac.boxes import pose_matrix
+from robosac.deadline import Deadline
 from robosac.defenses import Defense, State
 from robosac.detectors import Detector, Message, available, load
 from robosac.fusion import FusionResult, fuse
@@ -72,7 +73,7 @@ class Engine:
         state: State,
         frame: int,
         previous: PreviousAnswer | None,
-        deadline: float,
+        deadline: Deadline,
     ) -> tuple[FusionResult, float]:
         """`robosac.fusion.fuse` on the engine's thread; also the milliseconds that the frame waited for it."""
         submitted = time.perf_counter()

@@ -1,38 +1,29 @@
-"""Frames: from bodies to an answer."""
+"""Frames that arrive: from bodies to messages that are checked, and to whoever answers them."""
 
 from __future__ import annotations
 
-import contextlib
-import logging
 import time
-from collections.abc import Mapping
 from typing import Any
 
 import structlog
 
 from robosac import wire
 from robosac.answers import FrameAnswer, Reason
-from robosac.audit import commitment
-from robosac.audit.events import FrameAnswered, Proof
+from robosac.audit.events import Proof
 from robosac.defenses import Rejection
 from robosac.detectors import Role
 from robosac.signatures import is_valid, read_public_key
 from service.admission import Admission
-from service.engine import Engine
+from service.deciding import Asked, Deciding
 from service.gathering import Equivocation, Received, Refused
 from service.live import Caller
 from service.metrics import Metrics
 from service.problems import Problem
 from service.schemas import Receipt
 from service.sessions import Sessions
-from service.settings import Settings
-from service.store import SessionChanged
-from service.tracing import Tracing
 
 logger = structlog.stdlib.get_logger(__name__)
 
-ATTEMPTS = 3
-"""To decide a frame while other processes change its session."""
 STRANGERS_NAMED = 8
 SLACK_BYTES = 64 * 1024
 """What a message may have besides its tensors."""
@@ -55,33 +46,21 @@ class _Forged(Exception):
 
 
 class Frames:
-    """Takes messages and whole frames, and answers them.
+    """Takes messages and whole frames in, and has them answered.
 
     Parameters
     ----------
-    settings : Settings
     sessions : Sessions
-    engine : Engine
+    deciding : Deciding
     metrics : Metrics
     admission : Admission
-    tracing : Tracing
     """
 
-    def __init__(
-        self,
-        settings: Settings,
-        sessions: Sessions,
-        engine: Engine,
-        metrics: Metrics,
-        admission: Admission,
-        tracing: Tracing,
-    ) -> None:
-        self._tracing = tracing
-        self._admission = admission
-        self._settings = settings
+    def __init__(self, sessions: Sessions, deciding: Deciding, metrics: Metrics, admission: Admission) -> None:
         self._sessions = sessions
-        self._engine = engine
+        self._deciding = deciding
         self._metrics = metrics
+        self._admission = admission
 
     async def post_message(self, caller: Caller, body: bytes) -> FrameAnswer | Receipt:
         """A vehicle's own message: kept for a teammate, answered for the ego."""
@@ -100,14 +79,15 @@ class Frames:
         if not caller.is_ego:
             await self._keep(caller, frame, received)
             return Receipt(frame=frame, vehicle_id=caller.vehicle_id)
-        timings = {"receive": (time.perf_counter() - arrived) * 1e3}
+        asked = Asked(caller, frame, received, arrived)
+        asked.spent("receive", arrived)
         with self._admission.frame(caller.record.session_id, caller.live.budget_s):
             async with caller.live.lock:
                 await self._check_ego(caller, frame, received)
                 gathering = time.perf_counter()
-                messages = await caller.live.gathering.collect(frame, arrived + caller.record.gather_ms / 1e3)
-                timings["gather"] = (time.perf_counter() - gathering) * 1e3
-                return await self._answer(caller, frame, received, messages, {}, arrived, timings)
+                asked.messages = await caller.live.gathering.collect(frame, arrived + caller.record.gather_ms / 1e3)
+                asked.spent("gather", gathering)
+                return await self._deciding.answer(asked)
 
     async def post_frame(self, caller: Caller, body: bytes) -> FrameAnswer:
         """A whole frame from the ego; a teammate whose part is malformed is left out, and the frame is answered."""
@@ -119,25 +99,26 @@ class Frames:
             ego = _check(caller, caller.vehicle_id, frame, envelope.ego, "ego")
         except (wire.WireError, _Forged) as error:
             raise await self._unusable(caller, error, frame) from error
-        messages: dict[str, Received] = {}
-        unusable: dict[str, Rejection] = {}
+        asked = Asked(caller, frame, ego, arrived)
         for name in caller.record.teammates:
             if name not in envelope.teammates:
                 continue
             try:
-                messages[name] = _check(caller, name, frame, envelope.teammates[name], f"teammates.{name}")
+                asked.messages[name] = _check(caller, name, frame, envelope.teammates[name], f"teammates.{name}")
             except (wire.WireError, _Forged) as error:
                 reason = Reason.UNAUTHENTICATED if isinstance(error, _Forged) else Reason.MALFORMED
-                unusable[name] = Rejection(reason, {"field": error.field, "detail": error.detail})
+                asked.unusable[name] = Rejection(reason, {"field": error.field, "detail": error.detail})
                 self._metrics.refused(reason.value)
         strangers = [name for name in envelope.teammates if name not in caller.record.teammates]
         for name in strangers[:STRANGERS_NAMED]:
-            unusable[str(name)[:64]] = Rejection(Reason.UNAUTHENTICATED, {"detail": "not enrolled in this session"})
-        timings = {"receive": (time.perf_counter() - arrived) * 1e3}
+            asked.unusable[str(name)[:64]] = Rejection(
+                Reason.UNAUTHENTICATED, {"detail": "not enrolled in this session"}
+            )
+        asked.spent("receive", arrived)
         with self._admission.frame(caller.record.session_id, caller.live.budget_s):
             async with caller.live.lock:
                 await self._check_ego(caller, frame, ego)
-                return await self._answer(caller, frame, ego, messages, unusable, arrived, timings)
+                return await self._deciding.answer(asked)
 
     def body_limit(self, caller: Caller, *, whole_frame: bool) -> int:
         """Bytes that a message, or a whole frame, of a session's detector may have."""
@@ -201,119 +182,6 @@ class Frames:
         if not caller.is_ego:
             caller.live.gathering.refuse(caller.vehicle_id, frame, reason, detail)
         await self._sessions.journal.refusal(caller, reason, detail, frame, field)
-
-    async def _answer(
-        self,
-        caller: Caller,
-        frame: int,
-        ego: Received,
-        messages: Mapping[str, Received],
-        unusable: Mapping[str, Rejection],
-        arrived: float,
-        timings: dict[str, float],
-    ) -> FrameAnswer:
-        """Fuse, keep the decision, and build the frame result. The session's lock is held.
-
-        What was worked out from a session that another process has changed by then is worked out again.
-        """
-        absences: dict[str, Rejection] = {}
-        for _ in range(ATTEMPTS):
-            with contextlib.suppress(SessionChanged):
-                return await self._decide(caller, frame, ego, messages, unusable, absences, arrived, timings)
-        raise Problem(409, "session-changed", "the session keeps being changed elsewhere; try again")
-
-    async def _decide(
-        self,
-        caller: Caller,
-        frame: int,
-        ego: Received,
-        messages: Mapping[str, Received],
-        unusable: Mapping[str, Rejection],
-        absences: dict[str, Rejection],
-        arrived: float,
-        timings: dict[str, float],
-    ) -> FrameAnswer:
-        """As `_answer`, from the session as this process knows it.
-
-        The team is the one of this moment, whoever was in it when the messages came; ``unusable`` says why parts of the
-        body are not among the messages. ``absences`` holds why others sent none, as the first attempt found it, and
-        takes what this one finds: once the frame is closed, the gathering has forgotten it.
-        """
-        record = await self._sessions.current(caller)
-        live = caller.live
-        left_out = dict(unusable)
-        present: dict[str, Received] = {}
-        for name in record.teammates:
-            if name not in messages:
-                if name not in absences:
-                    absences[name] = live.gathering.absence(name, frame)
-                left_out.setdefault(name, absences[name])
-                continue
-            doubt = live.motion.implausible(name, frame, messages[name].message.pose, ego.message.pose)
-            if doubt is None:
-                present[name] = messages[name]
-            else:
-                left_out[name] = Rejection(Reason.MALFORMED, {"field": "pose", "detail": doubt})
-                self._metrics.refused(Reason.MALFORMED.value)
-        live.gathering.close(frame)
-        result, timings["queue"] = await self._engine.fuse(
-            live.detector,
-            live.defense,
-            ego.message,
-            {name: received.message for name, received in present.items()},
-            seed=int(record.seed, 16),
-            state=record.state,
-            frame=frame,
-            previous=live.previous,
-            deadline=arrived + record.latency_budget_ms / 1e3 - self._admission.store_s,
-        )
-        timings.update(result.timings_ms)
-        timings["total"] = (time.perf_counter() - arrived) * 1e3
-        answer = result.answer(frame, left_out, timings)
-        next_seed = self._sessions.draw_seed()
-        with live.unlogged() as unlogged:
-            event = FrameAnswered(
-                **dict(answer),
-                seed=record.seed,
-                ego_pose=ego.message.pose,
-                messages={name: received.proof for name, received in {record.ego_id: ego, **present}.items()},
-                previous_frame=None if live.previous is None else live.previous.frame,
-                out_of_time=result.out_of_time,
-                fault=result.fault,
-                state=dict(result.state),
-                unlogged_refusals=unlogged,
-                next_seed_commitment=commitment(next_seed),
-            )
-            await self._sessions.decide(record, event, next_seed, self._to_keep(frame, ego, present))
-        done = time.perf_counter()
-        timings["store"] = (done - arrived) * 1e3 - timings["total"]
-        self._admission.learn(arrived + timings.get("gather", 0.0) / 1e3, done, timings["store"] / 1e3)
-        live.answered, live.previous, live.ego_digest = frame, result.previous, ego.digest
-        for name, received in {record.ego_id: ego, **present}.items():
-            live.motion.moved(name, frame, received.message.pose)
-        self._metrics.frame(answer, timings)
-        self._tracing.frame(record.session_id, answer, timings)
-        logger.log(
-            logging.DEBUG if answer.degraded_by is None and answer.deadline_met else logging.WARNING,
-            "frame answered",
-            session_id=record.session_id,
-            frame=frame,
-            source=answer.source.value,
-            accepted=answer.accepted,
-            degraded_by=answer.degraded_by,
-            fault=result.fault,
-            deadline_met=answer.deadline_met,
-            total_ms=round(timings["total"], 1),
-        )
-        return answer
-
-    def _to_keep(self, frame: int, ego: Received, present: Mapping[str, Received]) -> bytes | None:
-        """The messages of a frame for a replay, if they are to be kept."""
-        if self._settings.keep_frames == 0:
-            return None
-        messages = {name: received.message for name, received in present.items()}
-        signatures = {name: r.signature for name, r in present.items() if r.signature is not None}
-        return wire.pack_frame(frame, ego.message, messages, ego.signature, signatures)
 
 
 def _check(caller: Caller, vehicle: str, frame: int, payload: Any, path: str) -> Received:

@@ -245,6 +245,11 @@ class Sessions:
         caller.live.follow(record)
         return record
 
+    @property
+    def keeps_messages(self) -> bool:
+        """Whether the messages of frames are kept, to replay decisions."""
+        return self._settings.keep_frames > 0
+
     def draw_seed(self) -> str:
         """The seed of a frame to come, hexadecimal."""
         return self._seeds()

@@ -7,14 +7,15 @@ import math
 from collections import deque
 from collections.abc import Iterable, Mapping
 from dataclasses import dataclass
-from typing import Any, cast
+from typing import Any
 
 import numpy as np
 
 from robosac import wire
 from robosac.audit.events import FrameAnswered, RecordError, SessionOpened, TeamChanged, event_on
 from robosac.calibration import calibration_digest, calibration_of
-from robosac.defenses import Conversation, Decision, Defense, GroupTesting, Outcome, State, build
+from robosac.deadline import Recorded
+from robosac.defenses import GroupTesting, State, build
 from robosac.detectors import Message, Preparer
 from robosac.faults import in_short
 from robosac.fusion import FusionResult, fuse
@@ -111,8 +112,8 @@ def replay(decision: LoggedDecision, body: bytes, detector: Preparer) -> list[Di
     """Make a decision again and compare.
 
     Jaccard indices are compared to `JACCARD_TOLERANCE`, boxes to `BOX_TOLERANCE`, the defence's state to
-    `STATE_TOLERANCE`; times are not. A decision that the deadline cut short is made again with a clock that runs out
-    after as many hypotheses.
+    `STATE_TOLERANCE`; times are not. A decision that the deadline cut short is made again with one that passes after as
+    many hypotheses.
 
     Parameters
     ----------
@@ -188,51 +189,21 @@ def _compare_digests(logged: FrameAnswered, messages: dict[str, Message]) -> lis
 
 def _fuse(decision: LoggedDecision, messages: dict[str, Message], detector: Preparer) -> FusionResult:
     try:
-        defense = _Counted(build(decision.session.defense, lambda: calibration_of(detector.info)))
+        defense = build(decision.session.defense, lambda: calibration_of(detector.info))
     except ValueError as error:
         raise ReplayError(f"the log's settings make no defence: {error}") from error
     logged, ego_id = decision.answer, decision.session.ego_id
-    most = len(logged.hypotheses) if logged.out_of_time else math.inf
     return fuse(
         detector,
-        cast(Defense, defense),
+        defense,
         messages[ego_id],
         {name: message for name, message in messages.items() if name != ego_id},
         rng=np.random.default_rng(int(logged.seed, 16)),
         state=decision.state,
         frame=logged.frame,
         previous=decision.previous,
-        deadline=0.5,
-        clock=lambda: 0.0 if defense.tested < most else 1.0,
+        deadline=Recorded(len(logged.hypotheses)) if logged.out_of_time else None,
     )
-
-
-class _Counted:
-    """A defence of which is known how many of its hypotheses were tested."""
-
-    def __init__(self, defense: Defense) -> None:
-        self._defense = defense
-        self.tested = 0
-
-    def __getattr__(self, name: str) -> Any:
-        return getattr(self._defense, name)
-
-    def converse(self, team: list[str], state: State, rng: np.random.Generator) -> Conversation:
-        conversation = self._defense.converse(team, state, rng)
-        try:
-            batch = next(conversation)
-            while True:
-                outcomes: list[Outcome] = []
-                for hypothesis in batch:
-                    tested = yield [hypothesis]
-                    if not tested:
-                        break
-                    self.tested += 1
-                    outcomes.extend(tested)
-                batch = conversation.send(outcomes)
-        except StopIteration as stop:
-            decision: Decision = stop.value
-            return decision
 
 
 def _compare(logged: FrameAnswered, made: FusionResult) -> list[Difference]:

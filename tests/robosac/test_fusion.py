@@ -1,4 +1,5 @@
 import logging
+import math
 from collections.abc import Collection
 from dataclasses import replace
 
@@ -7,9 +8,10 @@ import pytest
 
 from robosac.answers import Reason, Source, Verdict
 from robosac.boxes import from_world, pose_matrix
+from robosac.deadline import SAFETY, Deadline
 from robosac.defenses import Decision, Reference, SampleConsensus, StaticTeam, Undefended
 from robosac.detectors import DetectorInfo, Message
-from robosac.fusion import SAFETY, fuse
+from robosac.fusion import fuse
 from robosac.previous import PreviousAnswer
 
 EGO = Message(pose_matrix(0, 0, 0, 0), {})
@@ -45,9 +47,11 @@ class FakeDetector:
         return NOISE if self.attackers & set(teammates) else SEEN
 
 
-def run(detector, defense=SampleConsensus(sampling_budget=7, collaborators=3), team=TEAM, seed=0, **options):
+def run(
+    detector, defense=SampleConsensus(sampling_budget=7, collaborators=3), team=TEAM, seed=0, due=math.inf, **options
+):
     rng = np.random.default_rng(seed)
-    return fuse(detector, defense, EGO, team, rng=rng, clock=detector.clock, **options)
+    return fuse(detector, defense, EGO, team, rng=rng, deadline=Deadline(due, clock=detector.clock), **options)
 
 
 @pytest.mark.parametrize("seed", range(10))
@@ -115,7 +119,7 @@ def test_weak_boxes_take_no_part_in_the_test():
 @pytest.mark.parametrize("budget", [0.5, 1.0, 2.5, 3.7, 5.0, 20.0])
 def test_no_pass_is_begun_that_cannot_end_in_time(budget):
     detector = FakeDetector("abcde", pass_s=1.0)
-    result = run(detector, deadline=budget)
+    result = run(detector, due=budget)
     expected = 0
     while 1.0 + expected + SAFETY <= budget and expected < 7:
         expected += 1
@@ -134,7 +138,7 @@ def test_a_slow_pass_makes_the_next_estimate_careful():
         return slow(teammates)
 
     detector.detect = detect
-    result = run(detector, deadline=9.0)
+    result = run(detector, due=9.0)
     assert (result.sampling_steps, result.deadline_met) == (1, True)
 
 
@@ -234,7 +238,7 @@ def test_the_dearest_pass_counts_not_the_latest():
         return plain(teammates)
 
     detector.detect = detect
-    result = run(detector, deadline=8.0)
+    result = run(detector, due=8.0)
     assert result.sampling_steps == 2
 
 

@@ -14,7 +14,9 @@ from typer.testing import CliRunner
 from robosac import consensus, fusion, wire
 from robosac.audit import replay, verify
 from robosac.cli import app
+from robosac.deadline import Deadline
 from robosac.detectors import Message
+from service.admission import Admission
 from tests.robosac.audit.conftest import seal_all
 from tests.service.conftest import serve
 
@@ -99,11 +101,11 @@ async def test_a_decision_cut_short_comes_out_the_same(after, detector, ego_mess
         tested.append(args)
         return consensus.compare(*args)
 
-    def fuse_until_late(*args, **options):
-        return fusion.fuse(*args, **options, clock=lambda: time.perf_counter() + (60 if len(tested) == after else 0))
+    def due(self, arrived, budget_s):
+        return Deadline(arrived + budget_s, clock=lambda: time.perf_counter() + (60 if len(tested) == after else 0))
 
     monkeypatch.setattr(fusion, "compare", compare)
-    monkeypatch.setattr("service.engine.fuse", fuse_until_late)
+    monkeypatch.setattr(Admission, "deadline", due)
     got = await drive([(0, ego_message, attacked)], defense={"kind": "a2cp", "consensus_threshold": 1.0})
     monkeypatch.undo()
     answer = replay.find(got.lines, 0).answer

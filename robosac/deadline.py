@@ -1,0 +1,60 @@
+"""When an answer is due, and what still fits before it: what fusion knows of time."""
+
+from __future__ import annotations
+
+import math
+import time
+from collections.abc import Callable, Iterator
+from contextlib import contextmanager
+
+SAFETY = 1.2
+"""A pass is begun only if this multiple of the dearest one so far still fits."""
+
+
+class Deadline:
+    """The end of a frame's time, and what its passes cost so far.
+
+    Parameters
+    ----------
+    at : float
+        When the answer is due, in the clock's time; infinite by default.
+    reserve_s : float
+        What has to be left for whatever comes after the fusion.
+    clock : callable
+        Monotonic, seconds.
+    """
+
+    def __init__(
+        self, at: float = math.inf, reserve_s: float = 0.0, clock: Callable[[], float] = time.perf_counter
+    ) -> None:
+        self.clock = clock
+        self._end = at - reserve_s
+        self._dearest_s = 0.0
+
+    @contextmanager
+    def a_pass(self) -> Iterator[None]:
+        """Learn what a pass costs, for the length of a block."""
+        started = self.clock()
+        yield
+        self._dearest_s = max(self._dearest_s, self.clock() - started)
+
+    def another_fits(self) -> bool:
+        """Whether one more pass is expected to end in time."""
+        return self.clock() + SAFETY * self._dearest_s <= self._end
+
+    @property
+    def is_met(self) -> bool:
+        """Whether there is time left for what was reserved."""
+        return self.clock() <= self._end
+
+
+class Recorded(Deadline):
+    """One that passed after so many hypotheses, to make a decision again that time cut short."""
+
+    def __init__(self, hypotheses: int) -> None:
+        super().__init__()
+        self._left = hypotheses
+
+    def another_fits(self) -> bool:
+        self._left -= 1
+        return self._left >= 0

@@ -1,0 +1,215 @@
+"""From the messages of a frame to its answer: who takes part, fusion, keeping what was decided, telling of it."""
+
+from __future__ import annotations
+
+import contextlib
+import logging
+import time
+from collections.abc import Mapping
+from dataclasses import dataclass, field
+
+import structlog
+
+from robosac import wire
+from robosac.answers import FrameAnswer, Reason
+from robosac.audit import commitment
+from robosac.audit.events import FrameAnswered
+from robosac.defenses import Rejection
+from robosac.fusion import FusionResult
+from service.admission import Admission
+from service.engine import Engine
+from service.gathering import Received
+from service.live import Caller
+from service.metrics import Metrics
+from service.problems import Problem
+from service.sessions import Sessions
+from service.store import SessionChanged, SessionRecord
+from service.tracing import Tracing
+
+logger = structlog.stdlib.get_logger(__name__)
+
+ATTEMPTS = 3
+"""To decide a frame while other processes change its session."""
+
+
+@dataclass
+class Asked:
+    """A frame that an ego asks about, on its way to an answer.
+
+    Attributes
+    ----------
+    caller : Caller
+        The ego.
+    frame : int
+    ego : Received
+        Its own message.
+    arrived : float
+        When its last byte was in (`time.perf_counter`); its budget runs from then.
+    messages : mapping of vehicle id to Received
+        Those of teammates, whoever is in the team by now.
+    unusable : mapping of vehicle id to Rejection
+        Why other parts of the body are not among them.
+    absences : mapping of vehicle id to Rejection
+        Why others sent none; kept for another attempt, since the gathering forgets it once the frame is closed.
+    timings : mapping of stage to float
+        Milliseconds.
+    """
+
+    caller: Caller
+    frame: int
+    ego: Received
+    arrived: float
+    messages: dict[str, Received] = field(default_factory=dict)
+    unusable: dict[str, Rejection] = field(default_factory=dict)
+    absences: dict[str, Rejection] = field(default_factory=dict)
+    timings: dict[str, float] = field(default_factory=dict)
+
+    def spent(self, stage: str, since: float) -> None:
+        """Note how long a stage took, until now."""
+        self.timings[stage] = (time.perf_counter() - since) * 1e3
+
+
+class Deciding:
+    """Answers frames.
+
+    Parameters
+    ----------
+    sessions : Sessions
+    engine : Engine
+    metrics : Metrics
+    admission : Admission
+    tracing : Tracing
+    """
+
+    def __init__(
+        self, sessions: Sessions, engine: Engine, metrics: Metrics, admission: Admission, tracing: Tracing
+    ) -> None:
+        self._sessions = sessions
+        self._engine = engine
+        self._metrics = metrics
+        self._admission = admission
+        self._tracing = tracing
+
+    async def answer(self, asked: Asked) -> FrameAnswer:
+        """Decide a frame and keep the decision. The session's lock is held.
+
+        What was worked out from a session that another process has changed by then is worked out again.
+
+        Raises
+        ------
+        Problem
+            409 if the session keeps being changed; as `Sessions.decide`.
+        """
+        for _ in range(ATTEMPTS):
+            with contextlib.suppress(SessionChanged):
+                return await self._decide(asked)
+        raise Problem(409, "session-changed", "the session keeps being changed elsewhere; try again")
+
+    async def _decide(self, asked: Asked) -> FrameAnswer:
+        """As `answer`, from the session as this process knows it."""
+        record = await self._sessions.current(asked.caller)
+        present, left_out = self._who_takes_part(asked, record)
+        result = await self._fuse(asked, record, present)
+        answer = result.answer(asked.frame, left_out, asked.timings)
+        await self._keep(asked, record, present, result, answer)
+        self._remember(asked, present, result)
+        self._tell(asked, answer, result.fault)
+        return answer
+
+    def _who_takes_part(self, asked: Asked, record: SessionRecord) -> tuple[dict[str, Received], dict[str, Rejection]]:
+        """Messages of those who can be fused, and why the others of the team cannot; closes the frame."""
+        live, ego_pose = asked.caller.live, asked.ego.message.pose
+        present, left_out = {}, dict(asked.unusable)
+        for name in record.teammates:
+            received = asked.messages.get(name)
+            if received is None:
+                if name not in asked.absences:
+                    asked.absences[name] = live.gathering.absence(name, asked.frame)
+                left_out.setdefault(name, asked.absences[name])
+                continue
+            doubt = live.motion.implausible(name, asked.frame, received.message.pose, ego_pose)
+            if doubt is None:
+                present[name] = received
+            else:
+                left_out[name] = Rejection(Reason.MALFORMED, {"field": "pose", "detail": doubt})
+                self._metrics.refused(Reason.MALFORMED.value)
+        live.gathering.close(asked.frame)
+        return present, left_out
+
+    async def _fuse(self, asked: Asked, record: SessionRecord, present: Mapping[str, Received]) -> FusionResult:
+        live = asked.caller.live
+        result, asked.timings["queue"] = await self._engine.fuse(
+            live.detector,
+            live.defense,
+            asked.ego.message,
+            {name: received.message for name, received in present.items()},
+            seed=int(record.seed, 16),
+            state=record.state,
+            frame=asked.frame,
+            previous=live.previous,
+            deadline=self._admission.deadline(asked.arrived, record.latency_budget_ms / 1e3),
+        )
+        asked.timings.update(result.timings_ms)
+        asked.spent("total", asked.arrived)
+        return result
+
+    async def _keep(
+        self,
+        asked: Asked,
+        record: SessionRecord,
+        present: Mapping[str, Received],
+        result: FusionResult,
+        answer: FrameAnswer,
+    ) -> None:
+        """Put the decision on record, with all that it takes to make it again."""
+        live, decided = asked.caller.live, time.perf_counter()
+        next_seed = self._sessions.draw_seed()
+        with live.unlogged() as unlogged:
+            event = FrameAnswered(
+                **dict(answer),
+                seed=record.seed,
+                ego_pose=asked.ego.message.pose,
+                messages={name: received.proof for name, received in {record.ego_id: asked.ego, **present}.items()},
+                previous_frame=None if live.previous is None else live.previous.frame,
+                out_of_time=result.out_of_time,
+                fault=result.fault,
+                state=dict(result.state),
+                unlogged_refusals=unlogged,
+                next_seed_commitment=commitment(next_seed),
+            )
+            body = _whole_frame(asked, present) if self._sessions.keeps_messages else None
+            await self._sessions.decide(record, event, next_seed, body)
+        asked.spent("store", decided)
+        could_begin = asked.arrived + asked.timings.get("gather", 0.0) / 1e3
+        self._admission.learn(could_begin, time.perf_counter(), asked.timings["store"] / 1e3)
+
+    def _remember(self, asked: Asked, present: Mapping[str, Received], result: FusionResult) -> None:
+        """What the next frame is judged by."""
+        live = asked.caller.live
+        live.answered, live.previous, live.ego_digest = asked.frame, result.previous, asked.ego.digest
+        for name, received in {asked.caller.vehicle_id: asked.ego, **present}.items():
+            live.motion.moved(name, asked.frame, received.message.pose)
+
+    def _tell(self, asked: Asked, answer: FrameAnswer, fault: str | None) -> None:
+        session_id = asked.caller.record.session_id
+        self._metrics.frame(answer, asked.timings)
+        self._tracing.frame(session_id, answer, asked.timings)
+        logger.log(
+            logging.DEBUG if answer.degraded_by is None and answer.deadline_met else logging.WARNING,
+            "frame answered",
+            session_id=session_id,
+            frame=asked.frame,
+            source=answer.source.value,
+            accepted=answer.accepted,
+            degraded_by=answer.degraded_by,
+            fault=fault,
+            deadline_met=answer.deadline_met,
+            total_ms=round(asked.timings["total"], 1),
+        )
+
+
+def _whole_frame(asked: Asked, present: Mapping[str, Received]) -> bytes:
+    """The messages that were decided from, for a replay."""
+    messages = {name: received.message for name, received in present.items()}
+    signatures = {name: r.signature for name, r in present.items() if r.signature is not None}
+    return wire.pack_frame(asked.frame, asked.ego.message, messages, asked.ego.signature, signatures)

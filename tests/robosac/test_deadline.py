@@ -1,0 +1,59 @@
+import pytest
+
+from robosac.deadline import SAFETY, Deadline, Recorded
+
+
+class Clock:
+    def __init__(self):
+        self.now = 0.0
+
+    def __call__(self):
+        return self.now
+
+
+def test_by_default_there_is_time_for_everything():
+    deadline = Deadline()
+    assert deadline.another_fits()
+    assert deadline.is_met
+
+
+def test_a_pass_fits_as_long_as_the_dearest_so_far_would():
+    clock = Clock()
+    deadline = Deadline(10.0, reserve_s=1.0, clock=clock)
+    for cost in (2.0, 1.0):
+        with deadline.a_pass():
+            clock.now += cost
+    clock.now = 9.0 - SAFETY * 2.0
+    assert deadline.another_fits()
+    clock.now += 0.01
+    assert not deadline.another_fits()
+    assert deadline.is_met
+
+
+def test_what_is_reserved_is_no_time_for_an_answer():
+    clock = Clock()
+    deadline = Deadline(10.0, reserve_s=1.0, clock=clock)
+    clock.now = 9.0
+    assert deadline.is_met
+    clock.now = 9.1
+    assert not deadline.is_met
+
+
+def test_a_pass_that_fails_teaches_nothing():
+    clock = Clock()
+    deadline = Deadline(10.0, clock=clock)
+
+    def fail():
+        with deadline.a_pass():
+            clock.now += 20.0
+            raise RuntimeError
+
+    with pytest.raises(RuntimeError):
+        fail()
+    clock.now = 0.0
+    assert deadline.another_fits()
+
+
+def test_a_recorded_one_passes_after_as_many_hypotheses():
+    deadline = Recorded(2)
+    assert [deadline.another_fits() for _ in range(4)] == [True, True, False, False]
