@@ -1,4 +1,4 @@
-"""A gateway and a hostile fleet, from start to end: ``python -m clients.demo``."""
+"""A gateway and a hostile fleet, from start to end: ``robosac demo``."""
 
 from __future__ import annotations
 

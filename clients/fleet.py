@@ -1,4 +1,4 @@
-"""A simulated fleet as independent HTTP clients: ``python -m clients.fleet``."""
+"""A simulated fleet as independent HTTP clients: ``robosac fleet``."""
 
 from __future__ import annotations
 

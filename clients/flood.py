@@ -1,4 +1,4 @@
-"""What strangers can do to honest egos: ``python -m clients.flood``.
+"""What strangers can do to honest egos: ``robosac flood``.
 
 Honest egos post frames at a fixed rate. Meanwhile strangers, without a credential or with a wrong one, send requests to
 every call that takes a body, each as large as the gateway reads at all: once the headers alone, once the whole body.
