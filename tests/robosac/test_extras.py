@@ -9,7 +9,7 @@ from robosac.cli import app
 from robosac.extras import _EXTRAS, MissingExtra, need
 
 PLOTS = "Error: matplotlib is not installed, for pictures: pip install 'robosac[plots]'\n"
-EXTRAS = tomllib.loads(Path("pyproject.toml").read_text())["project"]["optional-dependencies"]
+EXTRAS = tomllib.loads((Path(__file__).parents[2] / "pyproject.toml").read_text())["project"]["optional-dependencies"]
 
 
 @pytest.mark.parametrize(("package", "extra"), _EXTRAS.items())

@@ -12,7 +12,7 @@ from robosac.cli import app, commands
 from robosac.extras import MissingExtra
 
 runner = CliRunner()
-PROJECT = tomllib.loads(Path("pyproject.toml").read_text())["project"]
+PROJECT = tomllib.loads((Path(__file__).parents[3] / "pyproject.toml").read_text())["project"]
 BROUGHT = PROJECT["entry-points"][commands.GROUP]
 
 
