@@ -16,10 +16,10 @@ help:
 	@echo "make bench   measure frames per second and latency, briefly"
 
 demo: $(VENV)/.installed
-	$(BIN)/python -m clients.demo --report $(OUT)/demo
+	$(BIN)/robosac demo --report $(OUT)/demo
 
 serve: $(VENV)/.installed
-	$(BIN)/uvicorn service.app:app --host $(HOST) --port $(PORT) --timeout-graceful-shutdown 5
+	$(BIN)/robosac serve --host $(HOST) --port $(PORT)
 
 test: $(VENV)/.installed-dev
 	$(BIN)/pytest
@@ -38,7 +38,7 @@ format: $(VENV)/.installed-dev
 	$(BIN)/ruff format .
 
 bench: $(VENV)/.installed
-	$(BIN)/python -m clients.load_test --seconds 4 --out $(OUT)/bench
+	$(BIN)/robosac load-test --seconds 4 --out $(OUT)/bench
 
 $(VENV)/.created:
 	$(PYTHON) -c 'import sys; assert sys.version_info >= (3, 11), "Python 3.11 or newer is needed; set PYTHON=..."'
@@ -46,7 +46,7 @@ $(VENV)/.created:
 	touch $@
 
 $(VENV)/.installed: $(VENV)/.created pyproject.toml constraints.txt
-	$(BIN)/pip install --quiet --constraint constraints.txt --editable .
+	$(BIN)/pip install --quiet --constraint constraints.txt --editable '.[plots,postgresql]'
 	touch $@
 
 $(VENV)/.installed-dev: $(VENV)/.installed

@@ -1,4 +1,4 @@
-"""A gateway and a hostile fleet, from start to end: ``python -m clients.demo``."""
+"""A gateway and a hostile fleet, from start to end: ``robosac demo``."""
 
 from __future__ import annotations
 
@@ -14,6 +14,7 @@ from rich.console import Console
 from clients.errors import GatewayError
 from clients.fleet import FleetOptions, close_run, run_fleet
 from clients.local_gateway import local_gateway
+from clients.simulation import make_picture_folder
 from clients.summary import FleetSummary
 from robosac.detectors import DEFAULT_DETECTOR
 
@@ -31,6 +32,7 @@ def main(
     """
     torch.set_num_threads(1)
     console = Console()
+    make_picture_folder(report, "--report")
     try:
         options, summary = asyncio.run(_run(report, scenes, frames, console))
     except (GatewayError, OSError) as error:

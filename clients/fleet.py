@@ -1,4 +1,4 @@
-"""A simulated fleet as independent HTTP clients: ``python -m clients.fleet``."""
+"""A simulated fleet as independent HTTP clients: ``robosac fleet``."""
 
 from __future__ import annotations
 
@@ -19,7 +19,7 @@ from rich.table import Table
 
 from clients.client import API_KEY_VARIABLE, GatewayClient, OpenedSession
 from clients.errors import FrameConflict, GatewayError
-from clients.simulation import EgoFrame, Fleet, make_folder
+from clients.simulation import EgoFrame, Fleet, make_picture_folder
 from clients.summary import FleetSummary
 from robosac import attacks, detectors
 from robosac.answers import FrameAnswer, Reason
@@ -237,7 +237,7 @@ def main(
     torch.set_num_threads(1)
     console = Console()
     if report is not None:
-        make_folder(report, "--report")
+        make_picture_folder(report, "--report")
     for option, load, value in (("--attack", attacks.load_campaign, attack), ("--detector", detectors.load, detector)):
         try:
             load(value)

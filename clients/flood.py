@@ -1,4 +1,4 @@
-"""What strangers can do to honest egos: ``python -m clients.flood``.
+"""What strangers can do to honest egos: ``robosac flood``.
 
 Honest egos post frames at a fixed rate. Meanwhile strangers, without a credential or with a wrong one, send requests to
 every call that takes a body, each as large as the gateway reads at all: once the headers alone, once the whole body.
@@ -48,7 +48,8 @@ BODY_BYTES = 32 * 2**20
 PATIENCE_S = 15.0
 """How long a stranger goes on with one request."""
 CHUNK = 2**18
-REFUSED = 401
+REFUSALS = (401, 503)
+"""Who asks for a frame while the gateway is at its limit is not even asked for a credential."""
 
 
 class Strangers(StrEnum):
@@ -70,7 +71,7 @@ class Refusals:
     taken_bytes : int
         Of bodies, that the gateway's side took off the strangers' hands.
     refused_ms : list of float
-        From a connection's beginning to its 401.
+        From a connection's beginning to its 401, or 503 where the gateway is busy.
     others : mapping of str to int
         What came instead: a status, or what went wrong.
     """
@@ -82,7 +83,7 @@ class Refusals:
 
     def answered(self, status: int, milliseconds: float) -> None:
         """Count an answer."""
-        if status == REFUSED:
+        if status in REFUSALS:
             self.refused_ms.append(milliseconds)
         else:
             self.failed(str(status))
@@ -197,7 +198,7 @@ def show(console: Console, results: dict[Strangers, tuple[Figures, Refusals]]) -
                 "of them cut short": str(values["degraded"]),
                 "latency, ms: p50, p99": f"{latency['p50']:.0f}, {latency['p99']:.0f}",
                 "strangers' requests": str(refusals.sent),
-                "refused (401)": str(len(refusals.refused_ms)),
+                "refused": str(len(refusals.refused_ms)),
                 "refusal, ms: p50, p99": f"{p50:.1f}, {p99:.1f}" if refusals.refused_ms else "-",
                 "anything else": ", ".join(f"{name}: {n}" for name, n in refusals.others.items()) or "-",
             }

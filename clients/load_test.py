@@ -1,4 +1,4 @@
-"""How many frames a gateway answers, and how fast: ``python -m clients.load_test``.
+"""How many frames a gateway answers, and how fast: ``robosac load-test``.
 
 Frames are sensed, attacked and packed ahead, so that the load costs the client little. *Closed loop*: each ego posts
 its next frame when the last is answered, which finds the capacity. *Open loop*: frames are due at a fixed rate

@@ -1,4 +1,4 @@
-"""What a gateway does with more frames than it can answer: ``python -m clients.overload``.
+"""What a gateway does with more frames than it can answer: ``robosac overload``.
 
 First the capacity is found with egos that post one frame after the other. Then frames are due at a multiple of it,
 whatever the gateway does. Each request asks with ``Expect: 100-continue`` whether its body is wanted, as a vehicle with

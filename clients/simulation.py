@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import sys
 from collections.abc import Mapping
 from dataclasses import dataclass
 from pathlib import Path
@@ -13,6 +14,8 @@ from robosac.attacks import Attack, Campaign
 from robosac.boxes import FloatArray
 from robosac.detectors import Detector, Message
 from robosac.evaluation.frames import encode_all, under_attack
+from robosac.extras import MissingExtra
+from robosac.figures import need_figures
 from robosac.scenes import IntersectionScene, SceneFrame
 
 
@@ -54,6 +57,15 @@ def make_folder(path: Path, option: str) -> None:
         path.mkdir(parents=True, exist_ok=True)
     except OSError as error:
         raise typer.BadParameter(str(error), param_hint=option) from error
+
+
+def make_picture_folder(path: Path, option: str) -> None:
+    """The same for what will hold pictures; ends the program where none can be drawn."""
+    try:
+        need_figures()
+    except MissingExtra as missing:
+        sys.exit(f"Error: {missing}")
+    make_folder(path, option)
 
 
 class Fleet:

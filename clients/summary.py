@@ -18,6 +18,7 @@ from robosac.boxes import FloatArray
 from robosac.consensus import at_least
 from robosac.detectors import Detector
 from robosac.evaluation import AveragePrecision
+from robosac.figures import new_figure
 from robosac.scenes.drawing import FOUND_COLOUR, TRUE_COLOUR, draw_boxes, draw_points, frame_axes
 
 GATEWAY = "gateway"
@@ -188,8 +189,6 @@ class FleetSummary:
 
 
 def _draw(example: Example, path: Path) -> None:
-    from matplotlib.figure import Figure  # noqa: PLC0415 (a second to import, and only pictures need it)
-
     frame, answer = example.frame, example.answer
     attack = f"attacked by {', '.join(sorted(frame.attackers))}" if frame.attackers else "nobody attacks"
     panels = (
@@ -202,7 +201,7 @@ def _draw(example: Example, path: Path) -> None:
             "found",
         ),
     )
-    figure = Figure(figsize=(21, 7.6), layout="constrained")
+    figure = new_figure(21, 7.6)
     for axes, (title, boxes, colour, label) in zip(figure.subplots(1, 3), panels, strict=True):
         draw_points(axes, frame.points)
         if boxes is not frame.truth:

@@ -16,10 +16,27 @@ Examples
 <Source.CONSENSUS: 'consensus'>
 """
 
-from robosac.defenses import SampleConsensus
-from robosac.detectors import Message
-from robosac.detectors import load as load_detector
-from robosac.fusion import FusionResult, fuse
-from robosac.scenes import IntersectionScene
+from typing import TYPE_CHECKING
+
+from robosac.lazy import lazily
+
+if TYPE_CHECKING:
+    from robosac.defenses import SampleConsensus
+    from robosac.detectors import Message
+    from robosac.detectors import load as load_detector
+    from robosac.fusion import FusionResult, fuse
+    from robosac.scenes import IntersectionScene
+else:
+    __getattr__, __dir__ = lazily(
+        __name__,
+        {
+            "FusionResult": "robosac.fusion:FusionResult",
+            "IntersectionScene": "robosac.scenes:IntersectionScene",
+            "Message": "robosac.detectors:Message",
+            "SampleConsensus": "robosac.defenses:SampleConsensus",
+            "fuse": "robosac.fusion:fuse",
+            "load_detector": "robosac.detectors:load",
+        },
+    )
 
 __all__ = ["FusionResult", "IntersectionScene", "Message", "SampleConsensus", "fuse", "load_detector"]

@@ -5,7 +5,6 @@ from __future__ import annotations
 from dataclasses import dataclass
 
 import numpy as np
-from scipy.optimize import linear_sum_assignment
 
 from robosac.answers import Verdict
 from robosac.boxes import FloatArray, IntArray, pairwise_iou
@@ -64,6 +63,8 @@ def match(reference: FloatArray, candidate: FloatArray, iou_threshold: float = M
     if (good.sum(axis=0) <= 1).all() and (good.sum(axis=1) <= 1).all():
         rows, columns = np.nonzero(good)
         return rows, columns
+    from scipy.optimize import linear_sum_assignment  # noqa: PLC0415 (a second to import; `fuse` has it already)
+
     rows, columns = linear_sum_assignment(iou, maximize=True)
     kept = iou[rows, columns] >= iou_threshold
     return rows[kept], columns[kept]

@@ -15,6 +15,7 @@ from typing import TYPE_CHECKING  # noqa: E402
 import structlog  # noqa: E402
 from fastapi import FastAPI  # noqa: E402
 
+from robosac.extras import MissingExtra  # noqa: E402
 from service import problems  # noqa: E402
 from service.admission import Admission, Gate  # noqa: E402
 from service.deciding import Deciding  # noqa: E402
@@ -116,4 +117,7 @@ def create_app(
     return app
 
 
-app = create_app()
+try:
+    app = create_app()
+except MissingExtra as missing:
+    raise SystemExit(f"Error: {missing}") from missing

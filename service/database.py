@@ -20,13 +20,13 @@ from contextlib import contextmanager, suppress
 from functools import partial
 from typing import Any, Protocol, TypeVar
 
-import asyncpg
 from sqlalchemy import Connection, Engine, create_engine, event
 from sqlalchemy.engine import URL, make_url
 from sqlalchemy.exc import ArgumentError, SQLAlchemyError
 from sqlalchemy.ext.asyncio import create_async_engine
 from sqlalchemy.pool import QueuePool
 
+from robosac.extras import need
 from robosac.faults import describe
 from service.store import StoreUnavailable
 
@@ -99,6 +99,8 @@ def connect(text: str) -> Database:
     ------
     ValueError
         As `read_url`.
+    MissingExtra
+        For PostgreSQL, if its driver is not installed.
     """
     url = read_url(text)
     return Sqlite(url) if url.get_backend_name() == "sqlite" else Postgres(url)
@@ -108,6 +110,10 @@ class Postgres:
     """PostgreSQL, for several gateways on several machines."""
 
     def __init__(self, url: URL) -> None:
+        need("asyncpg", "PostgreSQL")
+        import asyncpg  # noqa: PLC0415 (most gateways keep their sessions in SQLite and do without)
+
+        self._failures = (asyncpg.PostgresError, asyncpg.InterfaceError)
         self._engine = create_async_engine(
             url,
             pool_size=5,
@@ -119,12 +125,12 @@ class Postgres:
         self._reader = self._engine.execution_options(isolation_level="AUTOCOMMIT")
 
     async def read(self, work: Work[T]) -> T:
-        with _unavailable():
+        with _unavailable(*self._failures):
             async with self._reader.connect() as connection:
                 return await connection.run_sync(work)
 
     async def write(self, work: Work[T]) -> T:
-        with _unavailable():
+        with _unavailable(*self._failures):
             async with self._engine.begin() as connection:
                 return await connection.run_sync(work)
 
@@ -271,10 +277,12 @@ def _create_for_us_alone(_dialect: object, _record: object, arguments: list[str]
 
 
 @contextmanager
-def _unavailable() -> Iterator[None]:
+def _unavailable(*failures: type[Exception]) -> Iterator[None]:
+    """Turn what a database may raise, and what its driver may raise unwrapped, into `StoreUnavailable`."""
+    expected: tuple[type[Exception], ...] = (SQLAlchemyError, sqlite3.Error, OSError, *failures)
     try:
         yield
-    except (SQLAlchemyError, asyncpg.PostgresError, asyncpg.InterfaceError, sqlite3.Error, OSError) as error:
+    except expected as error:
         cause = getattr(error, "orig", None) or error
         logger.error("the database failed: %s", describe(cause))
         raise StoreUnavailable(type(error).__name__) from error

@@ -1,4 +1,4 @@
-"""Whether gateways that are killed go on where they were: ``python -m clients.crash_test --kills 40 --out DIR``.
+"""Whether gateways that are killed go on where they were: ``robosac crash-test --kills 40 --out DIR``.
 
 Egos with different defences post frames one after another. Each round something happens meanwhile (`Incident`), and at
 a random moment all gateways get SIGKILL. Another one is started on the same database. Then, for each session: what was

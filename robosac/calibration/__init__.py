@@ -1,8 +1,8 @@
 """How a detector is made ready for `robosac.defenses.GroupTesting`: likelihoods of what its tests show."""
 
+from robosac.calibrated import calibration_digest, calibration_of
 from robosac.calibration.fit import TooFewVerdicts, fit
 from robosac.calibration.making import Recipe, ReliabilityBin, calibrate
-from robosac.calibration.shipped import calibration_digest, calibration_of
 from robosac.calibration.verdicts import Verdicts, collect, validation_stretches
 
 __all__ = [

@@ -7,7 +7,7 @@ from typing import Annotated
 
 import typer
 
-from robosac.cli import audit, benign_scores, calibrate, compare, convert, evaluate, reproduce, scene, train
+from robosac.cli.commands import Commands
 
 
 def _show_version(wanted: bool) -> None:
@@ -16,7 +16,7 @@ def _show_version(wanted: bool) -> None:
         raise typer.Exit
 
 
-app = typer.Typer(no_args_is_help=True, add_completion=False, help="Consensus-verified collaborative perception.")
+app = typer.Typer(cls=Commands, no_args_is_help=True, help="Consensus-verified collaborative perception.")
 
 
 @app.callback()
@@ -27,15 +27,5 @@ def main(
 ) -> None:
     """Consensus-verified collaborative perception."""
 
-
-app.command("scene")(scene.run)
-app.command("train")(train.run)
-app.command("evaluate")(evaluate.run)
-app.command("benign-scores")(benign_scores.run)
-app.command("reproduce")(reproduce.run)
-app.command("compare")(compare.run)
-app.command("calibrate")(calibrate.run)
-app.command("convert-checkpoint")(convert.run)
-app.add_typer(audit.app, name="audit")
 
 __all__ = ["app"]

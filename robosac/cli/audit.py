@@ -1,4 +1,4 @@
-"""``robosac audit``: what the gateway decided, and whether its log can be believed."""
+"""Prove what the gateway decided, from its audit log."""
 
 from __future__ import annotations
 
@@ -13,9 +13,9 @@ from typing import Annotated, BinaryIO
 import typer
 
 from robosac import detectors, wire
-from robosac.audit import digest, misbehaviour, replay, verification
+from robosac.audit import digest, misbehaviour, verification
 
-app = typer.Typer(no_args_is_help=True, help="Prove what the gateway decided, from its audit log.")
+app = typer.Typer(no_args_is_help=True, add_completion=False, help=__doc__)
 
 Log = Annotated[Path, typer.Argument(help="The audit log (JSON Lines).", metavar="FILE")]
 
@@ -60,6 +60,8 @@ def replay_decision(
     ] = None,
 ) -> None:
     """Make a decision again from the log and the messages, and compare; 1 if it comes out otherwise."""
+    from robosac.audit import replay  # noqa: PLC0415 (seconds to import, and only this command needs it)
+
     try:
         body = messages.read_bytes()
         number = wire.read_frame(body).frame if frame is None else frame

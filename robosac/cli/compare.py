@@ -28,6 +28,7 @@ from robosac.evaluation.comparison import (
     write_comparison,
 )
 from robosac.evaluation.comparison.rows import EARLY
+from robosac.figures import need_figures
 from robosac.scenes.splits import TEST_SEEDS
 
 
@@ -60,6 +61,7 @@ def run(
         raise typer.BadParameter(f"unknown {', '.join(unknown)}; known: {', '.join(DEFENSES)}", param_hint="--only")
     if live and recordings is not None:
         raise typer.BadParameter("nothing is recorded live", param_hint="--recordings")
+    need_figures()
     extent = _extent(QUICK if quick else FULL, setting or (), scenes, frames)
     torch.set_num_threads(1)
     console = Console()

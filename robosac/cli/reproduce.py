@@ -13,6 +13,7 @@ from rich.console import Console
 from rich.progress import BarColumn, MofNCompleteColumn, Progress, TextColumn, TimeElapsedColumn
 
 from robosac.evaluation.experiments import EXPERIMENTS, FULL, QUICK, Context, Section, write_report
+from robosac.figures import need_figures
 
 
 def run(
@@ -27,6 +28,7 @@ def run(
     unknown = sorted(set(only or ()) - set(EXPERIMENTS))
     if unknown:
         raise typer.BadParameter(f"unknown {', '.join(unknown)}; known: {', '.join(EXPERIMENTS)}", param_hint="--only")
+    need_figures()
     torch.set_num_threads(1)
     console = Console()
     try:

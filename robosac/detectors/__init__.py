@@ -1,11 +1,9 @@
-"""Collaborative detectors, by name."""
+"""Collaborative detectors, by name. What a message holds is there at once; what needs torch, once it is asked for."""
 
 from __future__ import annotations
 
-from collections.abc import Callable
-from pathlib import Path
+from typing import TYPE_CHECKING
 
-from robosac import references
 from robosac.detectors.base import (
     AttackSurface,
     Detector,
@@ -17,60 +15,24 @@ from robosac.detectors.base import (
     Role,
     TensorSpec,
 )
-from robosac.detectors.embedded import NAME as EMBEDDED
-from robosac.detectors.embedded import EmbeddedDetector, WeightsError, read_weights
-from robosac.detectors.v2xsim import FAMILY as V2XSIM
-from robosac.detectors.v2xsim import V2XSimDetector
+from robosac.lazy import lazily
 
-_REGISTRY: dict[str, Callable[[], Detector]] = {EMBEDDED: EmbeddedDetector}
-DEFAULT_DETECTOR = EMBEDDED
-
-
-def available() -> tuple[str, ...]:
-    """Names of the detectors whose weights ship."""
-    return tuple(_REGISTRY)
-
-
-def load(detector: str = DEFAULT_DETECTOR) -> Detector:
-    """Load a detector.
-
-    Parameters
-    ----------
-    detector : str
-        A name of `available`, the path of a weights file, or ``module:callable``, where the callable takes no arguments
-        and returns a detector of the user's own.
-
-    Raises
-    ------
-    WeightsError
-        If the weights cannot be used.
-    ValueError
-        If there is no such detector.
-    """
-    if detector in _REGISTRY:
-        return _REGISTRY[detector]()
-    if references.is_reference(detector):
-        made = references.make(detector)
-        if not isinstance(made, Detector):
-            raise ValueError(f"{detector} made no detector but {made!r:.200}")
-        return made
-    if not Path(detector).exists():
-        raise ValueError(
-            f"no detector {detector!r}: give one of {', '.join(available())}, a weights file, or module:callable"
-        )
-    return _open_weights(Path(detector))
-
-
-def _open_weights(path: Path) -> Detector:
-    """The detector that a weights file is for, with those weights."""
-    _, recipe = read_weights(path)
-    name = str(recipe.get("detector"))
-    if name == EMBEDDED:
-        return EmbeddedDetector(path)
-    if name.startswith(f"{V2XSIM}-"):
-        return V2XSimDetector(path)
-    raise WeightsError(f"{path} is for an unknown detector, {name!r}")
-
+if TYPE_CHECKING:
+    from robosac.detectors.embedded import EmbeddedDetector, WeightsError
+    from robosac.detectors.loading import DEFAULT_DETECTOR, available, load
+    from robosac.detectors.v2xsim import V2XSimDetector
+else:
+    __getattr__, __dir__ = lazily(
+        __name__,
+        {
+            "DEFAULT_DETECTOR": "robosac.detectors.loading:DEFAULT_DETECTOR",
+            "EmbeddedDetector": "robosac.detectors.embedded:EmbeddedDetector",
+            "V2XSimDetector": "robosac.detectors.v2xsim:V2XSimDetector",
+            "WeightsError": "robosac.detectors.embedded:WeightsError",
+            "available": "robosac.detectors.loading:available",
+            "load": "robosac.detectors.loading:load",
+        },
+    )
 
 __all__ = [
     "DEFAULT_DETECTOR",

@@ -8,6 +8,7 @@ from typing import TYPE_CHECKING
 import numpy as np
 
 from robosac.boxes import FloatArray, corners, from_world
+from robosac.figures import new_figure
 
 if TYPE_CHECKING:
     from matplotlib.axes import Axes
@@ -67,8 +68,6 @@ def draw_view(frame: SceneFrame, agent: str, path: Path, title: str = "") -> tup
     KeyError
         If the frame has no such agent.
     """
-    from matplotlib.figure import Figure  # noqa: PLC0415 (a second to import, and only pictures need it)
-
     from robosac.scenes.intersection import TRUTH_MIN_HITS  # noqa: PLC0415 (would be circular)
 
     view = frame.views[agent]
@@ -76,7 +75,7 @@ def draw_view(frame: SceneFrame, agent: str, path: Path, title: str = "") -> tup
     everyone = np.max([v.hits for v in frame.views.values()], axis=0)[index]
     own = view.hits[index]
     seen, hidden = boxes[own >= TRUTH_MIN_HITS], boxes[(own < TRUTH_MIN_HITS) & (everyone >= TRUTH_MIN_HITS)]
-    figure = Figure(figsize=(9, 9), layout="constrained")
+    figure = new_figure(9, 9)
     axes = figure.add_subplot()
     draw_points(axes, view.points)
     draw_boxes(axes, seen, TRUE_COLOUR, "seen by the agent")

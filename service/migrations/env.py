@@ -7,6 +7,7 @@ import asyncio
 from alembic import context
 from sqlalchemy import Connection
 
+from robosac.extras import MissingExtra
 from service.database import connect
 from service.migrations import lock
 from service.settings import Settings
@@ -24,7 +25,10 @@ def _run_locked(connection: Connection) -> None:
 
 
 async def _by_hand() -> None:
-    database = connect(Settings().database_url)
+    try:
+        database = connect(Settings().database_url)
+    except MissingExtra as missing:
+        raise SystemExit(f"Error: {missing}") from missing
     try:
         await database.write(_run_locked)
     finally:

@@ -16,7 +16,7 @@ def test_strangers_are_refused_and_honest_egos_answered(tmp_path):
     report = json.loads((tmp_path / "flood.json").read_text())
     assert list(report) == ["none", "headers only", "whole bodies"]
     for name, part in report.items():
-        assert part["honest"]["frames"] == 5
+        assert part["honest"]["frames"] + sum(part["honest"]["errors"].values()) == 5
         strangers = part["strangers"]
         assert (strangers["sent"], strangers["others"]) == (0 if name == "none" else 10, {})
         assert len(strangers["refused_ms"]) == strangers["sent"]
@@ -25,9 +25,9 @@ def test_strangers_are_refused_and_honest_egos_answered(tmp_path):
 
 def test_what_is_no_refusal_is_told():
     refusals = Refusals()
-    for status in (401, 408, 408):
+    for status in (401, 503, 408, 408):
         refusals.answered(status, 1.0)
-    assert (refusals.refused_ms, refusals.others) == ([1.0], {"408": 2})
+    assert (refusals.refused_ms, refusals.others) == ([1.0, 1.0], {"408": 2})
 
 
 def test_bodies_are_announced_as_large_as_a_gateway_reads():

@@ -10,17 +10,16 @@ import numpy as np
 from robosac.evaluation.comparison.playing import EGO_ONLY, ORACLE
 from robosac.evaluation.comparison.rows import EARLY, Row
 from robosac.evaluation.comparison.settings import NOBODY
+from robosac.figures import new_figure
 
 
 def draw_precision(rows: Sequence[Row], path: Path) -> None:
     """AP70 of each defence in each setting as numbers, coloured by the loss against the oracle."""
-    from matplotlib.figure import Figure  # noqa: PLC0415 (a second to import, and only pictures need it)
-
     names = [name for name in dict.fromkeys(row.defense for row in rows) if name != ORACLE]
     settings = list(dict.fromkeys(row.setting for row in rows))
     ap = {(row.setting, row.defense): row.whole.ap70.value for row in rows}
     loss = np.array([[ap[s, ORACLE] - ap[s, n] for n in names] for s in settings])
-    figure = Figure(figsize=(1.8 + 1.15 * len(names), 1.6 + 0.34 * len(settings)), layout="constrained")
+    figure = new_figure(1.8 + 1.15 * len(names), 1.6 + 0.34 * len(settings))
     axes = figure.add_subplot()
     most = max(0.5, float(loss.max()))
     image = axes.imshow(loss, cmap="OrRd", vmin=0.0, vmax=most, aspect="auto")
@@ -37,9 +36,7 @@ def draw_precision(rows: Sequence[Row], path: Path) -> None:
 
 def draw_passes(rows: Sequence[Row], path: Path) -> None:
     """Each defence's mean AP70 over the settings with attackers against its fused passes in later frames."""
-    from matplotlib.figure import Figure  # noqa: PLC0415 (a second to import, and only pictures need it)
-
-    figure = Figure(figsize=(6.5, 4.2), layout="constrained")
+    figure = new_figure(6.5, 4.2)
     axes = figure.add_subplot()
     for name in dict.fromkeys(row.defense for row in rows):
         mine = [row for row in rows if row.defense == name and row.setting != NOBODY]

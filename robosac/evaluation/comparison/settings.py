@@ -6,7 +6,7 @@ from collections.abc import Callable, Mapping
 from dataclasses import dataclass
 
 from robosac.attacks import HONEST, load_campaign
-from robosac.calibration import calibration_of
+from robosac.calibrated import calibration_of
 from robosac.defenses import (
     A2CP,
     Conformal,

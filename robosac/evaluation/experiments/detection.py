@@ -14,7 +14,9 @@ from robosac.consensus import at_least, compare
 from robosac.defenses import SampleConsensus
 from robosac.evaluation.experiments import paper
 from robosac.evaluation.experiments.common import Context, Recorded, Section, Table, precision
+from robosac.figures import new_figure
 from robosac.fusion import FusionResult, fuse
+from robosac.scenes.drawing import FOUND_COLOUR, TRUE_COLOUR, draw_boxes, frame_axes
 
 COLLABORATORS = 3
 BUDGETS = (7, 5, 3, 1)
@@ -130,10 +132,8 @@ def ablation(context: Context) -> Section:
 
 def trade_off(context: Context) -> Section:
     """Average precision over computation."""
-    from matplotlib.figure import Figure  # noqa: PLC0415 (a second to import, and only pictures need it)
-
     frames = context.frames()
-    figure = Figure(figsize=(7, 4.6), layout="constrained")
+    figure = new_figure(7, 4.6)
     axes = figure.add_subplot()
     rows = []
     for s in (1, 2, 3, 4):
@@ -155,10 +155,6 @@ def trade_off(context: Context) -> Section:
 
 def qualitative(context: Context) -> Section:
     """The frame in which the attack did most, as a picture."""
-    from matplotlib.figure import Figure  # noqa: PLC0415 (a second to import, and only pictures need it)
-
-    from robosac.scenes.drawing import FOUND_COLOUR, TRUE_COLOUR, draw_boxes, frame_axes  # noqa: PLC0415
-
     recorded = max(context.frames(), key=lambda r: len(r.detect(sorted(r.frame.received))))
     frame = recorded.frame
     benign = context.detector.prepare(frame.ego, frame.benign)
@@ -170,7 +166,7 @@ def qualitative(context: Context) -> Section:
         (f"Attacked by {', '.join(sorted(frame.attackers))}, no defence", recorded.detect(sorted(frame.received))),
         (f"Defended: {', '.join(defended.accepted) or 'ego only'}", defended.boxes),
     )
-    figure = Figure(figsize=(22, 5.9), layout="constrained")
+    figure = new_figure(22, 5.9)
     for axes, (title, boxes) in zip(figure.subplots(1, 4), panels, strict=True):
         draw_boxes(axes, frame.truth, TRUE_COLOUR, "true", dashed=True, width=1.0)
         draw_boxes(axes, at_least(boxes, SHOWN_SCORE), FOUND_COLOUR, f"found, score from {SHOWN_SCORE}")

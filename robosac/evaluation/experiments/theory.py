@@ -11,6 +11,7 @@ from robosac.defenses import A2CP, SampleConsensus, State
 from robosac.evaluation.experiments import paper
 from robosac.evaluation.experiments.common import TEAM_SIZE, Context, Recorded, Section, Table
 from robosac.evaluation.oracle import converse_with_oracle, simulate_sampling
+from robosac.figures import new_figure
 from robosac.fusion import fuse
 
 MOST_STEPS = 500
@@ -73,10 +74,8 @@ def _steps_until_consensus(
 
 def numerical(context: Context) -> Section:
     """The numerical figures: s over N and N over s."""
-    from matplotlib.figure import Figure  # noqa: PLC0415 (a second to import, and only pictures need it)
-
     budgets, sizes = range(1, 26), range(1, 11)
-    figure = Figure(figsize=(11, 4.2), layout="constrained")
+    figure = new_figure(11, 4.2)
     left, right = figure.subplots(1, 2)
     for eta in RATIOS:
         left.plot(budgets, [eq1_collaborators(n, eta) for n in budgets], marker=".", label=f"eta = {eta}")

@@ -1,4 +1,4 @@
-"""The calibration that belongs to a detector."""
+"""The calibration that belongs to a detector: beside its weights, once `robosac.calibration` has made it."""
 
 from __future__ import annotations
 

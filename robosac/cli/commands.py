@@ -1,0 +1,95 @@
+"""The commands by name; each is imported when it runs, since most take seconds to import.
+
+Other packages add commands by the entry point group ``robosac.commands``, so that nothing here has to know them.
+"""
+
+from __future__ import annotations
+
+import ast
+from importlib.metadata import entry_points
+from importlib.util import find_spec
+from pathlib import Path
+from pkgutil import resolve_name
+from typing import Any
+
+import typer
+from typer.core import TyperCommand, TyperGroup
+
+from robosac.extras import MissingExtra
+
+OWN = {
+    "scene": "robosac.cli.scene:run",
+    "train": "robosac.cli.train:run",
+    "evaluate": "robosac.cli.evaluate:run",
+    "benign-scores": "robosac.cli.benign_scores:run",
+    "reproduce": "robosac.cli.reproduce:run",
+    "compare": "robosac.cli.compare:run",
+    "calibrate": "robosac.cli.calibrate:run",
+    "convert-checkpoint": "robosac.cli.convert:run",
+    "audit": "robosac.cli.audit:app",
+}
+"""Commands of the library, each ``module:attribute``: a function, or a typer application with commands of its own."""
+GROUP = "robosac.commands"
+"""Entry points of other packages' commands, in the same form."""
+
+
+def places() -> dict[str, str]:
+    """All commands, the library's own first; nobody else can take one of its names."""
+    others = {point.name: f"{point.module}:{point.attr}" for point in entry_points(group=GROUP)}
+    return OWN | {name: others[name] for name in sorted(others) if name not in OWN}
+
+
+def summary(place: str) -> str:
+    """The first paragraph of a command's docstring, or of its module's where the command is no function.
+
+    The module is read and not imported. What cannot be read has no summary.
+    """
+    module, _, attribute = place.partition(":")
+    try:
+        spec = find_spec(module)
+        tree = ast.parse(Path(spec.origin).read_bytes()) if spec and spec.origin else ast.Module([], [])
+    except (ImportError, OSError, SyntaxError):
+        return ""
+    functions = {node.name: node for node in tree.body if isinstance(node, ast.FunctionDef)}
+    text = ast.get_docstring(functions.get(attribute, tree)) or ""
+    return " ".join(text.partition("\n\n")[0].split())
+
+
+def load(name: str, place: str) -> Any:
+    """The command at a place."""
+    found = resolve_name(place)
+    if not isinstance(found, typer.Typer):
+        function, found = found, typer.Typer(add_completion=False)
+        found.command(name)(function)
+    command = typer.main.get_command(found)
+    command.name = name
+    return command
+
+
+class Commands(TyperGroup):
+    """A group whose commands are stand-ins, made real once one is chosen.
+
+    Contexts and commands are ``Any`` below, since it depends on the version of typer whose classes they are.
+    """
+
+    def __init__(self, **settings: Any) -> None:
+        super().__init__(**settings)
+        self._places = places()
+        self.commands = {name: TyperCommand(name) for name in self._places}
+
+    def get_command(self, ctx: Any, cmd_name: str) -> Any:
+        command = super().get_command(ctx, cmd_name)
+        if command is not None:
+            command.help = summary(self._places[cmd_name])
+        return command
+
+    def resolve_command(self, ctx: Any, args: list[str]) -> Any:
+        name, _, rest = super().resolve_command(ctx, args)
+        return name, None if name is None else load(name, self._places[name]), rest
+
+    def invoke(self, ctx: Any) -> Any:
+        try:
+            return super().invoke(ctx)
+        except MissingExtra as missing:
+            typer.echo(f"Error: {missing}", err=True)
+            raise typer.Exit(1) from missing

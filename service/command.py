@@ -1,0 +1,20 @@
+"""``robosac serve``: the gateway on one address."""
+
+from __future__ import annotations
+
+from typing import Annotated
+
+import typer
+import uvicorn
+
+GRACE_S = 5
+"""How long requests in hand may take after a SIGTERM; by their budgets they take less."""
+
+
+def main(
+    host: Annotated[str, typer.Option(help="Address to listen on; other machines need an API key.")] = "127.0.0.1",
+    port: Annotated[int, typer.Option(min=0, max=65535, help="Port; 0 takes a free one.")] = 8000,
+) -> None:
+    """Run the gateway, with the settings of the environment (ROBOSAC_...), until SIGTERM or Ctrl-C."""
+    # as uvicorn's own command does, the working directory may hold modules of the user's own detectors
+    uvicorn.run("service.app:app", host=host, port=port, timeout_graceful_shutdown=GRACE_S, app_dir="")

@@ -1,0 +1,111 @@
+import subprocess
+import sys
+import tomllib
+from importlib.metadata import EntryPoint
+from pathlib import Path
+
+import pytest
+import typer
+from typer.testing import CliRunner
+
+from robosac.cli import app, commands
+from robosac.extras import MissingExtra
+
+runner = CliRunner()
+PROJECT = tomllib.loads((Path(__file__).parents[3] / "pyproject.toml").read_text())["project"]
+BROUGHT = PROJECT["entry-points"][commands.GROUP]
+
+
+@pytest.fixture
+def brought(monkeypatch):
+    """Entry points of other packages, whatever is installed; by default those that this project declares."""
+
+    def bring(points):
+        found = [EntryPoint(name, place, commands.GROUP) for name, place in points.items()]
+        monkeypatch.setattr(commands, "entry_points", lambda group: found if group == commands.GROUP else [])
+
+    bring(BROUGHT)
+    return bring
+
+
+def words(text):
+    return " ".join(text.replace("│", " ").split())
+
+
+@pytest.mark.parametrize(("name", "place"), [*commands.OWN.items(), *BROUGHT.items()])
+def test_the_help_says_of_a_command_what_it_says_of_itself(name, place, brought):
+    summary = commands.summary(place)
+    assert summary
+    assert summary == " ".join(commands.load(name, place).help.partition("\n\n")[0].split())
+    assert summary in words(runner.invoke(app, ["--help"], terminal_width=400).output)
+    own = runner.invoke(app, [name, "--help"], terminal_width=400)
+    assert own.exit_code == 0, own.output
+    assert summary in words(own.output)
+    assert f" {name} [OPTIONS]" in own.output
+
+
+def test_the_help_imports_no_command():
+    code = """
+import sys
+from robosac.cli import app
+app(["--help"], standalone_mode=False)
+names = [name for name in ("torch", "scipy", "numpy", "uvicorn", "clients.client") if name in sys.modules]
+assert not names, names
+"""
+    subprocess.run([sys.executable, "-c", code], check=True, stdout=subprocess.DEVNULL)
+
+
+def test_checking_a_log_needs_no_torch():
+    code = """
+import sys
+from robosac.cli import app
+app(["audit", "verify", "--help"], standalone_mode=False)
+names = [name for name in ("torch", "scipy") if name in sys.modules]
+assert not names, names
+"""
+    subprocess.run([sys.executable, "-c", code], check=True, stdout=subprocess.DEVNULL)
+
+
+def test_a_command_that_another_package_brings_is_run(brought, tmp_path, monkeypatch):
+    (tmp_path / "other_package.py").write_text(
+        'def greet(name: str) -> None:\n    """Greet.\n\n    Further words.\n    """\n    print(f"Hello {name}")\n'
+    )
+    monkeypatch.syspath_prepend(tmp_path)
+    brought({"greet": "other_package:greet", "scene": "other_package:greet"})
+    assert commands.places()["scene"] == commands.OWN["scene"]
+    listed = runner.invoke(app, ["--help"]).output
+    assert "Greet." in listed
+    assert "Further" not in listed
+    assert "other_package" not in sys.modules
+    assert runner.invoke(app, ["greet", "Ann"]).output == "Hello Ann\n"
+
+
+@pytest.mark.parametrize("place", ["nonesuch_package.sub:main", "broken_package:main", "sys:exit"])
+def test_a_command_that_cannot_be_read_is_listed_without_words(place, brought, tmp_path, monkeypatch):
+    (tmp_path / "broken_package.py").write_text("def main(:")
+    monkeypatch.syspath_prepend(tmp_path)
+    brought({"odd-one": place})
+    result = runner.invoke(app, ["--help"])
+    assert result.exit_code == 0, result.output
+    assert "odd-one" in result.output
+
+
+def test_commands_are_completed_by_name(brought):
+    environment = {"_ROBOSAC_COMPLETE": "complete_bash", "COMP_WORDS": "robosac fl", "COMP_CWORD": "1"}
+    result = runner.invoke(app, [], prog_name="robosac", env=environment)
+    assert result.output.split() == ["fleet", "flood"]
+
+
+def test_a_missing_extra_ends_a_command_in_one_line(monkeypatch):
+    def load(name, place):
+        def needing() -> None:
+            raise MissingExtra("matplotlib is not installed")
+
+        alone = typer.Typer()
+        alone.command(name)(needing)
+        return typer.main.get_command(alone)
+
+    monkeypatch.setattr(commands, "load", load)
+    result = runner.invoke(app, ["scene"])
+    assert result.exit_code == 1
+    assert result.output == "Error: matplotlib is not installed\n"
