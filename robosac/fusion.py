@@ -16,7 +16,19 @@ import numpy as np
 
 from robosac.boxes import FloatArray
 from robosac.consensus import Verdict, at_least, compare
-from robosac.defenses import Decision, Defense, Hypothesis, Outcome, Reason, Reference, Rejection, Source, State
+from robosac.defenses import (
+    Decision,
+    Defense,
+    Hypothesis,
+    Outcome,
+    Reason,
+    Reference,
+    Rejection,
+    Source,
+    State,
+    named_in,
+    trusted_in,
+)
 from robosac.detectors import Message, PreparedFrame, Preparer
 from robosac.faults import describe
 from robosac.previous import PreviousAnswer
@@ -82,6 +94,11 @@ class FusionResult:
     def sampling_steps(self) -> int:
         """Hypotheses tested."""
         return len(self.hypotheses)
+
+    @property
+    def named(self) -> tuple[str, ...] | None:
+        """Teammates held to be attackers; None from a defence that names nobody."""
+        return named_in(self.state)
 
 
 def fuse(
@@ -203,7 +220,7 @@ class _FrameRun:
         less.
         """
         verified = {o.teammates for o in self.outcomes if o.verdict is Verdict.CONSENSUS}
-        trusted = set(state.get("trusted", ()))
+        trusted = set(trusted_in(state))
         allowed = {
             Source.CONSENSUS: bool(decision.accepted) and decision.accepted in verified,
             Source.TRUSTED: bool(decision.accepted) and trusted.issuperset(decision.accepted),
@@ -213,8 +230,8 @@ class _FrameRun:
             raise UnverifiedAnswer(f"{self.defense.kind} answered {decision.source} with {decision.accepted}")
         if sorted([*decision.accepted, *decision.rejected]) != team:
             raise UnverifiedAnswer(f"{self.defense.kind} neither accepted nor rejected some of {team}")
-        if not trusted.union(*verified).issuperset(decision.state.get("trusted", ())):
-            raise UnverifiedAnswer(f"{self.defense.kind} trusts {decision.state['trusted']} without a consensus")
+        if not trusted.union(*verified).issuperset(decision.trusted):
+            raise UnverifiedAnswer(f"{self.defense.kind} trusts {list(decision.trusted)} without a consensus")
 
     def _test(self, prepared: PreparedFrame, batch: Sequence[Hypothesis]) -> list[Outcome]:
         tested: list[Outcome] = []

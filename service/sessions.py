@@ -13,7 +13,7 @@ import structlog
 
 from robosac.audit import commitment
 from robosac.budget import DomainError
-from robosac.defenses import Reason
+from robosac.defenses import Reason, suspicion_in
 from robosac.detectors import Detector
 from service import audit
 from service.engine import Engine
@@ -202,7 +202,7 @@ class Sessions:
             last_frame=record.last_frame,
             frames_answered=record.frames_answered,
             state=dict(record.state),
-            suspicion=record.state.get("suspicion"),
+            suspicion=suspicion_in(record.state),
             audit_seq=record.audit_seq,
             audit_head=record.audit_head,
             next_seed_commitment=commitment(record.seed),

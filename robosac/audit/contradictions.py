@@ -6,7 +6,7 @@ from collections.abc import Collection, Iterator
 
 from robosac.audit.records import FrameAnswered
 from robosac.consensus import Verdict
-from robosac.defenses import Reason, Source
+from robosac.defenses import Reason, Source, trusted_in
 
 
 def contradictions(
@@ -42,7 +42,7 @@ def _of_answer(answer: FrameAnswered, trusted: Collection[str] | None) -> Iterat
     elif trusted is not None and not accepted <= set(trusted):
         yield f"{_listed(accepted - set(trusted))} accepted as trusted, but not on the trust list before"
     if trusted is not None:
-        gained = set(answer.state.get("trusted", ())) - set(trusted).union(*verified)
+        gained = set(trusted_in(answer.state)) - set(trusted).union(*verified)
         if gained:
             yield f"{_listed(gained)} on the trust list without a consensus"
 

@@ -22,6 +22,7 @@ from robosac.audit.records import (
     read,
 )
 from robosac.consensus import DEFAULT_THRESHOLD
+from robosac.defenses import trusted_in
 from robosac.signatures import is_valid, read_public_key
 
 
@@ -212,7 +213,7 @@ class _Verification:
             case "team_changed":
                 change = TeamChanged.of(record)
                 self._enrol(change.public_keys)
-                self._history.trusted = tuple(change.state.get("trusted", ()))
+                self._history.trusted = trusted_in(change.state)
             case "frame_answered":
                 self._check_answer(FrameAnswered.of(record))
             case "equivocation":
@@ -231,7 +232,7 @@ class _Verification:
             ego_id=opened.ego_id,
             threshold=threshold if isinstance(threshold, int | float) else None,
             commitment=opened.next_seed_commitment,
-            trusted=tuple(opened.state.get("trusted", ())),
+            trusted=trusted_in(opened.state),
         )
         self._enrol(opened.public_keys)
 
@@ -257,7 +258,7 @@ class _Verification:
             self._check_signature(name, proof)
         known.commitment = answer.next_seed_commitment
         known.frame = answer.frame
-        known.trusted = tuple(answer.state.get("trusted", ()))
+        known.trusted = trusted_in(answer.state)
 
     def _check_signature(self, vehicle: str, proof: Proof) -> None:
         key = self._history.keys.get(vehicle)

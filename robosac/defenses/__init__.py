@@ -19,6 +19,10 @@ from robosac.defenses.protocol import (
     Rejection,
     Source,
     State,
+    named_in,
+    remembered,
+    suspicion_in,
+    trusted_in,
 )
 from robosac.defenses.sample_consensus import SampleConsensus
 from robosac.defenses.static_team import StaticTeam
@@ -44,4 +48,8 @@ __all__ = [
     "StaticTeam",
     "Undefended",
     "build",
+    "named_in",
+    "remembered",
+    "suspicion_in",
+    "trusted_in",
 ]

@@ -19,6 +19,8 @@ from robosac.defenses.protocol import (
     Source,
     State,
     explain_rejections,
+    remembered,
+    trusted_in,
 )
 from robosac.defenses.sampling import SamplingSettings, search
 
@@ -64,16 +66,16 @@ class StaticTeam(SamplingSettings):
 
     def initial_state(self, team: Sequence[str]) -> State:  # noqa: ARG002
         """Nobody is trusted; ``frames_since_check`` counts from the latest consensus."""
-        return {"trusted": [], "frames_since_check": 0}
+        return remembered({"frames_since_check": 0}, trusted=())
 
     def change_team(self, state: State, team: Sequence[str]) -> State:
         """Those who left are no longer trusted; those who joined are not trusted yet."""
-        return {**state, "trusted": [name for name in state["trusted"] if name in team]}
+        return remembered(state, trusted=[name for name in trusted_in(state) if name in team])
 
     def converse(self, team: Sequence[str], state: State, rng: np.random.Generator) -> Conversation:
         """Answer from the trust list, re-check it, or build it."""
         outcomes: list[Outcome] = []
-        trusted = list(state["trusted"])
+        trusted: Sequence[str] = trusted_in(state)
         present: Hypothesis = tuple(name for name in team if name in trusted)
         waited = int(state["frames_since_check"]) + 1
         if present:
@@ -109,5 +111,5 @@ class StaticTeam(SamplingSettings):
             source=source,
             rejected=explain_rejections(team, accepted, outcomes, otherwise),
             attacker_ratio=self.attacker_ratio,
-            state={"trusted": list(trusted), "frames_since_check": waited},
+            state=remembered({"frames_since_check": waited}, trusted=trusted),
         )

@@ -9,7 +9,7 @@ from typing import ClassVar
 import numpy as np
 
 from robosac.consensus import DEFAULT_THRESHOLD
-from robosac.defenses.protocol import Conversation, Decision, Reference, Source, State
+from robosac.defenses.protocol import Conversation, Decision, Reference, Source, State, remembered
 
 
 @dataclass(frozen=True)
@@ -25,7 +25,7 @@ class Undefended:
 
     def initial_state(self, team: Sequence[str]) -> State:
         """Everybody is trusted."""
-        return {"trusted": list(team)}
+        return remembered({}, trusted=team)
 
     def change_team(self, state: State, team: Sequence[str]) -> State:  # noqa: ARG002
         """Everybody is trusted."""

@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Mapping, Sequence
+from collections.abc import Sequence
 from dataclasses import dataclass
 from typing import Any, ClassVar
 
@@ -15,7 +15,7 @@ from robosac.defenses.group_testing.frame import JudgedFrame
 from robosac.defenses.group_testing.memory import Memory
 from robosac.defenses.group_testing.model import Calibration, EvidenceModel
 from robosac.defenses.group_testing.posterior import Hazards, Posterior
-from robosac.defenses.protocol import Conversation, Reference, State
+from robosac.defenses.protocol import Conversation, Reference, State, named_in, remembered, trusted_in
 from robosac.defenses.sampling import check_budget, check_threshold
 
 DEFAULT_HAZARDS = Hazards(hijack=0.003, recovery=0.001, change=0.02)
@@ -133,7 +133,7 @@ class GroupTesting:
         """
         posterior, memory = self._revive(state)
         self._sync(posterior, memory, joined=team, kept=team)
-        kept = [[name for name in state[of] if name in set(team)] for of in ("trusted", "named")]
+        kept = [[name for name in of if name in set(team)] for of in (trusted_in(state), named_in(state) or ())]
         return _state(posterior, memory, *kept)
 
     def converse(self, team: Sequence[str], state: State, rng: np.random.Generator) -> Conversation:
@@ -145,7 +145,7 @@ class GroupTesting:
             posterior.step(self.hazards)
         posterior.regroup(unresolved(posterior.marginals()))
         judged = JudgedFrame(
-            self.model, posterior, memory, tuple(team), frozenset(state["trusted"]), compare_frames=self.compare_frames
+            self.model, posterior, memory, tuple(team), frozenset(trusted_in(state)), compare_frames=self.compare_frames
         )
         for passes in range(self.first_budget if first else self.budget, 0, -1):
             subset = judged.next_test(rng, passes)
@@ -155,7 +155,7 @@ class GroupTesting:
             if not tested:
                 break
             judged.learn(tested[0])
-        decision = judged.decide(frozenset(state["named"]), self.naming_bound)
+        decision = judged.decide(frozenset(named_in(state) or ()), self.naming_bound)
         memory.frame += 1
         return decision.with_state(_state(posterior, memory, decision.trusted, decision.named))
 
@@ -178,11 +178,10 @@ class GroupTesting:
             posterior.add(name, memory.welcome(name, self.attack_prior * self.attacker_prior))
 
 
-def _state(posterior: Posterior, memory: Memory, trusted: Sequence[str], named: Sequence[str]) -> Mapping[str, Any]:
-    return {
-        "posterior": posterior.to_state(),
-        "memory": memory.to_state(),
-        "trusted": list(trusted),
-        "named": list(named),
-        "suspicion": dict(sorted(zip(posterior.members, posterior.marginals().round(6).tolist(), strict=True))),
-    }
+def _state(posterior: Posterior, memory: Memory, trusted: Sequence[str], named: Sequence[str]) -> State:
+    return remembered(
+        {"posterior": posterior.to_state(), "memory": memory.to_state()},
+        trusted=trusted,
+        named=named,
+        suspicion=dict(sorted(zip(posterior.members, posterior.marginals().round(6).tolist(), strict=True))),
+    )
