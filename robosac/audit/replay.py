@@ -13,8 +13,19 @@ import numpy as np
 
 from robosac import wire
 from robosac.audit.records import FrameAnswered, RecordError, SessionOpened, TeamChanged, read
+from robosac.budget import DomainError
 from robosac.calibration import calibration_digest, calibration_of
-from robosac.defenses import Conversation, Decision, Defense, GroupTesting, Outcome, State, build
+from robosac.defenses import (
+    Conversation,
+    Decision,
+    Defense,
+    DefenseSettings,
+    Kinds,
+    Outcome,
+    State,
+    build,
+    read_settings,
+)
 from robosac.detectors import Message, Preparer
 from robosac.faults import in_short
 from robosac.fusion import FusionResult, fuse
@@ -112,7 +123,7 @@ def find(lines: Iterable[bytes], frame: int) -> LoggedDecision:
     raise ReplayError(f"the log holds no answer to frame {frame}")
 
 
-def replay(decision: LoggedDecision, body: bytes, detector: Preparer) -> list[Difference]:
+def replay(decision: LoggedDecision, body: bytes, detector: Preparer, kinds: Kinds | None = None) -> list[Difference]:
     """Make a decision again and compare.
 
     Jaccard indices are compared to `JACCARD_TOLERANCE`, boxes to `BOX_TOLERANCE`, the defence's state to
@@ -126,6 +137,8 @@ def replay(decision: LoggedDecision, body: bytes, detector: Preparer) -> list[Di
         The messages, as a whole frame (`robosac.wire.read_frame`).
     detector : Preparer
         The one that the session had.
+    kinds : mapping, optional
+        Where to look for the session's defence, as `robosac.defenses.read_settings` does.
 
     Returns
     -------
@@ -141,15 +154,15 @@ def replay(decision: LoggedDecision, body: bytes, detector: Preparer) -> list[Di
     if detector.info.weights_digest != decision.session.weights_digest:
         detail = f"the weights' digest is {detector.info.weights_digest}, logged {decision.session.weights_digest}"
         return [Difference("detector", detail)]
-    calibration = calibration_digest(detector.info)
-    if decision.session.defense.get("kind") == GroupTesting.kind and calibration != decision.session.calibration_digest:
+    calibration, settings = calibration_digest(detector.info), _settings(decision, kinds)
+    if settings.needs_calibration and calibration != decision.session.calibration_digest:
         detail = f"the calibration's digest is {calibration}, logged {decision.session.calibration_digest}"
         return [Difference("detector", detail)]
     messages = _read_messages(decision, body, detector)
     wrong = _compare_digests(logged, messages)
     if wrong:
         return wrong
-    return _compare(logged, _fuse(decision, messages, detector))
+    return _compare(logged, _fuse(decision, settings, messages, detector))
 
 
 def _before(answer: FrameAnswered, recent: Iterable[FrameAnswered]) -> PreviousAnswer | None:
@@ -191,10 +204,19 @@ def _compare_digests(logged: FrameAnswered, messages: dict[str, Message]) -> lis
     return wrong
 
 
-def _fuse(decision: LoggedDecision, messages: dict[str, Message], detector: Preparer) -> FusionResult:
+def _settings(decision: LoggedDecision, kinds: Kinds | None) -> DefenseSettings:
     try:
-        defense = _Counted(build(decision.session.defense, lambda: calibration_of(detector.info)))
-    except ValueError as error:
+        return read_settings(decision.session.defense, kinds)
+    except DomainError as error:
+        raise ReplayError(f"the log's settings make no defence: {error}") from error
+
+
+def _fuse(
+    decision: LoggedDecision, settings: DefenseSettings, messages: dict[str, Message], detector: Preparer
+) -> FusionResult:
+    try:
+        defense = _Counted(build(settings, lambda: calibration_of(detector.info)))
+    except DomainError as error:
         raise ReplayError(f"the log's settings make no defence: {error}") from error
     logged, ego_id = decision.answer, decision.session.ego_id
     most = len(logged.hypotheses) if logged.out_of_time else math.inf

@@ -14,7 +14,7 @@ from __future__ import annotations
 from collections.abc import Collection, Generator, Mapping, Sequence
 from dataclasses import dataclass, field
 from enum import StrEnum
-from typing import Any, ClassVar, Protocol
+from typing import Any, Protocol
 
 import numpy as np
 
@@ -195,7 +195,10 @@ Conversation = Generator[Sequence[Hypothesis], Sequence[Outcome], Decision]
 class Defense(Protocol):
     """A defence's settings and its conversation. Implementations are immutable."""
 
-    kind: ClassVar[str]
+    @property
+    def kind(self) -> str:
+        """Its name in settings and logs."""
+        ...
 
     @property
     def consensus_threshold(self) -> float:

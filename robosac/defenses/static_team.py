@@ -4,9 +4,10 @@ from __future__ import annotations
 
 from collections.abc import Sequence
 from dataclasses import dataclass
-from typing import ClassVar
+from typing import ClassVar, Literal
 
 import numpy as np
+from pydantic import Field
 
 from robosac.budget import DomainError
 from robosac.consensus import Verdict
@@ -22,13 +23,13 @@ from robosac.defenses.protocol import (
     remembered,
     trusted_in,
 )
-from robosac.defenses.sampling import SamplingSettings, search
+from robosac.defenses.sampling import Sampling, SamplingSettings, search
 
 DEFAULT_RECHECK = 10
 
 
 @dataclass(frozen=True)
-class StaticTeam(SamplingSettings):
+class StaticTeam(Sampling):
     """The paper's static team, with a re-check.
 
     1. Until there is a consensus, Algorithm 1. Its subset becomes the trust list.
@@ -113,3 +114,13 @@ class StaticTeam(SamplingSettings):
             attacker_ratio=self.attacker_ratio,
             state=remembered({"frames_since_check": waited}, trusted=trusted),
         )
+
+
+class StaticTeamSettings(SamplingSettings):
+    """Find trustworthy teammates once, rely on them, and look again now and then."""
+
+    makes = StaticTeam
+    kind: Literal["static_team"]
+    recheck_every: int | None = Field(
+        DEFAULT_RECHECK, ge=1, description="Frames between two re-checks of the trusted; null never looks again."
+    )

@@ -4,12 +4,13 @@ from __future__ import annotations
 
 from collections.abc import Sequence
 from dataclasses import dataclass
-from typing import ClassVar
+from typing import ClassVar, Literal
 
 import numpy as np
 
 from robosac.consensus import DEFAULT_THRESHOLD
 from robosac.defenses.protocol import Conversation, Decision, Reference, Source, State, remembered
+from robosac.defenses.settings import DefenseSettings
 
 
 @dataclass(frozen=True)
@@ -39,3 +40,10 @@ class Undefended:
         yield from ()
         source = Source.TRUSTED if team else Source.EGO_ONLY
         return Decision(tuple(team), source, rejected={}, attacker_ratio=None, state=state)
+
+
+class UndefendedSettings(DefenseSettings):
+    """No defence: everybody is fused and nothing is tested. A baseline."""
+
+    makes = Undefended
+    kind: Literal["none"]
