@@ -12,7 +12,7 @@ from typing import Annotated, BinaryIO
 
 import typer
 
-from robosac import detectors, wire
+from robosac import defenses, detectors, wire
 from robosac.audit import digest, misbehaviour, replay, verification
 
 app = typer.Typer(no_args_is_help=True, help="Prove what the gateway decided, from its audit log.")
@@ -58,6 +58,9 @@ def replay_decision(
         str | None,
         typer.Option(help="A detector's name, weights file or module:callable; by default the name in the log."),
     ] = None,
+    defense: Annotated[
+        str | None, typer.Option(help="Where a defence that does not ship is: module:callable, or its entry point.")
+    ] = None,
 ) -> None:
     """Make a decision again from the log and the messages, and compare; 1 if it comes out otherwise."""
     try:
@@ -72,7 +75,11 @@ def replay_decision(
         raise typer.BadParameter(str(error), param_hint="FILE") from error
     loaded = _load(detector, decision.session.detector)
     try:
-        differences = replay.replay(decision, body, loaded)
+        kinds = None if defense is None else defenses.known([defense])
+    except ValueError as error:
+        raise typer.BadParameter(str(error), param_hint="--defense") from error
+    try:
+        differences = replay.replay(decision, body, loaded, kinds)
     except replay.ReplayError as error:
         raise typer.BadParameter(str(error), param_hint="--messages") from error
     answer = decision.answer
