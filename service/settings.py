@@ -22,7 +22,7 @@ class Settings(BaseSettings):
         (), description="Detectors beside those that ship: weights files or module:callable, separated by commas."
     )
     extra_defenses: Annotated[tuple[str, ...], NoDecode] = Field(
-        (), description="Defences beside those that ship: module:callable, separated by commas."
+        (), description="Defences beside those that ship: module:callable or entry points, separated by commas."
     )
     api_keys: Annotated[tuple[SecretStr, ...], NoDecode] = Field(
         (), description="Keys that open sessions, separated by commas; without any, only loopback is served."

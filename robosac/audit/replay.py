@@ -15,17 +15,7 @@ from robosac import wire
 from robosac.audit.records import FrameAnswered, RecordError, SessionOpened, TeamChanged, read
 from robosac.budget import DomainError
 from robosac.calibration import calibration_digest, calibration_of
-from robosac.defenses import (
-    Conversation,
-    Decision,
-    Defense,
-    DefenseSettings,
-    Kinds,
-    Outcome,
-    State,
-    build,
-    read_settings,
-)
+from robosac.defenses import Conversation, Decision, Defense, Kinds, Outcome, State, build, read_settings
 from robosac.detectors import Message, Preparer
 from robosac.faults import in_short
 from robosac.fusion import FusionResult, fuse
@@ -154,15 +144,20 @@ def replay(decision: LoggedDecision, body: bytes, detector: Preparer, kinds: Kin
     if detector.info.weights_digest != decision.session.weights_digest:
         detail = f"the weights' digest is {detector.info.weights_digest}, logged {decision.session.weights_digest}"
         return [Difference("detector", detail)]
-    calibration, settings = calibration_digest(detector.info), _settings(decision, kinds)
-    if settings.needs_calibration and calibration != decision.session.calibration_digest:
-        detail = f"the calibration's digest is {calibration}, logged {decision.session.calibration_digest}"
-        return [Difference("detector", detail)]
+    calibration = calibration_digest(detector.info)
+    try:
+        settings = read_settings(decision.session.defense, kinds)
+        if settings.needs_calibration and calibration != decision.session.calibration_digest:
+            detail = f"the calibration's digest is {calibration}, logged {decision.session.calibration_digest}"
+            return [Difference("detector", detail)]
+        defense = build(settings, lambda: calibration_of(detector.info))
+    except DomainError as error:
+        raise ReplayError(f"the log's settings make no defence: {error}") from error
     messages = _read_messages(decision, body, detector)
     wrong = _compare_digests(logged, messages)
     if wrong:
         return wrong
-    return _compare(logged, _fuse(decision, settings, messages, detector))
+    return _compare(logged, _fuse(decision, _Counted(defense), messages, detector))
 
 
 def _before(answer: FrameAnswered, recent: Iterable[FrameAnswered]) -> PreviousAnswer | None:
@@ -204,20 +199,9 @@ def _compare_digests(logged: FrameAnswered, messages: dict[str, Message]) -> lis
     return wrong
 
 
-def _settings(decision: LoggedDecision, kinds: Kinds | None) -> DefenseSettings:
-    try:
-        return read_settings(decision.session.defense, kinds)
-    except DomainError as error:
-        raise ReplayError(f"the log's settings make no defence: {error}") from error
-
-
 def _fuse(
-    decision: LoggedDecision, settings: DefenseSettings, messages: dict[str, Message], detector: Preparer
+    decision: LoggedDecision, defense: _Counted, messages: dict[str, Message], detector: Preparer
 ) -> FusionResult:
-    try:
-        defense = _Counted(build(settings, lambda: calibration_of(detector.info)))
-    except DomainError as error:
-        raise ReplayError(f"the log's settings make no defence: {error}") from error
     logged, ego_id = decision.answer, decision.session.ego_id
     most = len(logged.hypotheses) if logged.out_of_time else math.inf
     return fuse(
