@@ -21,7 +21,7 @@ from clients.client import API_KEY_VARIABLE, GatewayClient, OpenedSession
 from clients.errors import FrameConflict, GatewayError
 from clients.simulation import EgoFrame, Fleet, make_picture_folder
 from clients.summary import FleetSummary
-from robosac import attacks, detectors
+from robosac import attacks, defenses, detectors
 from robosac.answers import FrameAnswer, Reason
 from robosac.attacks import CAMPAIGN_HELP
 from robosac.detectors import DEFAULT_DETECTOR
@@ -221,7 +221,10 @@ def main(
     detector: Annotated[
         str, typer.Option(help="The vehicles' own copy: a name, a weights file, or module:callable.")
     ] = DEFAULT_DETECTOR,
-    defense: Annotated[str | None, typer.Option(help="Kind of defence; by default the gateway's choice.")] = None,
+    defense: Annotated[
+        str | None,
+        typer.Option(help=f"{', '.join(defenses.shipped())}, or module:callable; by default the gateway's choice."),
+    ] = None,
     attacker_ratio: Annotated[float | None, typer.Option(help="Ratio the defence assumes.")] = None,
     sampling_budget: Annotated[int | None, typer.Option(help="Most hypotheses a frame.")] = None,
     collaborators: Annotated[int | None, typer.Option(help="Teammates in a hypothesis.")] = None,
@@ -244,9 +247,7 @@ def main(
         except ValueError as error:
             raise typer.BadParameter(str(error), param_hint=option) from error
     chosen = {"attacker_ratio": attacker_ratio, "sampling_budget": sampling_budget, "collaborators": collaborators}
-    given = {name: value for name, value in chosen.items() if value is not None}
-    if given and defense is None:
-        raise typer.BadParameter("its settings need to know the kind of defence", param_hint="--defense")
+    asked = _asked(defense, {name: value for name, value in chosen.items() if value is not None})
     options = FleetOptions(
         url=url,
         scenes=scenes,
@@ -256,7 +257,7 @@ def main(
         attackers=attackers,
         attack=attack,
         detector=detector,
-        defense=None if defense is None else {"kind": defense, **given},
+        defense=asked,
         seed=seed,
         budget_ms=budget_ms,
         real_time=real_time,
@@ -269,6 +270,21 @@ def main(
         console.print(f"[red]The fleet stopped:[/red] {error}")
         sys.exit(1)
     close_run(options, summary, console)
+
+
+def _asked(defense: str | None, given: dict[str, Any]) -> dict[str, Any] | None:
+    """The ``defense`` of the sessions, where one is asked for; what the defence itself refuses need not be sent."""
+    if defense is None:
+        if given:
+            raise typer.BadParameter("its settings need to know the kind of defence", param_hint="--defense")
+        return None
+    try:
+        loaded = defenses.load(defense)
+        asked = {**loaded.model_dump(mode="json", exclude_unset=True), "kind": loaded.kind, **given}
+        defenses.read_settings(asked, {loaded.kind: type(loaded)})
+    except ValueError as error:
+        raise typer.BadParameter(str(error), param_hint="--defense") from error
+    return asked
 
 
 def close_run(options: FleetOptions, summary: FleetSummary, console: Console) -> None:

@@ -17,7 +17,17 @@ from robosac.answers import FrameAnswer, Reason, RejectedTeammate, Source, Teste
 from robosac.boxes import FloatArray
 from robosac.consensus import at_least, compare
 from robosac.deadline import Deadline
-from robosac.defenses import Decision, Defense, Hypothesis, Outcome, Reference, Rejection, State
+from robosac.defenses import (
+    Decision,
+    Defense,
+    Hypothesis,
+    Outcome,
+    Reference,
+    Rejection,
+    State,
+    named_in,
+    trusted_in,
+)
 from robosac.detectors import Message, PreparedFrame, Preparer
 from robosac.faults import describe
 from robosac.previous import PreviousAnswer
@@ -80,6 +90,11 @@ class FusionResult:
     def sampling_steps(self) -> int:
         """Hypotheses tested."""
         return len(self.hypotheses)
+
+    @property
+    def named(self) -> tuple[str, ...] | None:
+        """Teammates held to be attackers; None from a defence that names nobody."""
+        return named_in(self.state)
 
     def answer(self, frame: int, left_out: Mapping[str, Rejection], timings_ms: Mapping[str, float]) -> FrameAnswer:
         """What is answered about the frame.
@@ -225,7 +240,7 @@ class _FrameRun:
         less.
         """
         verified = {o.teammates for o in self.outcomes if o.verdict is Verdict.CONSENSUS}
-        trusted = set(state.get("trusted", ()))
+        trusted = set(trusted_in(state))
         allowed = {
             Source.CONSENSUS: bool(decision.accepted) and decision.accepted in verified,
             Source.TRUSTED: bool(decision.accepted) and trusted.issuperset(decision.accepted),
@@ -235,8 +250,8 @@ class _FrameRun:
             raise UnverifiedAnswer(f"{self.defense.kind} answered {decision.source} with {decision.accepted}")
         if sorted([*decision.accepted, *decision.rejected]) != team:
             raise UnverifiedAnswer(f"{self.defense.kind} neither accepted nor rejected some of {team}")
-        if not trusted.union(*verified).issuperset(decision.state.get("trusted", ())):
-            raise UnverifiedAnswer(f"{self.defense.kind} trusts {decision.state['trusted']} without a consensus")
+        if not trusted.union(*verified).issuperset(decision.trusted):
+            raise UnverifiedAnswer(f"{self.defense.kind} trusts {list(decision.trusted)} without a consensus")
 
     def _test(self, prepared: PreparedFrame, batch: Sequence[Hypothesis]) -> list[Outcome]:
         tested: list[Outcome] = []

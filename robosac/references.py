@@ -26,4 +26,5 @@ def make(reference: str) -> Any:
     try:
         return pkgutil.resolve_name(reference)()
     except Exception as error:  # the user's code may raise anything
-        raise ValueError(f"{reference}: {type(error).__name__}: {error}") from error
+        said = " ".join(str(error).split())
+        raise ValueError(f"{reference}: {type(error).__name__}: {said}") from error

@@ -43,8 +43,8 @@ def check_type(request: Request, *types: str) -> None:
         raise Problem(415, "unsupported-encoding", "bodies must not be compressed", "content-encoding")
 
 
-async def read_json(request: Request, model: type[Model]) -> Model:
-    """A JSON body, checked against a model; a large one off the event loop.
+async def read_json(request: Request, model: type[Model], context: Any = None) -> Model:
+    """A JSON body, checked against a model, whose validators may ask for a context; a large one off the event loop.
 
     Raises
     ------
@@ -56,8 +56,8 @@ async def read_json(request: Request, model: type[Model]) -> Model:
     check_type(request, JSON)
     body = await read_bounded(request, JSON_BYTES)
     if len(body) <= SMALL_BYTES:
-        return _parsed(body, model)
-    return await asyncio.to_thread(_parsed, body, model)
+        return _parsed(body, model, context)
+    return await asyncio.to_thread(_parsed, body, model, context)
 
 
 def described(model: type[BaseModel]) -> dict[str, Any]:
@@ -67,9 +67,9 @@ def described(model: type[BaseModel]) -> dict[str, Any]:
     return {"requestBody": {"required": True, "content": {JSON: {"schema": _in_full(schema, definitions)}}}}
 
 
-def _parsed(body: bytes, model: type[Model]) -> Model:
+def _parsed(body: bytes, model: type[Model], context: Any) -> Model:
     try:
-        return model.model_validate_json(body)
+        return model.model_validate_json(body, context=context)
     except ValidationError as error:
         raise RequestValidationError(error.errors(include_url=False, include_input=False)) from None
 

@@ -16,8 +16,8 @@ from fastapi.exceptions import RequestValidationError
 from fastapi.responses import JSONResponse
 from starlette.exceptions import HTTPException
 
+from robosac.defenses import shipped
 from robosac.wire import WireError
-from service.schemas import DEFENSE_KINDS
 from service.store import StoreUnavailable
 
 logger = structlog.stdlib.get_logger(__name__)
@@ -113,7 +113,7 @@ def install(app: FastAPI) -> None:
             return Problem(
                 400, "malformed-json", f"not JSON: {first.get('ctx', {}).get('error', first['msg'])}"
             ).response()
-        where = [str(part) for part in first["loc"] if part not in ("body", "query", "path", *DEFENSE_KINDS)]
+        where = [str(part) for part in first["loc"] if part not in ("body", "query", "path", *shipped())]
         return Problem(422, "invalid-request", str(first["msg"]), ".".join(where) or "body").response()
 
     @app.exception_handler(HTTPException)

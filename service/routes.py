@@ -61,8 +61,10 @@ Vehicle = Annotated[Caller, Depends(_vehicle)]
 Ego = Annotated[Caller, Depends(_ego)]
 
 
-async def _session_request(request: Request, _: Annotated[None, Depends(_opener)]) -> SessionRequest:
-    return await read_json(request, SessionRequest)
+async def _session_request(
+    request: Request, gateway: GatewayDep, _: Annotated[None, Depends(_opener)]
+) -> SessionRequest:
+    return await read_json(request, SessionRequest, gateway.sessions.defenses)
 
 
 async def _enrolment_request(request: Request, _: Ego) -> EnrolmentRequest:

@@ -15,7 +15,8 @@ from robosac.answers import Reason
 from robosac.audit import commitment
 from robosac.audit.events import FrameAnswered, SessionEnded, SessionOpened, now
 from robosac.budget import DomainError
-from robosac.calibration import calibration_digest
+from robosac.calibration import calibration_digest, calibration_of
+from robosac.defenses import Defense, DefenseSettings, build, known, read_settings, suspicion_in
 from robosac.detectors import Detector, DetectorInfo
 from service.engine import Engine
 from service.gathering import Backlog, Gathering
@@ -31,7 +32,6 @@ from service.schemas import (
     SessionRequest,
     SessionState,
     default_defense,
-    read_defense,
 )
 from service.settings import Settings
 from service.store import (
@@ -78,6 +78,7 @@ class Sessions:
         self._metrics = metrics
         self._tokens = tokens
         self._live: dict[str, LiveSession] = {}
+        self.defenses = known(settings.extra_defenses)
         self.backlog = Backlog(settings.max_pending_bytes)
         self.journal = Journal(store, metrics)
 
@@ -87,7 +88,7 @@ class Sessions:
         check_size(request.teammates, self._settings.max_teammates)
         settings = (request.defense or default_defense(detector.info)).at_period(request.frame_period_ms)
         try:
-            defense = settings.build(detector.info)
+            defense = _built(settings, detector.info)
             defense.check_team(len(request.teammates))
         except DomainError as error:
             raise Problem(422, "impossible-defense", str(error), "defense") from error
@@ -149,7 +150,8 @@ class Sessions:
         Raises
         ------
         Problem
-            404 for an unknown or ended session, 401 without a token of it, 503 if its detector is not served any more.
+            404 for an unknown or ended session, 401 without a token of it, 503 if its detector or its defence is not
+            served any more.
         """
         record = await self._store.get(session_id)
         if record is None or record.ended_at is not None:
@@ -194,7 +196,7 @@ class Sessions:
             ego_id=record.ego_id,
             teammates=list(record.teammates),
             detector=record.detector,
-            defense=read_defense(record.defense),
+            defense=read_settings(record.defense, self.defenses),
             latency_budget_ms=record.latency_budget_ms,
             gather_ms=record.gather_ms,
             frame_period_ms=record.frame_period_ms,
@@ -202,7 +204,7 @@ class Sessions:
             last_frame=record.last_frame,
             frames_answered=record.frames_answered,
             state=dict(record.state),
-            suspicion=record.state.get("suspicion"),
+            suspicion=suspicion_in(record.state),
             audit_seq=record.audit_seq,
             audit_head=record.audit_head,
             next_seed_commitment=commitment(record.seed),
@@ -295,15 +297,19 @@ class Sessions:
         Raises
         ------
         Problem
-            503 if the detector that it was opened with is not served any more, or lacks what the defence needs.
+            503 if the detector or the defence that it was opened with is not served any more, or the detector lacks
+            what the defence needs.
         """
         closed = -1 if record.last_frame is None else record.last_frame
         settings, detector = self._settings, self._engine.detectors.get(record.detector)
         if detector is None:
             raise Problem(503, "detector-unavailable", f"the session's detector {record.detector} is not served now")
+        if record.defense["kind"] not in self.defenses:
+            detail = f"the session's defence {record.defense['kind']} is not served now"
+            raise Problem(503, "defense-unavailable", detail)
         try:
-            kept = read_defense(record.defense).at_period(record.frame_period_ms)
-            defense = kept.build(detector.info)
+            kept = read_settings(record.defense, self.defenses).at_period(record.frame_period_ms)
+            defense = _built(kept, detector.info)
         except DomainError as error:
             detail = f"the session's detector {record.detector} no longer serves its defence: {error}"
             raise Problem(503, "detector-unavailable", detail) from error
@@ -356,6 +362,10 @@ class Sessions:
             live = self._live_session(record) if record.ended_at is None and self._is_served(record) else None
             await self.journal.stranger(record.session_id, live, refused)
             raise refused.problem from refused
+
+
+def _built(settings: DefenseSettings, info: DetectorInfo) -> Defense:
+    return build(settings, lambda: calibration_of(info))
 
 
 def _opening(record: SessionRecord, info: DetectorInfo) -> SessionOpened:

@@ -21,6 +21,9 @@ class Settings(BaseSettings):
     extra_detectors: Annotated[tuple[str, ...], NoDecode] = Field(
         (), description="Detectors beside those that ship: weights files or module:callable, separated by commas."
     )
+    extra_defenses: Annotated[tuple[str, ...], NoDecode] = Field(
+        (), description="Defences beside those that ship: module:callable or entry points, separated by commas."
+    )
     api_keys: Annotated[tuple[SecretStr, ...], NoDecode] = Field(
         (), description="Keys that open sessions, separated by commas; without any, only loopback is served."
     )
@@ -66,7 +69,7 @@ class Settings(BaseSettings):
         read_url(value)
         return value
 
-    @field_validator("extra_detectors", "api_keys", "token_secrets", mode="before")
+    @field_validator("extra_detectors", "extra_defenses", "api_keys", "token_secrets", mode="before")
     @classmethod
     def _split(cls, value: object) -> object:
         return tuple(part.strip() for part in value.split(",") if part.strip()) if isinstance(value, str) else value

@@ -1,3 +1,4 @@
+import csv
 import itertools
 import json
 import re
@@ -9,8 +10,9 @@ from typer.testing import CliRunner
 
 import robosac
 from clients.simulation import Fleet
-from robosac import attacks, detectors
+from robosac import attacks, defenses, detectors
 from robosac.cli import app
+from robosac.defenses import registry
 from service.settings import Settings
 from tests.service.conftest import serve
 
@@ -49,10 +51,25 @@ def test_every_problem_and_reason_is_documented():
     assert not {slug for slug in slugs if f"`{slug}`" not in text}
 
 
+def test_the_table_of_defences_is_what_they_say_of_themselves():
+    text = (ROOT / "docs" / "api.md").read_text()
+    for kind, model in defenses.shipped().items():
+        settings = {name: field.default for name, field in model.model_fields.items() if name != "kind"}
+        said = ", ".join(f"`{n}`" + ("" if default is None else f" ({default})") for n, default in settings.items())
+        assert f"| `{kind}` | {model.summary()} | {said} |\n" in text
+
+
+def test_the_page_on_defences_knows_all_that_one_has_to_have():
+    text = (ROOT / "docs" / "own-defense.md").read_text()
+    (table,) = re.findall(r"^\| it has .*?\n\n", text, re.MULTILINE | re.DOTALL)
+    for part in registry._PARTS:
+        assert f"`{part}" in table
+
+
 @pytest.fixture
 def examples(tmp_path, monkeypatch):
-    """The whole examples of the pages on one's own detector and attack, importable."""
-    for name in ("detector", "attack"):
+    """The whole examples of the pages on one's own detector, attack and defence, importable."""
+    for name in ("detector", "attack", "defense"):
         (block,) = re.findall(r"```python\n(.*?)```", (ROOT / "docs" / f"own-{name}.md").read_text(), re.DOTALL)
         (tmp_path / f"my_{name}.py").write_text(block)
     monkeypatch.syspath_prepend(tmp_path)
@@ -89,3 +106,54 @@ async def test_the_gateway_serves_the_example_detector_and_fuses_as_the_library_
     assert answer.accepted == expected.accepted
     np.testing.assert_allclose(answer.boxes, expected.boxes)
     assert len(expected.boxes) > 5
+
+
+@pytest.mark.usefixtures("examples")
+def test_the_example_defence_can_be_compared(tmp_path):
+    options = ["compare", "--out", str(tmp_path), "--only", "one_by_one", "--defense", "my_defense:RunningScore"]
+    result = CliRunner().invoke(app, [*options, "--setting", "pgd:1", "--scenes", "1", "--frames", "6"])
+    assert result.exit_code == 0, result.output
+    with (tmp_path / "comparison.csv").open() as file:
+        rows = {line["defense"]: line for line in csv.DictReader(file)}
+    own = rows["my_defense:RunningScore"]
+    assert set(rows) == {"oracle", "one_by_one", "my_defense:RunningScore", "ego only"}
+    assert float(own["ap50"]) > float(rows["ego only"]["ap50"]) + 0.05
+    assert float(own["infiltrated"]) == 0.0
+    assert (own["attackers_named"], own["honest_named"]) == ("1", "0")
+    assert "--defense my_defense:RunningScore" in (tmp_path / "comparison.md").read_text()
+
+
+@pytest.mark.usefixtures("examples")
+@pytest.mark.parametrize(
+    ("name", "complaint"),
+    [("my_defense:START", "not callable"), ("halving", "has its column"), ("nonesuch", "give one")],
+)
+def test_what_cannot_be_compared_is_explained(name, complaint, tmp_path):
+    result = CliRunner().invoke(app, ["compare", "--out", str(tmp_path / "out"), "--defense", name])
+    assert result.exit_code == 2
+    assert complaint in " ".join(result.output.replace("│", "").split())
+
+
+@pytest.mark.usefixtures("examples")
+async def test_the_gateway_serves_the_example_defence_and_its_decisions_can_be_replayed(
+    ego_message, attacked, tmp_path, monkeypatch
+):
+    async with serve(extra_defenses="my_defense:RunningScore", keep_frames=9) as served:
+        session = await served.open(defense={"kind": "running_score", "keep": 0.5})
+        ego = served.ego(session)
+        answers = [await ego.post_frame(i, ego_message, attacked) for i in range(3)]
+        assert all(set(answer.accepted) == {"car-3", "car-4", "car-5", "rsu"} for answer in answers)
+        assert (await ego.state())["state"]["named"] == ["car-2"]
+        (tmp_path / "frame").write_bytes(await ego.kept_messages(2))
+        (tmp_path / "log").write_text("".join(line + "\n" for line in await ego.audit_lines()))
+    monkeypatch.chdir(tmp_path)
+    command = ["audit", "replay", "log", "--messages", "frame"]
+    told = CliRunner().invoke(app, [*command, "--defense", "my_defense:RunningScore"])
+    assert told.exit_code == 0, told.output
+    assert "the same decision: consensus" in told.output
+    untold = CliRunner().invoke(app, command)
+    assert untold.exit_code == 2
+    assert "no defence of kind 'running_score'" in " ".join(untold.output.replace("│", "").split())
+    wrong = CliRunner().invoke(app, [*command, "--defense", "my_defense:Nonesuch"])
+    assert wrong.exit_code == 2
+    assert "has no attribute 'Nonesuch'" in " ".join(wrong.output.replace("│", "").split())

@@ -13,9 +13,10 @@ import numpy as np
 
 from robosac import wire
 from robosac.audit.events import FrameAnswered, RecordError, SessionOpened, TeamChanged, event_on
+from robosac.budget import DomainError
 from robosac.calibration import calibration_digest, calibration_of
 from robosac.deadline import Recorded
-from robosac.defenses import GroupTesting, State, build
+from robosac.defenses import Defense, Kinds, State, build, read_settings
 from robosac.detectors import Message, Preparer
 from robosac.faults import in_short
 from robosac.fusion import FusionResult, fuse
@@ -108,7 +109,7 @@ def find(lines: Iterable[bytes], frame: int) -> LoggedDecision:
     raise ReplayError(f"the log holds no answer to frame {frame}")
 
 
-def replay(decision: LoggedDecision, body: bytes, detector: Preparer) -> list[Difference]:
+def replay(decision: LoggedDecision, body: bytes, detector: Preparer, kinds: Kinds | None = None) -> list[Difference]:
     """Make a decision again and compare.
 
     Jaccard indices are compared to `JACCARD_TOLERANCE`, boxes to `BOX_TOLERANCE`, the defence's state to
@@ -122,6 +123,8 @@ def replay(decision: LoggedDecision, body: bytes, detector: Preparer) -> list[Di
         The messages, as a whole frame (`robosac.wire.read_frame`).
     detector : Preparer
         The one that the session had.
+    kinds : mapping, optional
+        Where to look for the session's defence, as `robosac.defenses.read_settings` does.
 
     Returns
     -------
@@ -138,14 +141,19 @@ def replay(decision: LoggedDecision, body: bytes, detector: Preparer) -> list[Di
         detail = f"the weights' digest is {detector.info.weights_digest}, logged {decision.session.weights_digest}"
         return [Difference("detector", detail)]
     calibration = calibration_digest(detector.info)
-    if decision.session.defense.get("kind") == GroupTesting.kind and calibration != decision.session.calibration_digest:
-        detail = f"the calibration's digest is {calibration}, logged {decision.session.calibration_digest}"
-        return [Difference("detector", detail)]
+    try:
+        settings = read_settings(decision.session.defense, kinds)
+        if settings.needs_calibration and calibration != decision.session.calibration_digest:
+            detail = f"the calibration's digest is {calibration}, logged {decision.session.calibration_digest}"
+            return [Difference("detector", detail)]
+        defense = build(settings, lambda: calibration_of(detector.info))
+    except DomainError as error:
+        raise ReplayError(f"the log's settings make no defence: {error}") from error
     messages = _read_messages(decision, body, detector)
     wrong = _compare_digests(logged, messages)
     if wrong:
         return wrong
-    return _compare(logged, _fuse(decision, messages, detector))
+    return _compare(logged, _fuse(decision, defense, messages, detector))
 
 
 def _before(answer: FrameAnswered, recent: Iterable[FrameAnswered]) -> PreviousAnswer | None:
@@ -187,11 +195,7 @@ def _compare_digests(logged: FrameAnswered, messages: dict[str, Message]) -> lis
     return wrong
 
 
-def _fuse(decision: LoggedDecision, messages: dict[str, Message], detector: Preparer) -> FusionResult:
-    try:
-        defense = build(decision.session.defense, lambda: calibration_of(detector.info))
-    except ValueError as error:
-        raise ReplayError(f"the log's settings make no defence: {error}") from error
+def _fuse(decision: LoggedDecision, defense: Defense, messages: dict[str, Message], detector: Preparer) -> FusionResult:
     logged, ego_id = decision.answer, decision.session.ego_id
     return fuse(
         detector,

@@ -23,6 +23,7 @@ from robosac.audit.events import (
     read,
 )
 from robosac.consensus import DEFAULT_THRESHOLD
+from robosac.defenses import trusted_in
 from robosac.signatures import is_valid, read_public_key
 
 
@@ -211,7 +212,7 @@ class _Verification:
                 self._open(opened)
             case TeamChanged() as change:
                 self._enrol(change.public_keys)
-                self._history.trusted = tuple(change.state.get("trusted", ()))
+                self._history.trusted = trusted_in(change.state)
             case FrameAnswered() as answer:
                 self._check_answer(answer)
             case Equivocation() as lie:
@@ -229,7 +230,7 @@ class _Verification:
             ego_id=opened.ego_id,
             threshold=threshold if isinstance(threshold, int | float) else None,
             commitment=opened.next_seed_commitment,
-            trusted=tuple(opened.state.get("trusted", ())),
+            trusted=trusted_in(opened.state),
         )
         self._enrol(opened.public_keys)
 
@@ -255,7 +256,7 @@ class _Verification:
             self._check_signature(name, proof)
         known.commitment = answer.next_seed_commitment
         known.frame = answer.frame
-        known.trusted = tuple(answer.state.get("trusted", ()))
+        known.trusted = trusted_in(answer.state)
 
     def _check_signature(self, vehicle: str, proof: Proof) -> None:
         key = self._history.keys.get(vehicle)

@@ -58,9 +58,13 @@ def replay_decision(
         str | None,
         typer.Option(help="A detector's name, weights file or module:callable; by default the name in the log."),
     ] = None,
+    defense: Annotated[
+        str | None, typer.Option(help="Where a defence that does not ship is: module:callable, or its entry point.")
+    ] = None,
 ) -> None:
     """Make a decision again from the log and the messages, and compare; 1 if it comes out otherwise."""
-    from robosac.audit import replay  # noqa: PLC0415 (seconds to import, and only this command needs it)
+    from robosac import defenses  # noqa: PLC0415 (seconds to import, and only this command needs it)
+    from robosac.audit import replay  # noqa: PLC0415
 
     try:
         body = messages.read_bytes()
@@ -74,7 +78,11 @@ def replay_decision(
         raise typer.BadParameter(str(error), param_hint="FILE") from error
     loaded = _load(detector, decision.session.detector)
     try:
-        differences = replay.replay(decision, body, loaded)
+        kinds = None if defense is None else defenses.known([defense])
+    except ValueError as error:
+        raise typer.BadParameter(str(error), param_hint="--defense") from error
+    try:
+        differences = replay.replay(decision, body, loaded, kinds)
     except replay.ReplayError as error:
         raise typer.BadParameter(str(error), param_hint="--messages") from error
     answer = decision.answer

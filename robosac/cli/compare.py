@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import shlex
 import time
-from collections.abc import Mapping
+from collections.abc import Mapping, Sequence
 from dataclasses import replace
 from pathlib import Path
 from typing import Annotated
@@ -14,9 +14,10 @@ import typer
 from rich.console import Console
 from rich.progress import BarColumn, MofNCompleteColumn, Progress, TextColumn, TimeElapsedColumn, TimeRemainingColumn
 
-from robosac import detectors
+from robosac import defenses, detectors
 from robosac.attacks import NoGeometry
-from robosac.detectors import DEFAULT_DETECTOR
+from robosac.defenses import Defense
+from robosac.detectors import DEFAULT_DETECTOR, Detector
 from robosac.evaluation.comparison import (
     DEFENSES,
     FULL,
@@ -24,6 +25,7 @@ from robosac.evaluation.comparison import (
     Extent,
     Plan,
     Setting,
+    built,
     compare_defenses,
     write_comparison,
 )
@@ -36,6 +38,10 @@ def run(
     out: Annotated[Path, typer.Option(help="Folder for comparison.md, comparison.csv and two pictures.")],
     quick: Annotated[bool, typer.Option(help="Fewer attacks and frames, in a few minutes.")] = False,
     only: Annotated[list[str] | None, typer.Option(help=f"One of {', '.join(DEFENSES)}; may be repeated.")] = None,
+    defense: Annotated[
+        list[str] | None,
+        typer.Option(help="A defence of one's own, module:callable, to be compared too; may be repeated."),
+    ] = None,
     setting: Annotated[
         list[str] | None,
         typer.Option(help="CAMPAIGN:NUMBER of attackers, as in erase@asleep:2; may be repeated."),
@@ -56,9 +62,6 @@ def run(
     ] = DEFAULT_DETECTOR,
 ) -> None:
     """Play every defence against every attack on the same test sequences, and write tables and pictures."""
-    unknown = sorted(set(only or ()) - set(DEFENSES))
-    if unknown:
-        raise typer.BadParameter(f"unknown {', '.join(unknown)}; known: {', '.join(DEFENSES)}", param_hint="--only")
     if live and recordings is not None:
         raise typer.BadParameter("nothing is recorded live", param_hint="--recordings")
     need_figures()
@@ -72,8 +75,7 @@ def run(
         chosen = detectors.load(detector)
     except ValueError as error:
         raise typer.BadParameter(str(error), param_hint="--detector") from error
-    defenses = {name: make(chosen) for name, make in DEFENSES.items() if not only or name in only}
-    plan = Plan(chosen, defenses, extent, seed, recordings, pose_error, live)
+    plan = Plan(chosen, _defenses(only or (), defense or (), chosen), extent, seed, recordings, pose_error, live)
     started = time.monotonic()
     columns = (TextColumn("{task.description}"), BarColumn(), MofNCompleteColumn())
     with Progress(*columns, TimeElapsedColumn(), TimeRemainingColumn(), console=console) as progress:
@@ -85,6 +87,7 @@ def run(
     given = {
         "--seed": [str(seed)],
         "--only": only,
+        "--defense": defense,
         "--quick": quick,
         "--setting": setting,
         "--scenes": scenes,
@@ -109,6 +112,22 @@ def command(given: Mapping[str, object]) -> str:
             for each in value if isinstance(value, list) else [value]:
                 words += [option, str(each)]
     return shlex.join(words)
+
+
+def _defenses(only: Sequence[str], own: Sequence[str], detector: Detector) -> dict[str, Defense]:
+    """What is compared, by name: the defences that ship, or only some of them, and one's own."""
+    unknown = sorted(set(only) - set(DEFENSES))
+    if unknown:
+        raise typer.BadParameter(f"unknown {', '.join(unknown)}; known: {', '.join(DEFENSES)}", param_hint="--only")
+    chosen = {name: settings for name, settings in DEFENSES.items() if not only or name in only}
+    try:
+        for name in own:
+            if name in DEFENSES:
+                raise ValueError(f"{name} ships and has its column: see --only")
+            chosen[name] = defenses.load(name)
+        return built(chosen, detector)
+    except ValueError as error:
+        raise typer.BadParameter(str(error), param_hint="--defense") from error
 
 
 def _extent(extent: Extent, settings: list[str] | tuple[()], scenes: int | None, frames: int | None) -> Extent:

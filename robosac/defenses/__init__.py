@@ -4,7 +4,6 @@ from __future__ import annotations
 
 from robosac.answers import Distrust, Reason, Source, Verdict
 from robosac.defenses.a2cp import A2CP
-from robosac.defenses.building import build
 from robosac.defenses.conformal import Conformal
 from robosac.defenses.group_testing import GroupTesting
 from robosac.defenses.halving import Halving
@@ -18,21 +17,31 @@ from robosac.defenses.protocol import (
     Reference,
     Rejection,
     State,
+    explain_rejections,
+    named_in,
+    remembered,
+    suspicion_in,
+    trusted_in,
 )
+from robosac.defenses.registry import Kinds, build, known, load, read_settings, shipped
 from robosac.defenses.sample_consensus import SampleConsensus
+from robosac.defenses.settings import ConsensusSettings, DefenseSettings
 from robosac.defenses.static_team import StaticTeam
 from robosac.defenses.undefended import Undefended
 
 __all__ = [
     "A2CP",
     "Conformal",
+    "ConsensusSettings",
     "Conversation",
     "Decision",
     "Defense",
+    "DefenseSettings",
     "Distrust",
     "Halving",
     "GroupTesting",
     "Hypothesis",
+    "Kinds",
     "OneByOne",
     "Outcome",
     "Reason",
@@ -45,4 +54,13 @@ __all__ = [
     "Undefended",
     "Verdict",
     "build",
+    "explain_rejections",
+    "known",
+    "load",
+    "named_in",
+    "read_settings",
+    "remembered",
+    "shipped",
+    "suspicion_in",
+    "trusted_in",
 ]

@@ -5,15 +5,17 @@ from __future__ import annotations
 from collections.abc import Generator, Sequence
 from dataclasses import dataclass
 from math import comb
-from typing import ClassVar
+from typing import ClassVar, Literal
 
 import numpy as np
+from pydantic import Field
 
 from robosac.answers import Source, Verdict
 from robosac.budget import DEFAULT_CONFIDENCE, DomainError, eq2_budget
 from robosac.consensus import DEFAULT_THRESHOLD
 from robosac.defenses.protocol import Conversation, Decision, Hypothesis, Outcome, Reference, State, explain_rejections
-from robosac.defenses.sampling import check_budget, check_threshold, draw, search
+from robosac.defenses.sampling import MAX_BUDGET, check_budget, check_threshold, draw, search
+from robosac.defenses.settings import ConsensusSettings
 
 DEFAULT_BUDGET = 5
 
@@ -175,3 +177,15 @@ class A2CP:
                 raise DomainError(f"ratio {ratio} does not mean a whole number of attackers in a team of {team_size}")
             benign.append(round(s))
         return benign if team_size else []
+
+
+class A2CPSettings(ConsensusSettings):
+    """Aggressive-to-conservative probing: estimate the attacker ratio while answering."""
+
+    makes = A2CP
+    kind: Literal["a2cp"]
+    ratios: tuple[float, ...] | None = Field(
+        None, min_length=1, max_length=64, description="Ascending in [0, 1); by default all that the team size allows."
+    )
+    sampling_budget: int = Field(DEFAULT_BUDGET, ge=1, le=MAX_BUDGET, description="Most hypotheses tested in a frame.")
+    confidence: float = Field(DEFAULT_CONFIDENCE, gt=0, lt=1)

@@ -4,9 +4,10 @@ from __future__ import annotations
 
 from collections.abc import Sequence
 from dataclasses import dataclass
-from typing import ClassVar
+from typing import Annotated, ClassVar, Literal
 
 import numpy as np
+from pydantic import Field
 
 from robosac.answers import Reason, Verdict
 from robosac.boxes import FloatArray
@@ -14,6 +15,7 @@ from robosac.budget import DomainError
 from robosac.defenses.benign_scores import SINGLE_TEAMMATE
 from robosac.defenses.memoryless import Memoryless, decide, unite
 from robosac.defenses.protocol import Conversation, Hypothesis, Outcome, Rejection, State
+from robosac.defenses.settings import ConsensusSettings
 
 DEFAULT_RATE = 0.05
 
@@ -94,6 +96,22 @@ class Conformal(Memoryless):
         as_bad = np.searchsorted(known, jaccard_indices, side="right")
         p: FloatArray = (1.0 + as_bad) / (1.0 + len(known))
         return p
+
+
+class ConformalSettings(ConsensusSettings):
+    """Calibrated tests of every teammate with control of false discoveries."""
+
+    makes = Conformal
+    kind: Literal["conformal"]
+    false_discovery_rate: float = Field(
+        DEFAULT_RATE, gt=0, lt=1, description="Expected share of honest teammates among the accused, at most."
+    )
+    calibration: tuple[Annotated[float, Field(ge=0, le=1)], ...] | None = Field(
+        None,
+        min_length=1,
+        max_length=10_000,
+        description="Jaccard indices of honest single teammates; by default those of the shipped detector.",
+    )
 
 
 def discoveries(p_values: FloatArray, rate: float) -> np.ndarray[tuple[int], np.dtype[np.bool_]]:

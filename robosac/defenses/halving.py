@@ -4,13 +4,14 @@ from __future__ import annotations
 
 from collections.abc import Sequence
 from dataclasses import dataclass
-from typing import ClassVar
+from typing import ClassVar, Literal
 
 import numpy as np
 
 from robosac.answers import Verdict
 from robosac.defenses.memoryless import Memoryless, decide, unite
 from robosac.defenses.protocol import Conversation, Hypothesis, Outcome, State
+from robosac.defenses.settings import ConsensusSettings
 
 
 @dataclass(frozen=True)
@@ -49,6 +50,13 @@ class Halving(Memoryless):
             groups = halves
         accepted = yield from unite(team, passed, outcomes)
         return decide(team, accepted, outcomes, state)
+
+
+class HalvingSettings(ConsensusSettings):
+    """Split the team until every group agrees with the reference or is a single teammate."""
+
+    makes = Halving
+    kind: Literal["halving"]
 
 
 def _split(group: Hypothesis, rng: np.random.Generator) -> list[Hypothesis]:

@@ -4,13 +4,14 @@ from __future__ import annotations
 
 from collections.abc import Sequence
 from dataclasses import dataclass
-from typing import ClassVar
+from typing import ClassVar, Literal
 
 import numpy as np
 
 from robosac.answers import Verdict
 from robosac.defenses.memoryless import Memoryless, decide, unite
 from robosac.defenses.protocol import Conversation, Hypothesis, Outcome, State
+from robosac.defenses.settings import ConsensusSettings
 
 
 @dataclass(frozen=True)
@@ -34,3 +35,10 @@ class OneByOne(Memoryless):
         passed = [o.teammates[0] for o in outcomes if o.verdict is Verdict.CONSENSUS]
         accepted = yield from unite(team, passed, outcomes)
         return decide(team, accepted, outcomes, state)
+
+
+class OneByOneSettings(ConsensusSettings):
+    """Test every teammate alone, then all that passed together."""
+
+    makes = OneByOne
+    kind: Literal["one_by_one"]

@@ -5,8 +5,8 @@ for each that was tested, and returns a `Decision`. It knows nothing of detector
 outcomes than it proposed hypotheses, the time is up: it must return its decision from what it knows.
 
 What a defence remembers between frames is its *state*, a plain dict of JSON values that the caller keeps per session.
-Under ``trusted`` it may hold a list of teammates whose messages may be used without a test in the frame; a teammate
-gets onto that list only by having been in consensus, or because the defence's settings say so from the start.
+Most of it is the defence's own business. What others read of it too, whom it trusts, names and suspects, is put in by
+`remembered` and read by `trusted_in`, `named_in` and `suspicion_in`; nobody else knows under which names it is kept.
 """
 
 from __future__ import annotations
@@ -14,7 +14,7 @@ from __future__ import annotations
 from collections.abc import Collection, Generator, Mapping, Sequence
 from dataclasses import dataclass, field
 from enum import StrEnum
-from typing import Any, ClassVar, Protocol
+from typing import Any, Protocol
 
 import numpy as np
 
@@ -23,6 +23,52 @@ from robosac.boxes import FloatArray
 
 Hypothesis = tuple[str, ...]
 State = Mapping[str, Any]
+
+
+def remembered(
+    memory: Mapping[str, Any],
+    *,
+    trusted: Sequence[str] | None = None,
+    named: Sequence[str] | None = None,
+    suspicion: Mapping[str, float] | None = None,
+) -> State:
+    """A state of these parts; what is None is not in it.
+
+    Parameters
+    ----------
+    memory : mapping
+        What the defence alone reads, JSON values.
+    trusted : sequence of str, optional
+        Teammates whose messages may be used without a test in the next frame. A teammate gets onto that list only by
+        having been in consensus, or because the defence's settings say so from the start.
+    named : sequence of str, optional
+        Teammates held to be attackers; give an empty list for nobody yet.
+    suspicion : mapping of teammate id to float, optional
+        Probability that each teammate attacks.
+    """
+    state = dict(memory)
+    if trusted is not None:
+        state["trusted"] = list(trusted)
+    if named is not None:
+        state["named"] = list(named)
+    if suspicion is not None:
+        state["suspicion"] = dict(suspicion)
+    return state
+
+
+def trusted_in(state: State) -> tuple[str, ...]:
+    """The trust list of a state; empty where the defence keeps none."""
+    return tuple(state.get("trusted", ()))
+
+
+def named_in(state: State) -> tuple[str, ...] | None:
+    """Teammates held to be attackers; None from a defence that names nobody."""
+    return tuple(state["named"]) if "named" in state else None
+
+
+def suspicion_in(state: State) -> Mapping[str, float] | None:
+    """Probability that each teammate attacks, as it is kept between frames; None from a defence that knows none."""
+    return state.get("suspicion")
 
 
 class Reference(StrEnum):
@@ -97,7 +143,7 @@ class Decision:
     attacker_ratio : float or None
         Assumed or estimated share of attackers in the team.
     state : mapping
-        To be handed to the next frame's conversation.
+        To be handed to the next frame's conversation; see `remembered`.
     suspicion : mapping of teammate id to float, or None
         Probability that each teammate of the session attacks; None from a defence that knows none.
     """
@@ -109,6 +155,16 @@ class Decision:
     state: State
     suspicion: Mapping[str, float] | None = None
 
+    @property
+    def trusted(self) -> tuple[str, ...]:
+        """Teammates that the next frame may use without a test."""
+        return trusted_in(self.state)
+
+    @property
+    def named(self) -> tuple[str, ...] | None:
+        """Teammates held to be attackers; None from a defence that names nobody."""
+        return named_in(self.state)
+
 
 Conversation = Generator[Sequence[Hypothesis], Sequence[Outcome], Decision]
 
@@ -116,7 +172,10 @@ Conversation = Generator[Sequence[Hypothesis], Sequence[Outcome], Decision]
 class Defense(Protocol):
     """A defence's settings and its conversation. Implementations are immutable."""
 
-    kind: ClassVar[str]
+    @property
+    def kind(self) -> str:
+        """Its name in settings and logs."""
+        ...
 
     @property
     def consensus_threshold(self) -> float:

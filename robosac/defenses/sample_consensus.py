@@ -4,17 +4,17 @@ from __future__ import annotations
 
 from collections.abc import Sequence
 from dataclasses import dataclass
-from typing import ClassVar
+from typing import ClassVar, Literal
 
 import numpy as np
 
 from robosac.answers import Source
 from robosac.defenses.protocol import Conversation, Decision, Hypothesis, Outcome, State, explain_rejections
-from robosac.defenses.sampling import SamplingSettings, search
+from robosac.defenses.sampling import Sampling, SamplingSettings, search
 
 
 @dataclass(frozen=True)
-class SampleConsensus(SamplingSettings):
+class SampleConsensus(Sampling):
     """Algorithm 1 of *Among Us* (ICCV 2023), attacker ratio known; the paper's dynamic team.
 
     1. The reference is the ego's own perception (or, for temporal consistency, the previous answer).
@@ -49,3 +49,10 @@ class SampleConsensus(SamplingSettings):
             attacker_ratio=self.attacker_ratio,
             state=state,
         )
+
+
+class SampleConsensusSettings(SamplingSettings):
+    """ROBOSAC, Algorithm 1: sample subsets of teammates until one agrees with the reference."""
+
+    makes = SampleConsensus
+    kind: Literal["sample_consensus"] = "sample_consensus"

@@ -7,6 +7,7 @@ from dataclasses import dataclass
 from math import comb
 
 import numpy as np
+from pydantic import Field
 
 from robosac.answers import Verdict
 from robosac.budget import (
@@ -18,6 +19,7 @@ from robosac.budget import (
 )
 from robosac.consensus import DEFAULT_THRESHOLD
 from robosac.defenses.protocol import Hypothesis, Outcome, Reference
+from robosac.defenses.settings import ConsensusSettings
 
 DEFAULT_BUDGET = 7
 MAX_BUDGET = 10_000
@@ -27,9 +29,18 @@ Search = Generator[Sequence[Hypothesis], Sequence[Outcome], Hypothesis]
 """Yields hypotheses like a conversation, and returns the one in consensus, or an empty one."""
 
 
+class SamplingSettings(ConsensusSettings):
+    """Settings of every defence that samples with a known attacker ratio; see `Sampling`."""
+
+    attacker_ratio: float = Field(0.2, gt=0, lt=1, description="Assumed share of attackers among the teammates.")
+    sampling_budget: int | None = Field(None, ge=1, le=MAX_BUDGET, description="Most hypotheses tested in a frame.")
+    collaborators: int | None = Field(None, ge=1, le=1024, description="Teammates in a hypothesis.")
+    confidence: float = Field(DEFAULT_CONFIDENCE, gt=0, lt=1)
+
+
 @dataclass(frozen=True)
-class SamplingSettings:
-    """Settings of every defence that samples with a known attacker ratio.
+class Sampling:
+    """What is common to every defence that samples with a known attacker ratio.
 
     Parameters
     ----------

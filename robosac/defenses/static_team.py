@@ -4,20 +4,31 @@ from __future__ import annotations
 
 from collections.abc import Sequence
 from dataclasses import dataclass
-from typing import ClassVar
+from typing import ClassVar, Literal
 
 import numpy as np
+from pydantic import Field
 
 from robosac.answers import Distrust, Reason, Source, Verdict
 from robosac.budget import DomainError
-from robosac.defenses.protocol import Conversation, Decision, Hypothesis, Outcome, Rejection, State, explain_rejections
-from robosac.defenses.sampling import SamplingSettings, search
+from robosac.defenses.protocol import (
+    Conversation,
+    Decision,
+    Hypothesis,
+    Outcome,
+    Rejection,
+    State,
+    explain_rejections,
+    remembered,
+    trusted_in,
+)
+from robosac.defenses.sampling import Sampling, SamplingSettings, search
 
 DEFAULT_RECHECK = 10
 
 
 @dataclass(frozen=True)
-class StaticTeam(SamplingSettings):
+class StaticTeam(Sampling):
     """The paper's static team, with a re-check.
 
     1. Until there is a consensus, Algorithm 1. Its subset becomes the trust list.
@@ -55,16 +66,16 @@ class StaticTeam(SamplingSettings):
 
     def initial_state(self, team: Sequence[str]) -> State:  # noqa: ARG002
         """Nobody is trusted; ``frames_since_check`` counts from the latest consensus."""
-        return {"trusted": [], "frames_since_check": 0}
+        return remembered({"frames_since_check": 0}, trusted=())
 
     def change_team(self, state: State, team: Sequence[str]) -> State:
         """Those who left are no longer trusted; those who joined are not trusted yet."""
-        return {**state, "trusted": [name for name in state["trusted"] if name in team]}
+        return remembered(state, trusted=[name for name in trusted_in(state) if name in team])
 
     def converse(self, team: Sequence[str], state: State, rng: np.random.Generator) -> Conversation:
         """Answer from the trust list, re-check it, or build it."""
         outcomes: list[Outcome] = []
-        trusted = list(state["trusted"])
+        trusted: Sequence[str] = trusted_in(state)
         present: Hypothesis = tuple(name for name in team if name in trusted)
         waited = int(state["frames_since_check"]) + 1
         if present:
@@ -101,5 +112,15 @@ class StaticTeam(SamplingSettings):
             source=source,
             rejected=explain_rejections(team, accepted, outcomes, otherwise),
             attacker_ratio=self.attacker_ratio,
-            state={"trusted": list(trusted), "frames_since_check": waited},
+            state=remembered({"frames_since_check": waited}, trusted=trusted),
         )
+
+
+class StaticTeamSettings(SamplingSettings):
+    """Find trustworthy teammates once, rely on them, and look again now and then."""
+
+    makes = StaticTeam
+    kind: Literal["static_team"]
+    recheck_every: int | None = Field(
+        DEFAULT_RECHECK, ge=1, description="Frames between two re-checks of the trusted; null never looks again."
+    )

@@ -4,13 +4,14 @@ from __future__ import annotations
 
 from collections.abc import Sequence
 from dataclasses import dataclass
-from typing import ClassVar
+from typing import ClassVar, Literal
 
 import numpy as np
 
 from robosac.answers import Source
 from robosac.consensus import DEFAULT_THRESHOLD
-from robosac.defenses.protocol import Conversation, Decision, Reference, State
+from robosac.defenses.protocol import Conversation, Decision, Reference, State, remembered
+from robosac.defenses.settings import DefenseSettings
 
 
 @dataclass(frozen=True)
@@ -26,7 +27,7 @@ class Undefended:
 
     def initial_state(self, team: Sequence[str]) -> State:
         """Everybody is trusted."""
-        return {"trusted": list(team)}
+        return remembered({}, trusted=team)
 
     def change_team(self, state: State, team: Sequence[str]) -> State:  # noqa: ARG002
         """Everybody is trusted."""
@@ -40,3 +41,10 @@ class Undefended:
         yield from ()
         source = Source.TRUSTED if team else Source.EGO_ONLY
         return Decision(tuple(team), source, rejected={}, attacker_ratio=None, state=state)
+
+
+class UndefendedSettings(DefenseSettings):
+    """No defence: everybody is fused and nothing is tested. A baseline."""
+
+    makes = Undefended
+    kind: Literal["none"]

@@ -1,7 +1,9 @@
 import io
 import json
+import sys
 from contextlib import nullcontext
-from types import SimpleNamespace
+from types import ModuleType, SimpleNamespace
+from typing import Literal
 
 import httpx
 import numpy as np
@@ -13,10 +15,11 @@ from typer.testing import CliRunner
 from clients.client import GatewayClient, OpenedSession
 from clients.demo import main as demo_main
 from clients.errors import FrameConflict, GatewayUnreachable
-from clients.fleet import FleetOptions, _Vehicle, close_run, main, run_fleet
+from clients.fleet import FleetOptions, _asked, _Vehicle, close_run, main, run_fleet
 from clients.local_gateway import local_gateway
 from clients.simulation import Fleet
 from robosac.attacks import PGD, load_campaign
+from robosac.defenses.halving import HalvingSettings
 from robosac.detectors import DEFAULT_DETECTOR
 from robosac.detectors.embedded import ADVERSARIAL_WEIGHTS
 from robosac.scenes import IntersectionScene
@@ -96,11 +99,40 @@ def test_a_fleet_without_a_gateway_says_so():
     assert "The fleet stopped" in result.output
 
 
-@pytest.mark.parametrize(("option", "complaint"), [("--attack", "known: pgd"), ("--detector", "give one of")])
-def test_an_unknown_attack_or_detector_is_explained(option, complaint):
+@pytest.mark.parametrize(
+    ("option", "complaint"),
+    [("--attack", "known: pgd"), ("--detector", "give one of"), ("--defense", "give one of a2cp, ")],
+)
+def test_an_unknown_attack_detector_or_defence_is_explained(option, complaint):
     result = CliRunner().invoke(command(main), [option, "nonesuch"])
     assert result.exit_code == 2
     assert complaint in result.output
+
+
+@pytest.mark.parametrize(
+    ("asked", "complaint"),
+    [
+        (["--attacker-ratio", "0.2"], "need to know the kind"),
+        (["--defense", "halving", "--attacker-ratio", "0.2"], "halving: attacker_ratio"),
+        (["--defense", "static_team", "--attacker-ratio", "2"], "less than 1"),
+    ],
+)
+def test_settings_that_a_defence_does_not_take_are_refused_before_anything_is_sent(asked, complaint):
+    result = CliRunner().invoke(command(main), asked)
+    assert result.exit_code == 2
+    assert complaint in result.output
+
+
+def test_a_fleet_asks_for_a_defence_of_ones_own_by_its_kind(monkeypatch):
+    class Own(HalvingSettings):
+        kind: Literal["own"] = "own"
+
+    module = ModuleType("own")
+    module.build = lambda: Own(consensus_threshold=0.4)
+    monkeypatch.setitem(sys.modules, "own", module)
+    assert _asked("own:build", {}) == {"kind": "own", "consensus_threshold": 0.4}
+    assert _asked("static_team", {"collaborators": 2}) == {"kind": "static_team", "collaborators": 2}
+    assert _asked(None, {}) is None
 
 
 async def test_a_fleet_with_other_weights_than_the_gateway_stops(tmp_path):

@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from robosac.defenses.group_testing.defense import DEFAULT_HAZARDS, GroupTesting
+from robosac.defenses.group_testing.defense import DEFAULT_HAZARDS, GroupTesting, GroupTestingSettings
 from robosac.defenses.group_testing.model import OPEN, Calibration, CalibrationError, EvidenceModel
 from robosac.defenses.group_testing.posterior import Hazards
 
@@ -13,5 +13,6 @@ __all__ = [
     "CalibrationError",
     "EvidenceModel",
     "GroupTesting",
+    "GroupTestingSettings",
     "Hazards",
 ]

@@ -2,21 +2,23 @@
 
 from __future__ import annotations
 
-from collections.abc import Mapping, Sequence
+from collections.abc import Sequence
 from dataclasses import dataclass
-from typing import Any, ClassVar
+from typing import Any, ClassVar, Literal, Self
 
 import numpy as np
+from pydantic import Field
 
 from robosac.budget import DomainError
 from robosac.consensus import DEFAULT_THRESHOLD
 from robosac.defenses.group_testing.candidates import unresolved
 from robosac.defenses.group_testing.frame import JudgedFrame
 from robosac.defenses.group_testing.memory import Memory
-from robosac.defenses.group_testing.model import Calibration, EvidenceModel
+from robosac.defenses.group_testing.model import Calibration, CalibrationError, EvidenceModel
 from robosac.defenses.group_testing.posterior import Hazards, Posterior
-from robosac.defenses.protocol import Conversation, Reference, State
-from robosac.defenses.sampling import check_budget, check_threshold
+from robosac.defenses.protocol import Conversation, Defense, Reference, State, named_in, remembered, trusted_in
+from robosac.defenses.sampling import MAX_BUDGET, check_budget, check_threshold
+from robosac.defenses.settings import DefenseSettings
 
 DEFAULT_HAZARDS = Hazards(hijack=0.003, recovery=0.001, change=0.02)
 DEFAULT_FIRST_BUDGET = 7
@@ -24,6 +26,59 @@ DEFAULT_LATER_BUDGET = 4
 DEFAULT_NAMING_BOUND = 0.99
 DEFAULT_POSE_ERROR_M = 0.2
 """To reckon with more error than there is costs some sharpness; with less, it names honest teammates."""
+COMPARABLE_PERIOD_MS = 250.0
+"""Longest period of frames of which one is like the next, as calibrated at 200 ms."""
+
+
+class GroupTestingSettings(DefenseSettings):
+    """Bayesian group testing with memory: finds attackers of an unknown number, and names them."""
+
+    needs_calibration = True
+
+    kind: Literal["group_testing"] = "group_testing"
+    attack_prior: float = Field(0.5, gt=0, lt=1, description="Probability beforehand that anybody attacks.")
+    attacker_prior: float = Field(
+        0.25, gt=0, lt=1, description="Probability of each teammate to attack if anybody does."
+    )
+    hijack: float = Field(
+        DEFAULT_HAZARDS.hijack, ge=0, le=0.5, description="Per frame, that a benign teammate becomes an attacker."
+    )
+    recovery: float = Field(
+        DEFAULT_HAZARDS.recovery, ge=0, le=0.5, description="Per frame, that an attacker becomes benign."
+    )
+    kind_change: float = Field(
+        DEFAULT_HAZARDS.change, ge=0, le=0.5, description="Per frame, that the kind of attack changes."
+    )
+    first_budget: int = Field(
+        DEFAULT_FIRST_BUDGET, ge=1, le=MAX_BUDGET, description="Most hypotheses in the first frame."
+    )
+    budget: int = Field(DEFAULT_LATER_BUDGET, ge=1, le=MAX_BUDGET, description="Most hypotheses in each later frame.")
+    naming_bound: float = Field(
+        DEFAULT_NAMING_BOUND, ge=0.5, lt=1, description="Probability above which an attacker is named."
+    )
+    consensus_threshold: float = Field(DEFAULT_THRESHOLD, gt=0, le=1, description="Jaccard index of a consensus.")
+    pose_error_m: float = Field(
+        DEFAULT_POSE_ERROR_M, ge=0, description="Standard deviation of the teammates' positions to expect, metres."
+    )
+    compare_frames: bool | None = Field(
+        None,
+        description="Whether boxes that come and go from frame to frame are evidence, as calibrated at 5 frames a "
+        "second and with exact poses of the ego; by default if frame_period_ms is at most "
+        f"{COMPARABLE_PERIOD_MS:g}.",
+    )
+
+    def at_period(self, frame_period_ms: float) -> Self:
+        """With ``compare_frames`` decided."""
+        if self.compare_frames is not None:
+            return self
+        return self.model_copy(update={"compare_frames": frame_period_ms <= COMPARABLE_PERIOD_MS})
+
+    def build(self, calibration: Calibration | None) -> Defense:
+        if calibration is None:
+            raise CalibrationError("group_testing needs the calibration of a detector")
+        others = self.model_dump(exclude={"kind", "hijack", "recovery", "kind_change"}, exclude_none=True)
+        hazards = Hazards(self.hijack, self.recovery, self.kind_change)
+        return GroupTesting.calibrated(calibration, hazards=hazards, **others)
 
 
 @dataclass(frozen=True)
@@ -133,7 +188,7 @@ class GroupTesting:
         """
         posterior, memory = self._revive(state)
         self._sync(posterior, memory, joined=team, kept=team)
-        kept = [[name for name in state[of] if name in set(team)] for of in ("trusted", "named")]
+        kept = [[name for name in of if name in set(team)] for of in (trusted_in(state), named_in(state) or ())]
         return _state(posterior, memory, *kept)
 
     def converse(self, team: Sequence[str], state: State, rng: np.random.Generator) -> Conversation:
@@ -145,7 +200,7 @@ class GroupTesting:
             posterior.step(self.hazards)
         posterior.regroup(unresolved(posterior.marginals()))
         judged = JudgedFrame(
-            self.model, posterior, memory, tuple(team), frozenset(state["trusted"]), compare_frames=self.compare_frames
+            self.model, posterior, memory, tuple(team), frozenset(trusted_in(state)), compare_frames=self.compare_frames
         )
         for passes in range(self.first_budget if first else self.budget, 0, -1):
             subset = judged.next_test(rng, passes)
@@ -155,7 +210,7 @@ class GroupTesting:
             if not tested:
                 break
             judged.learn(tested[0])
-        decision = judged.decide(frozenset(state["named"]), self.naming_bound)
+        decision = judged.decide(frozenset(named_in(state) or ()), self.naming_bound)
         memory.frame += 1
         return decision.with_state(_state(posterior, memory, decision.trusted, decision.named))
 
@@ -178,11 +233,10 @@ class GroupTesting:
             posterior.add(name, memory.welcome(name, self.attack_prior * self.attacker_prior))
 
 
-def _state(posterior: Posterior, memory: Memory, trusted: Sequence[str], named: Sequence[str]) -> Mapping[str, Any]:
-    return {
-        "posterior": posterior.to_state(),
-        "memory": memory.to_state(),
-        "trusted": list(trusted),
-        "named": list(named),
-        "suspicion": dict(sorted(zip(posterior.members, posterior.marginals().round(6).tolist(), strict=True))),
-    }
+def _state(posterior: Posterior, memory: Memory, trusted: Sequence[str], named: Sequence[str]) -> State:
+    return remembered(
+        {"posterior": posterior.to_state(), "memory": memory.to_state()},
+        trusted=trusted,
+        named=named,
+        suspicion=dict(sorted(zip(posterior.members, posterior.marginals().round(6).tolist(), strict=True))),
+    )

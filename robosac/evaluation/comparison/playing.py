@@ -201,16 +201,14 @@ def _play(
 ) -> Played:
     """One sequence as a session, with the defence's memory."""
     played = Played()
-    named: list[frozenset[str]] = []
-    names = False
+    named: list[tuple[str, ...] | None] = []
     for index, (frame, answer) in enumerate(zip(sequence, play(defense, sequence, rng), strict=True)):
         result = answer.result
         played.add(frame, matcher(index, result.boxes), result.accepted, answer.passes)
         played.milliseconds.append(answer.milliseconds)
-        names |= "named" in result.state
-        named.append(frozenset(result.state.get("named", ())))
-    if names:
-        played.naming = _naming(sequence, named, chosen)
+        named.append(result.named)
+    if any(names is not None for names in named):
+        played.naming = _naming(sequence, [frozenset(names or ()) for names in named], chosen)
     return played
 
 

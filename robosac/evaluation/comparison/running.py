@@ -22,8 +22,7 @@ Scene = dict[tuple[Setting, str], Played]
 def compare_defenses(plan: Plan, jobs: int = 1, tick: Callable[[], None] = lambda: None) -> list[Row]:
     """Every defence in every setting.
 
-    The rows of a defence depend neither on the other defences, nor on the other settings, nor on the number of jobs. A
-    defence that names attackers lists them under ``named`` in its state.
+    The rows of a defence depend neither on the other defences, nor on the other settings, nor on the number of jobs.
 
     Parameters
     ----------

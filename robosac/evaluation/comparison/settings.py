@@ -2,39 +2,45 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable, Mapping
+from collections.abc import Mapping
 from dataclasses import dataclass
+from typing import Any
 
 from robosac.attacks import HONEST, load_campaign
 from robosac.calibrated import calibration_of
-from robosac.defenses import (
-    A2CP,
-    Conformal,
-    Defense,
-    GroupTesting,
-    Halving,
-    OneByOne,
-    SampleConsensus,
-    StaticTeam,
-    Undefended,
-)
+from robosac.defenses import Defense, DefenseSettings, build, read_settings, shipped
 from robosac.detectors import Detector
 
 TEAMMATES = 5
 """Of the ego, in every test scene."""
 
-DEFENSES: Mapping[str, Callable[[Detector], Defense]] = {
-    "no defence": lambda _: Undefended(),
-    "sample_consensus": lambda _: SampleConsensus(0.2, sampling_budget=7, collaborators=3),
-    "static_team": lambda _: StaticTeam(0.2, sampling_budget=7, collaborators=3),
-    "a2cp": lambda _: A2CP(),
-    "group_testing": lambda detector: GroupTesting.calibrated(calibration_of(detector.info), pose_error_m=0.0),
-    "group_testing, expecting .2 m": lambda detector: GroupTesting.calibrated(calibration_of(detector.info)),
-    "halving": lambda _: Halving(),
-    "one_by_one": lambda _: OneByOne(),
-    "conformal": lambda _: Conformal(),
+_PAPER = {"sampling_budget": 7, "collaborators": 3}
+_AS_PLAYED: Mapping[str, Mapping[str, Mapping[str, Any]]] = {
+    "none": {"no defence": {}},
+    "sample_consensus": {"sample_consensus": _PAPER},
+    "static_team": {"static_team": _PAPER},
+    "a2cp": {"a2cp": {}},
+    "group_testing": {"group_testing": {"pose_error_m": 0.0}, "group_testing, expecting .2 m": {}},
 }
-"""The defences by the names they have in the report; each is made for a detector, as it may be calibrated for it."""
+"""Columns of a kind, and its settings there; any other kind has one column, with its defaults."""
+
+DEFENSES: Mapping[str, DefenseSettings] = {
+    name: read_settings({"kind": kind, **settings})
+    for kind in dict.fromkeys((*_AS_PLAYED, *shipped()))
+    for name, settings in _AS_PLAYED.get(kind, {kind: {}}).items()
+}
+"""The defences that ship, by the names they have in the report."""
+
+
+def built(defenses: Mapping[str, DefenseSettings], detector: Detector) -> dict[str, Defense]:
+    """The defences themselves, for a detector, as they may be calibrated for it.
+
+    Raises
+    ------
+    DomainError
+        If one cannot be made for it.
+    """
+    return {name: build(settings, lambda: calibration_of(detector.info)) for name, settings in defenses.items()}
 
 
 @dataclass(frozen=True)

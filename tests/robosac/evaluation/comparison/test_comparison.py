@@ -17,6 +17,7 @@ from robosac.evaluation.comparison import (
     Extent,
     Plan,
     Setting,
+    built,
     compare_defenses,
     write_comparison,
 )
@@ -253,8 +254,7 @@ def test_settings_are_read_from_text():
 
 
 def test_every_defence_of_the_table_has_a_row_and_answers(detector, plan):
-    defenses = {name: make(detector) for name, make in DEFENSES.items()}
-    rows = compare_defenses(plan(defenses, Extent((Setting("pgd", 1),), scenes=1, frames=6)))
+    rows = compare_defenses(plan(built(DEFENSES, detector), Extent((Setting("pgd", 1),), scenes=1, frames=6)))
     at = {row.defense: row for row in rows}
     assert set(at) == {"oracle", "ego only", *DEFENSES}
     for name in ("halving", "one_by_one", "conformal"):

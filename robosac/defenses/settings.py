@@ -1,0 +1,70 @@
+"""What a defence's file says of the defence: its settings, and how it is made of them."""
+
+from __future__ import annotations
+
+import inspect
+from typing import TYPE_CHECKING, ClassVar, Self, cast, get_args
+
+from pydantic import BaseModel, ConfigDict, Field
+
+from robosac.consensus import DEFAULT_THRESHOLD
+from robosac.defenses.protocol import Defense, Reference
+
+if TYPE_CHECKING:
+    from robosac.defenses.group_testing import Calibration
+
+
+class DefenseSettings(BaseModel):
+    """Settings of a defence, as sessions and audit logs keep them.
+
+    A subclass has ``kind``, a literal of its one name; a field for each setting, with type, bounds, default and
+    description; and a docstring whose first line says what the defence does. One that assumes a share of attackers has
+    a setting ``attacker_ratio``. The class ``makes`` the defence, or has the methods of `Defense` itself.
+    """
+
+    model_config = ConfigDict(extra="forbid", frozen=True, allow_inf_nan=False)
+
+    makes: ClassVar[type[Defense] | None] = None
+    """Class of the defence, which takes the settings as its arguments; None where these settings are the defence."""
+    needs_calibration: ClassVar[bool] = False
+    """Whether the defence works only with what ``robosac calibrate`` has made for the detector."""
+    kind: str
+
+    @classmethod
+    def name(cls) -> str:
+        """The kind that all of this class have; empty for a class that only others derive from."""
+        names = get_args(cls.model_fields["kind"].annotation)
+        return names[0] if len(names) == 1 and isinstance(names[0], str) else ""
+
+    @classmethod
+    def summary(cls) -> str:
+        """What the defence does, in a line."""
+        return (inspect.getdoc(cls) or "").partition("\n")[0]
+
+    def at_period(self, frame_period_ms: float) -> Self:  # noqa: ARG002
+        """With what is left open decided for frames so far apart."""
+        return self
+
+    def build(self, calibration: Calibration | None) -> Defense:  # noqa: ARG002
+        """The defence itself; to be overridden where more is needed than its class and the settings.
+
+        Parameters
+        ----------
+        calibration : Calibration or None
+            That of the detector the defence is for; None unless ``needs_calibration``.
+
+        Raises
+        ------
+        robosac.budget.DomainError
+            If the settings contradict each other, or the calibration does not do.
+        """
+        if self.makes is None:
+            return cast(Defense, self)
+        return self.makes(**self.model_dump(exclude={"kind"}))
+
+
+class ConsensusSettings(DefenseSettings):
+    """Settings of a defence that compares with a reference of one's choice."""
+
+    consensus_threshold: float = Field(DEFAULT_THRESHOLD, gt=0, le=1, description="Jaccard index of a consensus.")
+    reference: Reference = Field(Reference.EGO, description="What a hypothesis is compared with.")
