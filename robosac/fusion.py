@@ -12,6 +12,7 @@ from contextlib import contextmanager
 from dataclasses import dataclass, field
 
 import numpy as np
+import rfc8785
 
 from robosac.answers import FrameAnswer, Reason, RejectedTeammate, Source, TestedHypothesis, Verdict
 from robosac.boxes import FloatArray
@@ -26,6 +27,7 @@ from robosac.defenses import (
     Rejection,
     State,
     named_in,
+    shipped,
     trusted_in,
 )
 from robosac.detectors import Message, PreparedFrame, Preparer
@@ -237,7 +239,7 @@ class _FrameRun:
 
     def _check(self, decision: Decision, team: list[str], state: State) -> None:
         """Nothing reaches the answer that was not verified in this frame or trusted before; nor does trust come from
-        less.
+        less. And what is to be remembered can be.
         """
         verified = {o.teammates for o in self.outcomes if o.verdict is Verdict.CONSENSUS}
         trusted = set(trusted_in(state))
@@ -252,6 +254,8 @@ class _FrameRun:
             raise UnverifiedAnswer(f"{self.defense.kind} neither accepted nor rejected some of {team}")
         if not trusted.union(*verified).issuperset(decision.trusted):
             raise UnverifiedAnswer(f"{self.defense.kind} trusts {list(decision.trusted)} without a consensus")
+        if self.defense.kind not in shipped():  # those that ship are known to keep JSON, and theirs may be long
+            rfc8785.dumps(dict(decision.state))
 
     def _test(self, prepared: PreparedFrame, batch: Sequence[Hypothesis]) -> list[Outcome]:
         tested: list[Outcome] = []

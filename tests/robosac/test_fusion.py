@@ -267,6 +267,23 @@ def test_trust_comes_from_consensus_and_from_nothing_else(defense, caplog):
     assert "UnverifiedAnswer" in result.fault
 
 
+class Hoarder(SampleConsensus):
+    """A defence of one's own, which remembers what no log can hold."""
+
+    kind = "hoarder"
+
+    def converse(self, team, state, rng):
+        decision = yield from super().converse(team, state, rng)
+        return replace(decision, state={"seen": {*team}})
+
+
+def test_a_state_that_cannot_be_kept_is_a_fault_of_the_frame(caplog):
+    with caplog.at_level(logging.CRITICAL):
+        result = run(FakeDetector(), Hoarder())
+    assert (result.source, result.state) == (Source.EGO_ONLY, {})
+    assert "CanonicalizationError" in result.fault
+
+
 def test_a_trusted_frame_costs_one_pass_and_none_of_the_ego_alone():
     detector = FakeDetector()
     state = {"trusted": ["a", "c"], "frames_since_check": 0}
