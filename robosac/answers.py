@@ -36,7 +36,7 @@ class Reason(StrEnum):
     """Why a teammate was left out of an answer.
 
     ``not_sampled`` also stands where a teammate was in tested hypotheses but no verdict was reached, because ego and
-    fusion were both empty. For ``distrusted``, `Distrust` says which kind.
+    fusion were both empty. For ``distrusted``, `Distrust` says why.
     """
 
     DISSENSUS = "dissensus"
@@ -54,7 +54,7 @@ class Distrust(StrEnum):
     """Why a teammate is distrusted."""
 
     NAMED = "named"
-    """The defence names it as an attacker; the rejection's ``evidence`` says why."""
+    """The defence names it as an attacker."""
     UNTRUSTED = "untrusted"
     """It is not on the trust list from which the frame was answered."""
     EQUIVOCATION = "equivocation"
@@ -129,7 +129,9 @@ class RejectedTeammate(Typed):
     vehicle_id: str
     reason: Reason
     distrust: Distrust | None = Field(
-        None, exclude_if=lambda value: value is None, description="With the reason distrusted: why."
+        None,
+        exclude_if=lambda value: value is None,
+        description="That it is named, or why else it is distrusted.",
     )
 
 

@@ -14,7 +14,7 @@ from dataclasses import dataclass, field
 import numpy as np
 import rfc8785
 
-from robosac.answers import FrameAnswer, Reason, RejectedTeammate, Source, TestedHypothesis, Verdict
+from robosac.answers import Distrust, FrameAnswer, Reason, RejectedTeammate, Source, TestedHypothesis, Verdict
 from robosac.boxes import FloatArray
 from robosac.consensus import at_least, compare
 from robosac.deadline import Deadline
@@ -99,7 +99,7 @@ class FusionResult:
         return named_in(self.state)
 
     def answer(self, frame: int, left_out: Mapping[str, Rejection], timings_ms: Mapping[str, float]) -> FrameAnswer:
-        """What is answered about the frame.
+        """What is answered about the frame. Whoever the defence names is told so.
 
         Parameters
         ----------
@@ -108,13 +108,16 @@ class FusionResult:
             Those who were not among the teammates of the fusion.
         timings_ms : mapping of stage to float
         """
+        named = dict.fromkeys(self.named or (), Distrust.NAMED)
         return FrameAnswer(
             frame=frame,
             boxes=self.boxes,
             source=self.source,
             accepted=self.accepted,
             rejected={
-                name: RejectedTeammate(vehicle_id=name, reason=why.reason, distrust=why.distrust, **why.evidence)
+                name: RejectedTeammate(
+                    vehicle_id=name, reason=why.reason, distrust=why.distrust or named.get(name), **why.evidence
+                )
                 for name, why in {**left_out, **self.rejected}.items()
             },
             hypotheses=tuple(

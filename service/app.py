@@ -26,6 +26,7 @@ from service.identity import ApiKeys, LoopbackOnly, Tokens  # noqa: E402
 from service.limits import BodyLimit, HeadLimit  # noqa: E402
 from service.logs import logging_to_stderr  # noqa: E402
 from service.metrics import Metrics  # noqa: E402
+from service.opening import Opening  # noqa: E402
 from service.routes import operations, v1  # noqa: E402
 from service.sessions import Sessions  # noqa: E402
 from service.settings import Settings  # noqa: E402
@@ -69,7 +70,8 @@ def create_app(
     tracing = Tracing(provider_from_environment() if spans is None else spans)
     deciding = Deciding(sessions, engine, metrics, admission, tracing)
     frames = Frames(sessions, deciding, metrics, admission)
-    gateway = Gateway(admission, engine, metrics, sessions, teams, frames, api_keys)
+    opening = Opening(settings, store, engine, metrics, tokens, sessions)
+    gateway = Gateway(admission, engine, metrics, opening, sessions, teams, frames, api_keys)
 
     @contextlib.asynccontextmanager
     async def lifespan(_: FastAPI) -> AsyncIterator[None]:

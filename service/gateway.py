@@ -9,6 +9,7 @@ from service.engine import Engine
 from service.frames import Frames
 from service.identity import ApiKeys
 from service.metrics import Metrics
+from service.opening import Opening
 from service.sessions import Sessions
 from service.teams import Teams
 
@@ -20,6 +21,7 @@ class Gateway:
     admission: Admission
     engine: Engine
     metrics: Metrics
+    opening: Opening
     sessions: Sessions
     teams: Teams
     frames: Frames

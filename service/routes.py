@@ -102,7 +102,7 @@ async def open_session(
     request: Annotated[SessionRequest, Depends(_session_request)], gateway: GatewayDep
 ) -> SessionCreated:
     """Open a session of one ego with its teammates. The tokens are shown only in this answer."""
-    return await gateway.sessions.open(request)
+    return await gateway.opening.open(request)
 
 
 @v1.get("/sessions/{sid}", responses=_EGO_PROBLEMS)

@@ -1,23 +1,21 @@
-"""Sessions: opening and ending them, who speaks in them, and the decisions that they are left with."""
+"""Sessions that are open: who speaks in them, the decisions that they are left with, and their end."""
 
 from __future__ import annotations
 
 import asyncio
 import contextlib
-import secrets
 import time
 from collections.abc import Callable, Sequence
-from importlib.metadata import version
 
 import structlog
 
 from robosac.answers import Reason
 from robosac.audit import commitment
-from robosac.audit.events import FrameAnswered, SessionEnded, SessionOpened, now
+from robosac.audit.events import FrameAnswered, SessionEnded
 from robosac.budget import DomainError
-from robosac.calibration import calibration_digest, calibration_of
+from robosac.calibration import calibration_of
 from robosac.defenses import Defense, DefenseSettings, build, known, read_settings, suspicion_in
-from robosac.detectors import Detector, DetectorInfo
+from robosac.detectors import DetectorInfo
 from service.engine import Engine
 from service.gathering import Backlog, Gathering
 from service.identity import TokenRefused, Tokens
@@ -27,11 +25,7 @@ from service.metrics import Metrics
 from service.motion import Motion
 from service.problems import Problem
 from service.schemas import (
-    DetectorEntry,
-    SessionCreated,
-    SessionRequest,
     SessionState,
-    default_defense,
 )
 from service.settings import Settings
 from service.store import (
@@ -82,67 +76,9 @@ class Sessions:
         self.backlog = Backlog(settings.max_pending_bytes)
         self.journal = Journal(store, metrics)
 
-    async def open(self, request: SessionRequest) -> SessionCreated:
-        """Begin a session; the answer is the only place where its tokens are shown."""
-        detector = self._detector(self._settings.detector if request.detector is None else request.detector)
-        check_size(request.teammates, self._settings.max_teammates)
-        settings = (request.defense or default_defense(detector.info)).at_period(request.frame_period_ms)
-        try:
-            defense = _built(settings, detector.info)
-            defense.check_team(len(request.teammates))
-        except DomainError as error:
-            raise Problem(422, "impossible-defense", str(error), "defense") from error
-        budget_ms = request.latency_budget_ms or self._settings.latency_budget_ms
-        gather_ms = min(self._settings.gather_ms, budget_ms / 2) if request.gather_ms is None else request.gather_ms
-        if gather_ms > budget_ms:
-            raise Problem(
-                422, "invalid-request", f"must not exceed the latency budget of {budget_ms:g} ms", "gather_ms"
-            )
-        already_open = await self._store.count()
-        if already_open >= self._settings.max_sessions:
-            raise Problem(
-                503, "too-many-sessions", "the gateway holds as many sessions as it may", headers={"Retry-After": "30"}
-            )
-        session_id = secrets.token_hex(16)
-        own = self._tokens.issue(session_id, request.ego_id, is_ego=True)
-        others = {name: self._tokens.issue(session_id, name, is_ego=False) for name in request.teammates}
-        record = SessionRecord(
-            session_id=session_id,
-            ego_id=request.ego_id,
-            teammates=tuple(request.teammates),
-            detector=detector.info.name,
-            defense=settings.model_dump(mode="json"),
-            latency_budget_ms=budget_ms,
-            gather_ms=gather_ms,
-            frame_period_ms=request.frame_period_ms,
-            token_ids={name: token.token_id for name, token in {request.ego_id: own, **others}.items()},
-            public_keys=dict(request.public_keys),
-            created_at=now(),
-            seed=self._seeds(),
-            state=defense.initial_state(request.teammates),
-        )
-        await self._store.create(record, _opening(record, detector.info).as_json())
+    def begin(self, record: SessionRecord) -> None:
+        """Let a session be used whose record is kept now."""
         self._live[record.session_id] = self._revive(record)
-        self._metrics.sessions.set(already_open + 1)
-        logger.info(
-            "session opened",
-            session_id=record.session_id,
-            ego_id=record.ego_id,
-            teammates=len(record.teammates),
-            detector=record.detector,
-            defense=settings.kind,
-        )
-        return SessionCreated(
-            session_id=record.session_id,
-            ego_token=own.text,
-            teammate_tokens={name: token.text for name, token in others.items()},
-            tokens_expire_at=own.expires_at,
-            detector=DetectorEntry.of(detector.info),
-            defense=settings,
-            latency_budget_ms=record.latency_budget_ms,
-            gather_ms=record.gather_ms,
-            frame_period_ms=record.frame_period_ms,
-        )
 
     async def authenticate(self, session_id: str, token: str | None) -> Caller:
         """The vehicle that a token belongs to.
@@ -283,14 +219,6 @@ class Sessions:
         """The messages kept of a decided frame."""
         return await self._store.messages(caller.record.session_id, frame)
 
-    def _detector(self, name: str) -> Detector:
-        if not self._engine.ready:
-            raise Problem(503, "not-ready", "the gateway is still warming up", headers={"Retry-After": "5"})
-        if name not in self._engine.detectors:
-            known = ", ".join(self._engine.detectors)
-            raise Problem(422, "unknown-detector", f"there is no detector of that name; known: {known}", "detector")
-        return self._engine.detectors[name]
-
     def _revive(self, record: SessionRecord) -> LiveSession:
         """What this process holds of a session.
 
@@ -309,7 +237,7 @@ class Sessions:
             raise Problem(503, "defense-unavailable", detail)
         try:
             kept = read_settings(record.defense, self.defenses).at_period(record.frame_period_ms)
-            defense = _built(kept, detector.info)
+            defense = built(kept, detector.info)
         except DomainError as error:
             detail = f"the session's detector {record.detector} no longer serves its defence: {error}"
             raise Problem(503, "detector-unavailable", detail) from error
@@ -364,27 +292,9 @@ class Sessions:
             raise refused.problem from refused
 
 
-def _built(settings: DefenseSettings, info: DetectorInfo) -> Defense:
+def built(settings: DefenseSettings, info: DetectorInfo) -> Defense:
+    """A session's defence, for its detector."""
     return build(settings, lambda: calibration_of(info))
-
-
-def _opening(record: SessionRecord, info: DetectorInfo) -> SessionOpened:
-    return SessionOpened(
-        time=record.created_at,
-        version=version("robosac"),
-        ego_id=record.ego_id,
-        teammates=record.teammates,
-        detector=record.detector,
-        weights_digest=info.weights_digest,
-        calibration_digest=calibration_digest(info),
-        defense=dict(record.defense),
-        latency_budget_ms=record.latency_budget_ms,
-        gather_ms=record.gather_ms,
-        frame_period_ms=record.frame_period_ms,
-        public_keys=dict(record.public_keys),
-        state=dict(record.state),
-        next_seed_commitment=commitment(record.seed),
-    )
 
 
 def _ego_only(vehicle_id: str) -> Problem:

@@ -120,7 +120,7 @@ class Rejection:
         JSON values; for ``dissensus`` the indices of the hypotheses that speak against the teammate and their lowest
         Jaccard index.
     distrust : Distrust or None
-        Which kind, for ``distrusted``.
+        Why, for ``distrusted``. Whoever the state names need not be said here.
     """
 
     reason: Reason

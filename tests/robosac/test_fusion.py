@@ -6,10 +6,10 @@ from dataclasses import replace
 import numpy as np
 import pytest
 
-from robosac.answers import Reason, Source, Verdict
+from robosac.answers import Distrust, Reason, Source, Verdict
 from robosac.boxes import from_world, pose_matrix
 from robosac.deadline import SAFETY, Deadline
-from robosac.defenses import Decision, Reference, SampleConsensus, StaticTeam, Undefended
+from robosac.defenses import Decision, Reference, Rejection, SampleConsensus, StaticTeam, Undefended, remembered
 from robosac.detectors import DetectorInfo, Message
 from robosac.fusion import fuse
 from robosac.previous import PreviousAnswer
@@ -344,3 +344,24 @@ def test_the_embedded_detector_end_to_end(detector, ego_message, attacked):
     assert all("car-2" not in result.accepted for result in results)
     assert any(result.sampling_steps > 1 for result in results)
     assert all(len(result.boxes) for result in results)
+
+
+class Accuser(SampleConsensus):
+    """Names a teammate that is there, and one that is not."""
+
+    def converse(self, team, state, rng):
+        yield [("a",)]
+        why = dict.fromkeys("bcde", Rejection(Reason.NOT_SAMPLED))
+        return Decision(("a",), Source.CONSENSUS, why, None, remembered({}, named=["c", "absent"]))
+
+
+def test_an_answer_says_who_is_named_whatever_the_reason():
+    left_out = {"absent": Rejection(Reason.MISSING), "late": Rejection(Reason.LATE)}
+    result = run(FakeDetector(), Accuser())
+    assert result.named == ("c", "absent")
+    answer = result.answer(7, left_out, {"total": 1.23456})
+    assert set(answer.named) == {"c", "absent"}
+    reasons = {name: (why.reason, why.distrust) for name, why in answer.rejected.items()}
+    assert reasons["absent"] == (Reason.MISSING, Distrust.NAMED)
+    assert reasons["late"] == (Reason.LATE, None)
+    assert (answer.frame, answer.timings_ms) == (7, {"total": 1.235})

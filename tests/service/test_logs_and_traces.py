@@ -104,7 +104,7 @@ async def a_faulty_opening(served, monkeypatch, messages, benign):
             error.__cause__, error = RuntimeError(bytes(range(256)) * 10), error.__cause__ or error
         raise error
 
-    monkeypatch.setattr(served.gateway.sessions, "open", broken)
+    monkeypatch.setattr(served.gateway.opening, "open", broken)
     opening = await served.http.post("/v1/sessions", json={"ego_id": "a", "teammates": []}, headers=bearer(KEY))
     problem(opening, 500, "internal-error")
     return session

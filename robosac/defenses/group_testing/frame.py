@@ -9,7 +9,7 @@ from typing import Any
 
 import numpy as np
 
-from robosac.answers import Distrust, Reason, Source, Verdict
+from robosac.answers import Reason, Source, Verdict
 from robosac.boxes import FloatArray
 from robosac.defenses.group_testing import choice
 from robosac.defenses.group_testing.candidates import WITNESSES, candidates, cleared
@@ -281,11 +281,11 @@ class JudgedFrame:
         rejected = {}
         for name, rejection in explain_rejections(self._team, accepted, self._outcomes).items():
             evidence: dict[str, Any] = {**rejection.evidence, "suspicion": round(suspicion[name], 6)}
+            reason = rejection.reason
             if name in named:
+                reason = Reason.DISTRUSTED
                 evidence["evidence"] = [dict(item) for item in self._memory.evidence.get(name, ())]
-                rejected[name] = Rejection(Reason.DISTRUSTED, evidence, Distrust.NAMED)
-            else:
-                rejected[name] = Rejection(rejection.reason, evidence)
+            rejected[name] = Rejection(reason, evidence)
         return rejected
 
     def _suspicion(self) -> dict[str, float]:
