@@ -27,9 +27,9 @@ from robosac.defenses.group_testing.geometry import PairMeasure
 from robosac.detectors import Detector, load
 from robosac.evaluation.average_precision import AveragePrecision
 from robosac.evaluation.frames import DecodedOnce, EvaluationFrame, encode_all, under_attack
-from robosac.fusion import fuse
 from robosac.scenes import IntersectionScene
 from robosac.scenes.splits import TEST_SEEDS
+from robosac.session import Session
 
 LOSSES = np.array([0.0, *likelihoods.LOSS_EDGES])
 NOVELTIES = (0, *likelihoods.NOVELTY_EDGES)
@@ -153,18 +153,17 @@ def play_scenes(teammates: int, attackers: int, kind: str, frames: int, sequence
         scene = IntersectionScene(seed, car_agents=teammates)
         team = sorted(set(scene.agents) - {EGO})
         bad = frozenset(str(name) for name in rng.choice(team, attackers, replace=False))
-        state, spent, done, accused = defense.initial_state(team), 0, None, set()
+        session, spent, done, accused = Session(detector, team, defense, rng=rng), 0, None, set()
         for index, met in enumerate(_attacked(detector, scene, kind, bad, frames, rng)):
             decoded = DecodedOnce(detector, met.ego, met.received)
-            result = fuse(decoded, defense, met.ego, met.received, rng=rng, state=state, frame=index)
+            result = session.answer(index, met.ego, met.received, detector=decoded)
             if result.fault is not None:
                 raise RuntimeError(f"scene {seed}, frame {index}: {result.fault}")
-            state = result.state
             spent += result.sampling_steps
             passes.append(result.sampling_steps)
             infiltrated.append(not bad.isdisjoint(result.accepted))
-            accused |= set(state["named"])
-            if done is None and bad <= set(state["named"]):
+            accused |= set(result.named or ())
+            if done is None and bad <= set(result.named or ()):
                 done = spent
             ours.add(result.boxes, met.truth)
             oracle.add(decoded.detect(set(team) - bad), met.truth)

@@ -1,7 +1,8 @@
 """Consensus-verified collaborative perception, as a library.
 
-A frame is an ego's `Message` and its teammates'. `fuse` runs a defence against a detector and answers with boxes, the
-teammates whose messages are in them, and why the others are not.
+A frame is an ego's `Message` and its teammates'. A `Session` answers frame after frame with boxes, the teammates whose
+messages are in them, and why the others are not; it remembers who was found to attack. `fuse` does the same for one
+frame. `PGD` is an attack to try them with.
 
 Examples
 --------
@@ -11,8 +12,8 @@ Examples
 >>> detector = robosac.load_detector()
 >>> messages = {name: detector.encode(view.points, view.pose) for name, view in frame.views.items()}
 >>> ego = messages.pop("car-1")
->>> result = robosac.fuse(detector, robosac.SampleConsensus(), ego, messages, rng=np.random.default_rng(0))
->>> result.source
+>>> session = robosac.Session(detector, list(messages), rng=np.random.default_rng(0))
+>>> session.answer(0, ego, messages).source
 <Source.CONSENSUS: 'consensus'>
 """
 
@@ -21,11 +22,13 @@ from typing import TYPE_CHECKING
 from robosac.lazy import lazily
 
 if TYPE_CHECKING:
+    from robosac.attacks import PGD
     from robosac.defenses import SampleConsensus
     from robosac.detectors import Message
     from robosac.detectors import load as load_detector
     from robosac.fusion import FusionResult, fuse
     from robosac.scenes import IntersectionScene
+    from robosac.session import Session
 else:
     __getattr__, __dir__ = lazily(
         __name__,
@@ -33,10 +36,12 @@ else:
             "FusionResult": "robosac.fusion:FusionResult",
             "IntersectionScene": "robosac.scenes:IntersectionScene",
             "Message": "robosac.detectors:Message",
+            "PGD": "robosac.attacks:PGD",
             "SampleConsensus": "robosac.defenses:SampleConsensus",
+            "Session": "robosac.session:Session",
             "fuse": "robosac.fusion:fuse",
             "load_detector": "robosac.detectors:load",
         },
     )
 
-__all__ = ["FusionResult", "IntersectionScene", "Message", "SampleConsensus", "fuse", "load_detector"]
+__all__ = ["PGD", "FusionResult", "IntersectionScene", "Message", "SampleConsensus", "Session", "fuse", "load_detector"]

@@ -2,7 +2,9 @@
 
 from __future__ import annotations
 
+from collections.abc import Mapping
 from dataclasses import dataclass
+from typing import Any
 
 import numpy as np
 from scipy.optimize import linear_sum_assignment
@@ -57,6 +59,16 @@ class PreviousAnswer:
             same = distance[now, then] < FOLLOWED_M
             motion[now[same]] = placed[now[same], :2] - before.boxes[then[same], :2]
         return cls(frame, placed, motion)
+
+    def as_json(self) -> dict[str, Any]:
+        """JSON values, which `from_json` reads back."""
+        return {"frame": self.frame, "boxes": self.boxes.tolist(), "motion": self.motion.tolist()}
+
+    @classmethod
+    def from_json(cls, fields: Mapping[str, Any]) -> PreviousAnswer:
+        """What `as_json` gave."""
+        boxes = np.array(fields["boxes"], dtype=np.float64).reshape(-1, 6)
+        return cls(int(fields["frame"]), boxes, np.array(fields["motion"], dtype=np.float64).reshape(-1, 2))
 
     def expected_at(self, pose: FloatArray) -> FloatArray:
         """The boxes (n, 6) one frame later, in the frame of the ego at ``pose``: each moved as it moved before."""

@@ -138,16 +138,10 @@ class Deciding:
 
     async def _fuse(self, asked: Asked, record: SessionRecord, present: Mapping[str, Received]) -> FusionResult:
         live = asked.caller.live
-        result, asked.timings["queue"] = await self._engine.fuse(
-            live.detector,
-            live.defense,
-            asked.ego.message,
-            {name: received.message for name, received in present.items()},
-            seed=int(record.seed, 16),
-            state=record.state,
-            frame=asked.frame,
-            previous=live.previous,
-            deadline=self._admission.deadline(asked.arrived, record.latency_budget_ms / 1e3),
+        messages = {name: received.message for name, received in present.items()}
+        deadline = self._admission.deadline(asked.arrived, record.latency_budget_ms / 1e3)
+        result, asked.timings["queue"] = await self._engine.decide(
+            live.session, asked.frame, asked.ego.message, messages, int(record.seed, 16), deadline
         )
         asked.timings.update(result.timings_ms)
         asked.spent("total", asked.arrived)
@@ -170,7 +164,7 @@ class Deciding:
                 seed=record.seed,
                 ego_pose=asked.ego.message.pose,
                 messages={name: received.proof for name, received in {record.ego_id: asked.ego, **present}.items()},
-                previous_frame=None if live.previous is None else live.previous.frame,
+                previous_frame=None if live.session.previous is None else live.session.previous.frame,
                 out_of_time=result.out_of_time,
                 fault=result.fault,
                 state=dict(result.state),
@@ -186,7 +180,8 @@ class Deciding:
     def _remember(self, asked: Asked, present: Mapping[str, Received], result: FusionResult) -> None:
         """What the next frame is judged by."""
         live = asked.caller.live
-        live.answered, live.previous, live.ego_digest = asked.frame, result.previous, asked.ego.digest
+        live.session.remember(result)
+        live.answered, live.ego_digest = asked.frame, asked.ego.digest
         for name, received in {asked.caller.vehicle_id: asked.ego, **present}.items():
             live.motion.moved(name, asked.frame, received.message.pose)
 

@@ -6,6 +6,7 @@ import asyncio
 import time
 from collections.abc import Callable, Mapping, Sequence
 from concurrent.futures import ThreadPoolExecutor
+from copy import copy
 from functools import partial
 from typing import TypeVar
 
@@ -14,10 +15,9 @@ import torch
 
 from robosac.boxes import pose_matrix
 from robosac.deadline import Deadline
-from robosac.defenses import Defense, State
 from robosac.detectors import Detector, Message, available, load
-from robosac.fusion import FusionResult, fuse
-from robosac.previous import PreviousAnswer
+from robosac.fusion import FusionResult
+from robosac.session import Session
 
 T = TypeVar("T")
 
@@ -62,36 +62,23 @@ class Engine:
             await self._submit(partial(_warm_up, detector))
         self.ready = True
 
-    async def fuse(
+    async def decide(
         self,
-        detector: Detector,
-        defense: Defense,
+        session: Session,
+        frame: int,
         ego: Message,
         teammates: Mapping[str, Message],
-        *,
         seed: int,
-        state: State,
-        frame: int,
-        previous: PreviousAnswer | None,
         deadline: Deadline,
     ) -> tuple[FusionResult, float]:
-        """`robosac.fusion.fuse` on the engine's thread; also the milliseconds that the frame waited for it."""
-        submitted = time.perf_counter()
+        """`robosac.Session.decide` on the engine's thread, from what the session remembers at this moment; also the
+        milliseconds that the frame waited for it.
+        """
+        submitted, asked = time.perf_counter(), copy(session)
 
         def work() -> tuple[FusionResult, float]:
             waited_ms = (time.perf_counter() - submitted) * 1e3
-            result = fuse(
-                detector,
-                defense,
-                ego,
-                teammates,
-                rng=np.random.default_rng(seed),
-                state=state,
-                frame=frame,
-                previous=previous,
-                deadline=deadline,
-            )
-            return result, waited_ms
+            return asked.decide(frame, ego, teammates, np.random.default_rng(seed), deadline), waited_ms
 
         return await self._submit(work)
 

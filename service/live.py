@@ -9,9 +9,8 @@ from collections.abc import Iterator
 from contextlib import contextmanager
 from dataclasses import dataclass, field
 
-from robosac.defenses import Defense
 from robosac.detectors import Detector, Role
-from robosac.previous import PreviousAnswer
+from robosac.session import Session
 from service.gathering import Gathering
 from service.motion import Motion
 from service.store import SessionRecord
@@ -26,17 +25,17 @@ STRANGERS = "?"
 class LiveSession:
     """What a session holds in this process only; the lock is held while a frame is answered or the team changes.
 
-    ``previous`` and ``ego_digest`` are of the frame ``answered``, the latest that this process answered.
+    The store is right about what ``session`` remembers; only the previous answer is known to this process alone. It and
+    ``ego_digest`` are of the frame ``answered``, the latest that this process answered.
     """
 
+    session: Session
     detector: Detector
-    defense: Defense
     team: tuple[str, ...]
     gathering: Gathering
     motion: Motion
     budget_s: float
     answered: int | None = None
-    previous: PreviousAnswer | None = None
     ego_digest: str | None = None
     lock: asyncio.Lock = field(default_factory=asyncio.Lock)
     last_used: float = field(default_factory=time.monotonic)
@@ -50,8 +49,9 @@ class LiveSession:
             self.gathering.change_team(record.teammates)
         if record.last_frame is not None and record.last_frame > self.gathering.closed:
             self.gathering.close(record.last_frame)
+        self.session.state = record.state
         if record.last_frame != self.answered:
-            self.previous = self.ego_digest = None
+            self.session.previous = self.ego_digest = None
 
     @contextmanager
     def unlogged(self) -> Iterator[dict[str, int]]:

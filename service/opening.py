@@ -13,12 +13,13 @@ from robosac.budget import DomainError
 from robosac.calibration import calibration_digest
 from robosac.defenses import DefenseSettings, State
 from robosac.detectors import Detector, DetectorInfo
+from robosac.session import default_defense, defense_for
 from service.engine import Engine
 from service.identity import Tokens
 from service.metrics import Metrics
 from service.problems import Problem
-from service.schemas import DetectorEntry, SessionCreated, SessionRequest, default_defense
-from service.sessions import Sessions, built, check_size
+from service.schemas import DetectorEntry, SessionCreated, SessionRequest
+from service.sessions import Sessions, check_size
 from service.settings import Settings
 from service.store import SessionRecord, Store
 
@@ -132,7 +133,7 @@ def _defense(request: SessionRequest, info: DetectorInfo) -> tuple[DefenseSettin
     """Settings of the session's defence, and its state before the first frame."""
     settings = (request.defense or default_defense(info)).at_period(request.frame_period_ms)
     try:
-        defense = built(settings, info)
+        defense = defense_for(settings, info)
         defense.check_team(len(request.teammates))
     except DomainError as error:
         raise Problem(422, "impossible-defense", str(error), "defense") from error

@@ -22,8 +22,6 @@ from pydantic import (
 )
 
 from robosac.defenses import DefenseSettings, Kinds, shipped
-from robosac.defenses.group_testing import GroupTestingSettings
-from robosac.defenses.sample_consensus import SampleConsensusSettings
 from robosac.detectors import DetectorInfo
 from robosac.signatures import read_public_key
 
@@ -56,11 +54,6 @@ else:
         WrapSerializer(lambda settings, _: settings.model_dump(mode="json")),
     ]
     """Settings of any defence that is served; described as one of those that ship."""
-
-
-def default_defense(info: DetectorInfo) -> DefenseSettings:
-    """The defence of a session that asks for none."""
-    return GroupTestingSettings() if info.calibration is not None else SampleConsensusSettings()
 
 
 def _check_distinct(teammates: list[str]) -> list[str]:

@@ -13,9 +13,8 @@ from robosac.answers import Reason
 from robosac.audit import commitment
 from robosac.audit.events import FrameAnswered, SessionEnded
 from robosac.budget import DomainError
-from robosac.calibration import calibration_of
-from robosac.defenses import Defense, DefenseSettings, build, known, read_settings, suspicion_in
-from robosac.detectors import DetectorInfo
+from robosac.defenses import known, read_settings, suspicion_in
+from robosac.session import Session, defense_for
 from service.engine import Engine
 from service.gathering import Backlog, Gathering
 from service.identity import TokenRefused, Tokens
@@ -237,13 +236,13 @@ class Sessions:
             raise Problem(503, "defense-unavailable", detail)
         try:
             kept = read_settings(record.defense, self.defenses).at_period(record.frame_period_ms)
-            defense = built(kept, detector.info)
+            defense = defense_for(kept, detector.info)
         except DomainError as error:
             detail = f"the session's detector {record.detector} no longer serves its defence: {error}"
             raise Problem(503, "detector-unavailable", detail) from error
         return LiveSession(
+            Session(detector, record.teammates, defense, {"state": record.state}),
             detector,
-            defense,
             record.teammates,
             Gathering(record.teammates, settings.max_pending_frames, self.backlog, closed),
             Motion(settings.max_speed_mps, record.frame_period_ms / 1e3, settings.max_range_m),
@@ -290,11 +289,6 @@ class Sessions:
             live = self._live_session(record) if record.ended_at is None and self._is_served(record) else None
             await self.journal.stranger(record.session_id, live, refused)
             raise refused.problem from refused
-
-
-def built(settings: DefenseSettings, info: DetectorInfo) -> Defense:
-    """A session's defence, for its detector."""
-    return build(settings, lambda: calibration_of(info))
 
 
 def _ego_only(vehicle_id: str) -> Problem:

@@ -93,7 +93,7 @@ class Teams:
         """Keep a new team of the session ``record``. The session's lock is held."""
         check_size(team, self._settings.max_teammates)
         try:
-            state = caller.live.defense.change_team(record.state, team)
+            state = caller.live.session.defense.change_team(record.state, team)
         except DomainError as error:
             raise Problem(422, "impossible-defense", str(error), "teammates") from error
         event = TeamChanged(

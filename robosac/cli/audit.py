@@ -63,9 +63,12 @@ def replay_decision(
     ] = None,
 ) -> None:
     """Make a decision again from the log and the messages, and compare; 1 if it comes out otherwise."""
-    from robosac import defenses  # noqa: PLC0415 (seconds to import, and only this command needs it)
+    import torch  # noqa: PLC0415 (seconds to import, and only this command needs it)
+
+    from robosac import defenses  # noqa: PLC0415
     from robosac.audit import replay  # noqa: PLC0415
 
+    torch.set_num_threads(1)  # as gateways do: another order of summation shifts boxes by more than is tolerated
     try:
         body = messages.read_bytes()
         number = wire.read_frame(body).frame if frame is None else frame

@@ -10,11 +10,11 @@ from typing import Protocol
 import numpy as np
 
 from robosac.boxes import FloatArray
-from robosac.defenses import Defense, State
+from robosac.defenses import Defense
 from robosac.detectors import Message
 from robosac.detectors.base import Preparer
-from robosac.fusion import FusionResult, fuse
-from robosac.previous import PreviousAnswer
+from robosac.fusion import FusionResult
+from robosac.session import Session
 
 
 class FaultyDefense(RuntimeError):
@@ -79,14 +79,12 @@ def play(defense: Defense, sequence: Sequence[PlayableFrame], rng: np.random.Gen
     FaultyDefense
         If a fusion failed.
     """
-    state: State = defense.initial_state(list(sequence[0].team))
-    previous: PreviousAnswer | None = None
+    session = Session(sequence[0], sequence[0].team, defense, rng=rng)
     answers = []
     for index, frame in enumerate(sequence):
         started = time.perf_counter()
-        result = fuse(frame, defense, frame.ego, frame.teammates, rng=rng, state=state, frame=index, previous=previous)
+        result = session.answer(index, frame.ego, frame.teammates, detector=frame)
         answers.append(Answer(result, (time.perf_counter() - started) * 1e3))
         if result.fault is not None:
             raise FaultyDefense(f"frame {index}: {result.fault}")
-        state, previous = result.state, result.previous
     return answers

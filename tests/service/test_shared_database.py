@@ -81,15 +81,15 @@ async def test_who_left_at_one_gateway_is_a_stranger_at_the_other(two, messages,
 @contextlib.contextmanager
 def meanwhile(served, monkeypatch, *happenings):
     """Let something happen at each of the next fusions, once it is done but before the decision is kept."""
-    fuse, left = served.gateway.engine.fuse, list(happenings)
+    decide, left = served.gateway.engine.decide, list(happenings)
 
     async def interrupted(*arguments, **options):
-        outcome = await fuse(*arguments, **options)
+        outcome = await decide(*arguments, **options)
         if left:
             await left.pop(0)()
         return outcome
 
-    monkeypatch.setattr(served.gateway.engine, "fuse", interrupted)
+    monkeypatch.setattr(served.gateway.engine, "decide", interrupted)
     yield
     assert not left
 

@@ -15,8 +15,8 @@ from robosac.consensus import at_least, compare
 from robosac.defenses import Defense, Reference, SampleConsensus, StaticTeam, Undefended
 from robosac.evaluation.experiments import paper
 from robosac.evaluation.experiments.common import Context, Recorded, Section, Table, precision
-from robosac.fusion import fuse
 from robosac.previous import PreviousAnswer
+from robosac.session import Session
 
 STEADY_FROM = 5
 BUDGET = 7
@@ -43,23 +43,15 @@ def _play(context: Context, defenses: dict[str, Defense]) -> dict[str, _Run]:
     for number in range(context.scale.sequences):
         sequence = context.sequence(number)
         for repeat in range(context.scale.repeats):
-            states = {name: d.initial_state(sorted(sequence[0].frame.received)) for name, d in defenses.items()}
-            before: dict[str, PreviousAnswer | None] = dict.fromkeys(defenses)
+            team = sorted(sequence[0].frame.received)
+            sessions = {name: Session(context.detector, team, defense) for name, defense in defenses.items()}
             for index, recorded in enumerate(sequence):
-                for stream, (name, defense) in enumerate(defenses.items()):
+                for stream, (name, session) in enumerate(sessions.items()):
+                    rng = context.rng(10, number, repeat, index, stream)
                     started = time.perf_counter()
-                    result = fuse(
-                        context.detector,
-                        defense,
-                        recorded.frame.ego,
-                        recorded.frame.received,
-                        rng=context.rng(10, number, repeat, index, stream),
-                        state=states[name],
-                        frame=index,
-                        previous=before[name],
-                    )
+                    result = session.decide(index, recorded.frame.ego, recorded.frame.received, rng)
                     seconds = time.perf_counter() - started
-                    states[name], before[name] = result.state, result.previous
+                    session.remember(result)
                     run = runs[name]
                     run.answers.append((result.boxes, recorded.frame.truth))
                     run.steps.append(result.sampling_steps)

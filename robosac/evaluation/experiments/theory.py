@@ -13,6 +13,7 @@ from robosac.evaluation.experiments.common import TEAM_SIZE, Context, Recorded, 
 from robosac.evaluation.oracle import converse_with_oracle, simulate_sampling
 from robosac.figures import new_figure
 from robosac.fusion import fuse
+from robosac.session import Session
 
 MOST_STEPS = 500
 NEVER = MOST_STEPS + 1
@@ -136,11 +137,10 @@ def _estimate_by_oracle(attackers: int, rng: np.random.Generator) -> tuple[int, 
 
 
 def _estimate_by_detector(sequence: list[Recorded], rng: np.random.Generator) -> tuple[int, float]:
-    defense = A2CP()
-    state = defense.initial_state(sorted(sequence[0].frame.received))
+    session = Session(sequence[0], sorted(sequence[0].frame.received), A2CP(), rng=rng)
     steps = index = 0
-    while not _settled(state) and index < MOST_FRAMES:
+    while not _settled(session.state) and index < MOST_FRAMES:
         recorded = sequence[index % len(sequence)]
-        result = fuse(recorded, defense, recorded.frame.ego, recorded.frame.received, rng=rng, state=state)
-        state, steps, index = result.state, steps + result.sampling_steps, index + 1
-    return steps, state["estimate"]
+        result = session.answer(index, recorded.frame.ego, recorded.frame.received, detector=recorded)
+        steps, index = steps + result.sampling_steps, index + 1
+    return steps, session.state["estimate"]

@@ -9,6 +9,7 @@ from pathlib import Path
 
 import numpy as np
 import pytest
+import torch
 from typer.testing import CliRunner
 
 from robosac import consensus, fusion, wire
@@ -253,6 +254,19 @@ def test_bad_arguments_are_explained(got, arguments, complaint, tmp_path, monkey
     code, said = run(*arguments)
     assert code == 2
     assert complaint in said
+
+
+def test_a_decision_is_made_again_with_as_many_threads_as_a_gateway_has(got, tmp_path):
+    """More add up in another order, which shifts boxes by more than is tolerated."""
+    (tmp_path / "log").write_bytes(b"\n".join(got.lines))
+    (tmp_path / "body").write_bytes(got.bodies[2])
+    before = torch.get_num_threads()
+    torch.set_num_threads(2)
+    try:
+        code, said = run("replay", tmp_path / "log", "--messages", tmp_path / "body")
+    finally:
+        torch.set_num_threads(before)
+    assert (code, "the same decision" in said) == (0, True), said
 
 
 def run(*arguments):

@@ -1,0 +1,158 @@
+"""An ego's perception over time: a detector, a defence that remembers, and the answer before."""
+
+from __future__ import annotations
+
+from collections.abc import Mapping, Sequence
+from typing import Any
+
+import numpy as np
+
+from robosac.calibrated import calibration_of
+from robosac.deadline import Deadline
+from robosac.defenses import Defense, DefenseSettings, State, build
+from robosac.defenses.group_testing import GroupTestingSettings
+from robosac.defenses.sample_consensus import SampleConsensusSettings
+from robosac.detectors import Detector, DetectorInfo, Message, Preparer
+from robosac.fusion import FusionResult, fuse
+from robosac.previous import PreviousAnswer
+
+
+def default_defense(info: DetectorInfo) -> DefenseSettings:
+    """The defence where none is asked for: group testing if the detector is calibrated for it, else sampling."""
+    return GroupTestingSettings() if info.calibration is not None else SampleConsensusSettings()
+
+
+def defense_for(settings: DefenseSettings | Mapping[str, Any], info: DetectorInfo) -> Defense:
+    """A defence of these settings, with the calibration of a detector where it needs one.
+
+    Raises
+    ------
+    robosac.budget.DomainError
+        As `robosac.defenses.build`.
+    """
+    return build(settings, lambda: calibration_of(info))
+
+
+class Session:
+    """Answers frame after frame, and remembers between them what the defence knows and what was answered last.
+
+    Parameters
+    ----------
+    detector : Preparer
+        Any `Detector`.
+    team : sequence of str
+        All teammates, present or not.
+    defense : Defense, optional
+        By default `default_defense` of the detector, which then must be a whole `Detector`.
+    saved : mapping, optional
+        What `save` gave: the session goes on from there.
+    rng : numpy.random.Generator, optional
+        All randomness of the defence; seeded by the operating system by default, so that nobody can foresee it.
+
+    Attributes
+    ----------
+    state : mapping
+        What the defence remembers, JSON values.
+    previous : PreviousAnswer or None
+        The latest answer, if anybody was fused into it.
+
+    Examples
+    --------
+    >>> import robosac
+    >>> detector = robosac.load_detector()
+    >>> scene = robosac.IntersectionScene(seed=8)
+    >>> session = robosac.Session(detector, [name for name in scene.agents if name != "car-1"])
+    >>> for number in range(2):
+    ...     views = scene.frame(number).views
+    ...     messages = {name: detector.encode(view.points, view.pose) for name, view in views.items()}
+    ...     answer = session.answer(number, messages.pop("car-1"), messages)
+    >>> answer.named
+    ()
+    """
+
+    def __init__(
+        self,
+        detector: Preparer,
+        team: Sequence[str],
+        defense: Defense | None = None,
+        saved: Mapping[str, Any] | None = None,
+        rng: np.random.Generator | None = None,
+    ) -> None:
+        self.detector = detector
+        self.defense = defense or _default(detector)
+        self._rng = rng or np.random.default_rng()
+        self.state: State = self.defense.initial_state(list(team)) if saved is None else saved["state"]
+        before = None if saved is None else saved.get("previous")
+        self.previous = None if before is None else PreviousAnswer.from_json(before)
+
+    def answer(
+        self,
+        frame: int,
+        ego: Message,
+        teammates: Mapping[str, Message],
+        deadline: Deadline | None = None,
+        detector: Preparer | None = None,
+    ) -> FusionResult:
+        """Decide a frame, and remember it for the next.
+
+        Parameters
+        ----------
+        frame : int
+            Its number; frames of successive numbers are one frame period apart.
+        ego : Message
+        teammates : mapping of teammate id to Message
+            Those present in this frame, checked against the detector's layout.
+        deadline : Deadline, optional
+            By default there is time for all.
+        detector : Preparer, optional
+            What decodes this frame in the place of the session's detector, such as a recording.
+        """
+        result = self.decide(frame, ego, teammates, self._rng, deadline, detector)
+        self.remember(result)
+        return result
+
+    def decide(
+        self,
+        frame: int,
+        ego: Message,
+        teammates: Mapping[str, Message],
+        rng: np.random.Generator,
+        deadline: Deadline | None = None,
+        detector: Preparer | None = None,
+    ) -> FusionResult:
+        """As `answer`, with draws of one's own, and nothing is remembered yet: for who must keep the decision first."""
+        return fuse(
+            detector or self.detector,
+            self.defense,
+            ego,
+            teammates,
+            rng=rng,
+            state=self.state,
+            frame=frame,
+            previous=self.previous,
+            deadline=deadline,
+        )
+
+    def remember(self, result: FusionResult) -> None:
+        """Let a decision count for the next frame."""
+        self.state, self.previous = result.state, result.previous
+
+    def change_team(self, team: Sequence[str]) -> None:
+        """Teammates joined or left; ``team`` is the new one.
+
+        Raises
+        ------
+        robosac.budget.DomainError
+            If the defence's settings make no sense for it.
+        """
+        self.state = self.defense.change_team(self.state, list(team))
+
+    def save(self) -> dict[str, Any]:
+        """What the session remembers, JSON values: with it, another one goes on from here."""
+        return {"state": dict(self.state), "previous": None if self.previous is None else self.previous.as_json()}
+
+
+def _default(detector: Preparer) -> Defense:
+    if not isinstance(detector, Detector):
+        raise TypeError(f"{type(detector).__name__} is no whole detector: say which defence to take")
+    return defense_for(default_defense(detector.info), detector.info)
