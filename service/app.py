@@ -17,23 +17,23 @@ from fastapi import FastAPI  # noqa: E402
 
 from robosac.extras import MissingExtra  # noqa: E402
 from service import problems  # noqa: E402
-from service.admission import Admission, Gate  # noqa: E402
-from service.deciding import Deciding  # noqa: E402
+from service.arriving.frames import Frames  # noqa: E402
+from service.arriving.limits import BodyLimit, HeadLimit  # noqa: E402
+from service.deciding.admission import Admission, Gate  # noqa: E402
+from service.deciding.answering import Deciding  # noqa: E402
 from service.engine import Engine  # noqa: E402
-from service.frames import Frames  # noqa: E402
 from service.gateway import Gateway  # noqa: E402
-from service.identity import ApiKeys, LoopbackOnly, Tokens  # noqa: E402
-from service.limits import BodyLimit, HeadLimit  # noqa: E402
-from service.logs import logging_to_stderr  # noqa: E402
-from service.metrics import Metrics  # noqa: E402
-from service.opening import Opening  # noqa: E402
+from service.keeping.sql_store import SqlStore  # noqa: E402
+from service.keeping.store import new_seed  # noqa: E402
 from service.routes import operations, v1  # noqa: E402
-from service.sessions import Sessions  # noqa: E402
+from service.sessions.identity import ApiKeys, LoopbackOnly, Tokens  # noqa: E402
+from service.sessions.opening import Opening  # noqa: E402
+from service.sessions.sessions import Sessions  # noqa: E402
+from service.sessions.teams import Teams  # noqa: E402
 from service.settings import Settings  # noqa: E402
-from service.sql_store import SqlStore  # noqa: E402
-from service.store import new_seed  # noqa: E402
-from service.teams import Teams  # noqa: E402
-from service.tracing import Traced, Tracing, provider_from_environment  # noqa: E402
+from service.watching.logs import logging_to_stderr  # noqa: E402
+from service.watching.metrics import Metrics  # noqa: E402
+from service.watching.tracing import Traced, Tracing, provider_from_environment  # noqa: E402
 
 if TYPE_CHECKING:
     from opentelemetry.sdk.trace import TracerProvider
@@ -56,7 +56,7 @@ def create_app(
         Seed of each frame's draws, hexadecimal; from the operating system by default. Set it only for tests: whoever
         knows the seed knows which subsets will be sampled.
     spans : TracerProvider, optional
-        Takes the traces; by default what the environment says, see `service.tracing`.
+        Takes the traces; by default what the environment says, see `service.watching.tracing`.
     """
     settings = settings or Settings()
     engine = Engine(settings.torch_threads, settings.extra_detectors)

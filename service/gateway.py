@@ -4,14 +4,14 @@ from __future__ import annotations
 
 from dataclasses import dataclass
 
-from service.admission import Admission
+from service.arriving.frames import Frames
+from service.deciding.admission import Admission
 from service.engine import Engine
-from service.frames import Frames
-from service.identity import ApiKeys
-from service.metrics import Metrics
-from service.opening import Opening
-from service.sessions import Sessions
-from service.teams import Teams
+from service.sessions.identity import ApiKeys
+from service.sessions.opening import Opening
+from service.sessions.sessions import Sessions
+from service.sessions.teams import Teams
+from service.watching.metrics import Metrics
 
 
 @dataclass(frozen=True)

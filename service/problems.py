@@ -18,7 +18,7 @@ from starlette.exceptions import HTTPException
 
 from robosac.defenses import shipped
 from robosac.wire import WireError
-from service.store import StoreUnavailable
+from service.keeping.store import StoreUnavailable
 
 logger = structlog.stdlib.get_logger(__name__)
 

@@ -11,10 +11,9 @@ from pydantic import BaseModel
 
 from robosac import wire
 from robosac.answers import FrameAnswer
-from service.bodies import MSGPACK, MSGPACK_TYPES, check_type, described, read_json
+from service.arriving.bodies import MSGPACK, MSGPACK_TYPES, check_type, described, read_json
+from service.arriving.limits import read_bounded
 from service.gateway import Gateway
-from service.limits import read_bounded
-from service.live import Caller
 from service.problems import Problem, documented
 from service.schemas import (
     ChangedTeam,
@@ -27,6 +26,7 @@ from service.schemas import (
     SessionRequest,
     SessionState,
 )
+from service.sessions.live import Caller
 
 v1 = APIRouter(prefix="/v1", responses=documented(422, 503))
 operations = APIRouter()

@@ -9,7 +9,7 @@ from pydantic import Field, SecretStr, field_validator
 from pydantic_settings import BaseSettings, NoDecode, SettingsConfigDict
 
 from robosac.detectors import DEFAULT_DETECTOR
-from service.database import read_url
+from service.keeping.database import read_url
 
 
 class Settings(BaseSettings):

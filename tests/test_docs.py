@@ -44,7 +44,7 @@ def test_links_between_pages_lead_somewhere():
 
 def test_every_problem_and_reason_is_documented():
     text = (ROOT / "docs" / "api.md").read_text()
-    sources = [*(ROOT / "service").glob("*.py"), ROOT / "robosac" / "wire.py"]
+    sources = [*(ROOT / "service").rglob("*.py"), ROOT / "robosac" / "wire.py"]
     code = "\n".join(path.read_text() for path in sources)
     slugs = set(re.findall(r'(?:Problem\(\s*\d{3},\s*|WireError\(\s*)"([a-z-]+)"', code))
     assert len(slugs) > 15

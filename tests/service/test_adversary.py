@@ -70,7 +70,7 @@ async def test_an_expired_token_is_worth_nothing(served, session, messages, beni
     await still_serves(served, session, messages, benign, 0)
     token, later = session.teammate_tokens["rsu"], time.time() + 2 * 86_400
     with monkeypatch.context() as patch:
-        patch.setattr("service.identity.time.time", lambda: later)
+        patch.setattr("service.sessions.identity.time.time", lambda: later)
         body = wire.pack_message(1, "rsu", messages["rsu"])
         problem(await served.post(session, "messages", body, token), 401, "token-expired")
         problem(await served.post(session, "frames", wire.pack_frame(1, messages[EGO], benign)), 401, "token-expired")

@@ -9,9 +9,10 @@ import pytest
 from cryptography.hazmat.primitives.asymmetric.ed25519 import Ed25519PrivateKey
 
 from robosac.signatures import show_public_key
-from service import bodies, schemas
+from service import schemas
 from service.app import create_app
-from service.limits import HEADER_BYTES, HEADERS, TARGET_BYTES
+from service.arriving import bodies
+from service.arriving.limits import HEADER_BYTES, HEADERS, TARGET_BYTES
 from service.settings import Settings
 from tests.service.conftest import problem, serve
 from tests.service.test_identity import ANYBODY, EGO_ONLY, KEY, KEY_HOLDER, OTHER_KEY, RULES, bearer

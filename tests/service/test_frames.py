@@ -250,7 +250,7 @@ async def test_waiting_for_teammates_costs_nothing(served, messages, monkeypatch
         waits.append(1)
         return await wait_for(*arguments)
 
-    monkeypatch.setattr("service.gathering.asyncio.wait_for", counted)
+    monkeypatch.setattr("service.sessions.gathering.asyncio.wait_for", counted)
     session = await served.open(gather_ms=5000)
     asking = asyncio.create_task(served.ego(session).ask(0, messages[EGO]))
     await asyncio.sleep(0.1)

@@ -11,7 +11,7 @@ import pytest
 from clients.errors import AccessDenied, InvalidRequest, SessionNotFound
 from robosac import wire
 from service.app import create_app
-from service.identity import AUDIENCE, CLAIMS, ISSUER, is_local
+from service.sessions.identity import AUDIENCE, CLAIMS, ISSUER, is_local
 from service.settings import Settings
 from tests.service.conftest import EGO, TEAM, problem, serve
 
@@ -399,7 +399,7 @@ async def test_refused_access_is_recorded_without_belief_in_what_it_claims(good_
 
 
 async def test_refused_access_does_not_keep_a_session_from_expiring(monkeypatch):
-    monkeypatch.setattr("service.sessions.SWEEP_EVERY_S", 0.02)
+    monkeypatch.setattr("service.sessions.sessions.SWEEP_EVERY_S", 0.02)
     async with serve(session_idle_s=0.3) as served:
         session = await served.open()
         for _ in range(30):

@@ -21,7 +21,7 @@ from opentelemetry.sdk.trace.export.in_memory_span_exporter import InMemorySpanE
 
 from robosac import wire
 from service.settings import Settings
-from service.tracing import provider_from_environment
+from service.watching.tracing import provider_from_environment
 from tests.service.conftest import EGO, problem, serve
 from tests.service.test_identity import bearer
 
@@ -180,7 +180,7 @@ async def test_a_database_that_fails_tells_of_no_row(caplog, tmp_path, monkeypat
         def broken(*_):
             raise sqlite3.IntegrityError(f"failing row: {token}, {'ab' * 32}")
 
-        monkeypatch.setattr("service.sql_store.seal", broken)
+        monkeypatch.setattr("service.keeping.sql_store.seal", broken)
         path = f"/v1/sessions/{session.session_id}/token"
         problem(await served.http.post(path, headers=bearer(token)), 503, "store-unavailable")
     (record,) = [r for r in caplog.records if "database failed" in r.getMessage()]

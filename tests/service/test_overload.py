@@ -4,7 +4,7 @@ from contextlib import ExitStack
 import pytest
 
 from robosac import wire
-from service.admission import SESSION_FRAMES, Admission
+from service.deciding.admission import SESSION_FRAMES, Admission
 from service.problems import Problem
 from tests.service.conftest import EGO, problem, serve
 

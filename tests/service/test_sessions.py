@@ -142,7 +142,7 @@ async def test_the_number_of_sessions_is_bounded():
 
 
 async def test_a_session_does_not_expire_under_a_waiting_ego(monkeypatch, messages):
-    monkeypatch.setattr("service.sessions.SWEEP_EVERY_S", 0.02)
+    monkeypatch.setattr("service.sessions.sessions.SWEEP_EVERY_S", 0.02)
     async with serve(session_idle_s=0.1) as served:
         session = await served.open(gather_ms=500)
         answer = await served.ego(session).ask(0, messages["car-1"])
@@ -150,7 +150,7 @@ async def test_a_session_does_not_expire_under_a_waiting_ego(monkeypatch, messag
 
 
 async def test_idle_sessions_expire(monkeypatch):
-    monkeypatch.setattr("service.sessions.SWEEP_EVERY_S", 0.02)
+    monkeypatch.setattr("service.sessions.sessions.SWEEP_EVERY_S", 0.02)
     async with serve(session_idle_s=0.3) as served:
         idle, busy = await served.open(), await served.open()
         import asyncio

@@ -17,7 +17,7 @@ from robosac.audit import replay, verify
 from robosac.cli import app
 from robosac.deadline import Deadline
 from robosac.detectors import Message
-from service.admission import Admission
+from service.deciding.admission import Admission
 from tests.robosac.audit.conftest import seal_all
 from tests.service.conftest import serve
 

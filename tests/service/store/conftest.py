@@ -15,8 +15,8 @@ import asyncpg
 import pytest
 
 from robosac.audit import GENESIS, digest
-from service.sql_store import SqlStore
-from service.store import SessionRecord
+from service.keeping.sql_store import SqlStore
+from service.keeping.store import SessionRecord
 
 NUMBERS = count()
 

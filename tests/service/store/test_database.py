@@ -19,11 +19,11 @@ from alembic.util import CommandError
 from sqlalchemy import text
 
 from clients.errors import SessionNotFound
-from service import migrations
-from service.database import _keep_a_journal, connect
-from service.sql_store import SqlStore
-from service.store import StoreUnavailable
-from service.tables import metadata
+from service.keeping import migrations
+from service.keeping.database import _keep_a_journal, connect
+from service.keeping.sql_store import SqlStore
+from service.keeping.store import StoreUnavailable
+from service.keeping.tables import metadata
 from tests.service.conftest import problem, serve
 from tests.service.store.conftest import added, all_of, check_chain, opened
 
@@ -189,7 +189,7 @@ async def test_a_database_that_is_not_there_is_unavailable(tmp_path):
 async def test_while_another_process_holds_the_file_nothing_is_acknowledged_and_then_it_goes_on(
     tmp_path, monkeypatch, good_frame
 ):
-    monkeypatch.setattr("service.database.BUSY_TIMEOUT_S", 0.05)
+    monkeypatch.setattr("service.keeping.database.BUSY_TIMEOUT_S", 0.05)
     path = tmp_path / "robosac.db"
     async with serve(database_url=f"sqlite:///{path}") as served:
         session = await served.open()

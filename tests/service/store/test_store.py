@@ -8,7 +8,7 @@ import pytest
 import rfc8785
 from sqlalchemy import text
 
-from service.store import FrameDecided, SessionChanged, SessionOver
+from service.keeping.store import FrameDecided, SessionChanged, SessionOver
 from tests.service.store.conftest import a_session, added, all_of, check_chain, decided, opened
 
 LATER = time.time() + 3600
@@ -211,7 +211,7 @@ async def test_a_store_learns_of_a_conflict_what_the_other_did(shared_url):
 
 
 async def test_many_sessions_are_remembered_but_not_all(store, monkeypatch):
-    monkeypatch.setattr("service.sql_store.REMEMBERED", 3)
+    monkeypatch.setattr("service.keeping.sql_store.REMEMBERED", 3)
     sids = [await added(store, number) for number in range(5)]
     assert [store.seen(sid) is None for sid in sids] == [True, True, False, False, False]
     assert (await store.get(sids[0])).session_id == sids[0]

@@ -8,8 +8,8 @@ from alembic import command
 from alembic.config import Config
 
 from robosac.extras import MissingExtra
-from service import migrations
-from service.database import connect
+from service.keeping import migrations
+from service.keeping.database import connect
 
 URL = "postgresql://user:password@nowhere/gateway"
 MESSAGE = "asyncpg is not installed, for PostgreSQL: pip install 'robosac[postgresql]'"

@@ -16,15 +16,15 @@ from robosac.audit import commitment
 from robosac.audit.events import FrameAnswered
 from robosac.defenses import Rejection
 from robosac.fusion import FusionResult
-from service.admission import Admission
+from service.deciding.admission import Admission
 from service.engine import Engine
-from service.gathering import Received
-from service.live import Caller
-from service.metrics import Metrics
+from service.keeping.store import SessionChanged, SessionRecord
 from service.problems import Problem
-from service.sessions import Sessions
-from service.store import SessionChanged, SessionRecord
-from service.tracing import Tracing
+from service.sessions.gathering import Received
+from service.sessions.live import Caller
+from service.sessions.sessions import Sessions
+from service.watching.metrics import Metrics
+from service.watching.tracing import Tracing
 
 logger = structlog.stdlib.get_logger(__name__)
 

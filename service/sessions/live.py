@@ -11,9 +11,9 @@ from dataclasses import dataclass, field
 
 from robosac.detectors import Detector, Role
 from robosac.session import Session
-from service.gathering import Gathering
-from service.motion import Motion
-from service.store import SessionRecord
+from service.keeping.store import SessionRecord
+from service.sessions.gathering import Gathering
+from service.sessions.motion import Motion
 
 REFUSALS_LOGGED = 16
 """Refused messages of one vehicle between two frames that get a record each; the others are counted."""

@@ -10,11 +10,11 @@ import structlog
 
 from robosac.answers import Reason
 from robosac.audit.events import AccessRefused, Equivocation, Event, MessageRefused, Proof
-from service.gathering import Received
-from service.identity import TokenRefused
-from service.live import REFUSALS_LOGGED, STRANGERS, Caller, LiveSession
-from service.metrics import Metrics
-from service.store import SessionOver, Store
+from service.keeping.store import SessionOver, Store
+from service.sessions.gathering import Received
+from service.sessions.identity import TokenRefused
+from service.sessions.live import REFUSALS_LOGGED, STRANGERS, Caller, LiveSession
+from service.watching.metrics import Metrics
 
 logger = structlog.stdlib.get_logger(__name__)
 

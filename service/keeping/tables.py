@@ -1,4 +1,4 @@
-"""The one schema of SQLite and PostgreSQL; `service.migrations` brings a database there."""
+"""The one schema of SQLite and PostgreSQL; `service.keeping.migrations` brings a database there."""
 
 from __future__ import annotations
 

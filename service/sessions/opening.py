@@ -15,13 +15,13 @@ from robosac.defenses import DefenseSettings, State
 from robosac.detectors import Detector, DetectorInfo
 from robosac.session import default_defense, defense_for
 from service.engine import Engine
-from service.identity import Tokens
-from service.metrics import Metrics
+from service.keeping.store import SessionRecord, Store
 from service.problems import Problem
 from service.schemas import DetectorEntry, SessionCreated, SessionRequest
-from service.sessions import Sessions, check_size
+from service.sessions.identity import Tokens
+from service.sessions.sessions import Sessions, check_size
 from service.settings import Settings
-from service.store import SessionRecord, Store
+from service.watching.metrics import Metrics
 
 logger = structlog.stdlib.get_logger(__name__)
 

@@ -13,7 +13,7 @@ from fastapi import Request
 from fastapi.exceptions import RequestValidationError
 from pydantic import BaseModel, ValidationError
 
-from service.limits import read_bounded
+from service.arriving.limits import read_bounded
 from service.problems import Problem
 
 JSON = "application/json"
@@ -49,7 +49,7 @@ async def read_json(request: Request, model: type[Model], context: Any = None) -
     Raises
     ------
     Problem
-        413, 415, or as `service.limits.read_bounded`.
+        413, 415, or as `service.arriving.limits.read_bounded`.
     RequestValidationError
         If it is not JSON, or not what the model says.
     """

@@ -16,18 +16,7 @@ from robosac.budget import DomainError
 from robosac.defenses import known, read_settings, suspicion_in
 from robosac.session import Session, defense_for
 from service.engine import Engine
-from service.gathering import Backlog, Gathering
-from service.identity import TokenRefused, Tokens
-from service.journal import Journal
-from service.live import Caller, LiveSession
-from service.metrics import Metrics
-from service.motion import Motion
-from service.problems import Problem
-from service.schemas import (
-    SessionState,
-)
-from service.settings import Settings
-from service.store import (
+from service.keeping.store import (
     FrameDecided,
     SessionOver,
     SessionRecord,
@@ -35,6 +24,17 @@ from service.store import (
     StoreUnavailable,
     new_seed,
 )
+from service.problems import Problem
+from service.schemas import (
+    SessionState,
+)
+from service.sessions.gathering import Backlog, Gathering
+from service.sessions.identity import TokenRefused, Tokens
+from service.sessions.journal import Journal
+from service.sessions.live import Caller, LiveSession
+from service.sessions.motion import Motion
+from service.settings import Settings
+from service.watching.metrics import Metrics
 
 logger = structlog.stdlib.get_logger(__name__)
 

@@ -12,10 +12,10 @@ from typing import Any
 from sqlalchemy import Connection, Row, bindparam, delete, func, insert, select, text, update
 
 from robosac.audit import digest, seal
-from service import migrations
-from service.database import connect
-from service.store import AuditEvent, FrameDecided, SessionChanged, SessionOver, SessionRecord
-from service.tables import audit_lines, kept_messages, secrets, sessions
+from service.keeping import migrations
+from service.keeping.database import connect
+from service.keeping.store import AuditEvent, FrameDecided, SessionChanged, SessionOver, SessionRecord
+from service.keeping.tables import audit_lines, kept_messages, secrets, sessions
 
 REMEMBERED = 4096
 """Sessions that `SqlStore.seen` knows."""
@@ -51,7 +51,7 @@ Change = Callable[[SessionRecord], Mapping[str, Any]]
 
 
 class SqlStore:
-    """`service.store.Store` on a database.
+    """`service.keeping.store.Store` on a database.
 
     Every method is a transaction that holds the session's row while it numbers and seals the log's next line, so that
     a log never has two ends. `get` always asks the database; what the methods learn of a session, `seen` tells.
@@ -59,7 +59,7 @@ class SqlStore:
     Parameters
     ----------
     url : str
-        As `service.database.read_url`.
+        As `service.keeping.database.read_url`.
 
     Raises
     ------

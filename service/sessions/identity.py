@@ -21,9 +21,9 @@ import jwt
 from starlette.datastructures import Headers
 from starlette.types import ASGIApp, Receive, Scope, Send
 
+from service.keeping.store import SessionRecord, Store
 from service.problems import Problem
 from service.settings import Settings
-from service.store import SessionRecord, Store
 
 API_KEY_LENGTH = 16
 SECRET_LENGTH = 32

@@ -13,14 +13,14 @@ from robosac.audit.events import Proof
 from robosac.defenses import Rejection
 from robosac.detectors import Role
 from robosac.signatures import is_valid, read_public_key
-from service.admission import Admission
-from service.deciding import Asked, Deciding
-from service.gathering import Equivocation, Received, Refused
-from service.live import Caller
-from service.metrics import Metrics
+from service.deciding.admission import Admission
+from service.deciding.answering import Asked, Deciding
 from service.problems import Problem
 from service.schemas import Receipt
-from service.sessions import Sessions
+from service.sessions.gathering import Equivocation, Received, Refused
+from service.sessions.live import Caller
+from service.sessions.sessions import Sessions
+from service.watching.metrics import Metrics
 
 logger = structlog.stdlib.get_logger(__name__)
 

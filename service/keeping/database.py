@@ -28,7 +28,7 @@ from sqlalchemy.pool import QueuePool
 
 from robosac.extras import need
 from robosac.faults import describe
-from service.store import StoreUnavailable
+from service.keeping.store import StoreUnavailable
 
 logger = logging.getLogger(__name__)
 

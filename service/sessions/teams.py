@@ -6,13 +6,13 @@ from collections.abc import Mapping, Sequence
 
 from robosac.audit.events import TeamChanged, TokenRenewed
 from robosac.budget import DomainError
-from service.identity import Tokens, unauthenticated
-from service.live import Caller
+from service.keeping.store import SessionChanged, SessionOver, SessionRecord, Store
 from service.problems import Problem
 from service.schemas import ChangedTeam, RenewedToken
-from service.sessions import Sessions, check_size, over
+from service.sessions.identity import Tokens, unauthenticated
+from service.sessions.live import Caller
+from service.sessions.sessions import Sessions, check_size, over
 from service.settings import Settings
-from service.store import SessionChanged, SessionOver, SessionRecord, Store
 
 MAX_RENEWALS = 16
 """Tokens that a vehicle may take between two frames: each leaves a record."""

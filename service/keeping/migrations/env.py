@@ -8,10 +8,10 @@ from alembic import context
 from sqlalchemy import Connection
 
 from robosac.extras import MissingExtra
-from service.database import connect
-from service.migrations import lock
+from service.keeping.database import connect
+from service.keeping.migrations import lock
+from service.keeping.tables import metadata
 from service.settings import Settings
-from service.tables import metadata
 
 
 def _run(connection: Connection) -> None:

@@ -1,0 +1,1 @@
+"""What comes in: bounded, read once its sender is known, checked."""

@@ -1,0 +1,1 @@
+"""What tells of the gateway: logs, metrics, traces."""
