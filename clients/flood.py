@@ -72,6 +72,8 @@ class Refusals:
         Of bodies, that the gateway's side took off the strangers' hands.
     refused_ms : list of float
         From a connection's beginning to its 401, or 503 where the gateway is busy.
+    hung_up : int
+        Requests whose connection was closed while their bodies were on the way, before the answer was read.
     others : mapping of str to int
         What came instead: a status, or what went wrong.
     """
@@ -79,6 +81,7 @@ class Refusals:
     sent: int = 0
     taken_bytes: int = 0
     refused_ms: list[float] = field(default_factory=list)
+    hung_up: int = 0
     others: dict[str, int] = field(default_factory=dict)
 
     def answered(self, status: int, milliseconds: float) -> None:
@@ -141,6 +144,11 @@ async def _send(url: str, head: bytes, with_body: bool, refusals: Refusals) -> N
                     await sending
             finally:
                 writer.close()
+    except (BrokenPipeError, ConnectionResetError) as error:
+        if with_body:
+            refusals.hung_up += 1
+        else:
+            refusals.failed(type(error).__name__)
     except (OSError, TimeoutError, asyncio.IncompleteReadError, ValueError) as error:
         refusals.failed(type(error).__name__)
 
@@ -200,6 +208,7 @@ def show(console: Console, results: dict[Strangers, tuple[Figures, Refusals]]) -
                 "strangers' requests": str(refusals.sent),
                 "refused": str(len(refusals.refused_ms)),
                 "refusal, ms: p50, p99": f"{p50:.1f}, {p99:.1f}" if refusals.refused_ms else "-",
+                "hung up on": str(refusals.hung_up),
                 "anything else": ", ".join(f"{name}: {n}" for name, n in refusals.others.items()) or "-",
             }
         )

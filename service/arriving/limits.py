@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import asyncio
+import math
 
 from fastapi import Request
 from starlette.datastructures import Headers
@@ -14,6 +15,8 @@ from service.problems import Problem
 TARGET_BYTES = 2048
 HEADERS = 128
 HEADER_BYTES = 32 * 1024
+UNREAD_BYTES = 2**21
+"""If more of a body is left when its request is answered, the connection is closed: to take the rest costs time."""
 
 
 def too_large(limit: int) -> Problem:
@@ -74,7 +77,7 @@ def _absurd_head(scope: Scope) -> Problem | None:
 
 class BodyLimit:
     """Bounds every body, whatever route reads it: 413 by its announced length, else when it outgrows the limit; 408 if
-    it is not there in time.
+    it is not there in time. Hangs up where much of a body was not wanted.
 
     Parameters
     ----------
@@ -94,11 +97,10 @@ class BodyLimit:
         if scope["type"] != "http":
             await self._app(scope, receive, send)
             return
-        if announced_bytes(Headers(scope=scope)) > self._limit:
-            await too_large(self._limit).response()(scope, receive, send)
-            return
+        headers = Headers(scope=scope)
+        announced = announced_bytes(headers)
         taken = 0
-        complete = False
+        complete = announced == 0 and "transfer-encoding" not in headers
         end: float | None = None
 
         async def bounded() -> Message:
@@ -120,4 +122,14 @@ class BodyLimit:
                 raise too_large(self._limit)
             return message
 
-        await self._app(scope, bounded, send)
+        async def hanging_up(message: Message) -> None:
+            if message["type"] == "http.response.start" and not complete:
+                left = math.inf if announced == 0 else announced - taken
+                if left > UNREAD_BYTES and "connection" not in Headers(raw=message["headers"]):
+                    message = {**message, "headers": [*message["headers"], (b"connection", b"close")]}
+            await send(message)
+
+        if announced > self._limit:
+            await too_large(self._limit).response()(scope, receive, hanging_up)
+        else:
+            await self._app(scope, bounded, hanging_up)

@@ -112,7 +112,8 @@ class LoopbackOnly:
             await self._app(scope, receive, send)
             return
         detail = "without an API key the gateway serves its own machine only; set ROBOSAC_API_KEYS"
-        await Problem(403, "loopback-only", detail).response()(scope, receive, send)
+        refusal = Problem(403, "loopback-only", detail, headers={"Connection": "close"})  # and takes no body
+        await refusal.response()(scope, receive, send)
 
 
 def is_local(scope: Scope) -> bool:

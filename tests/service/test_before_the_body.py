@@ -12,7 +12,7 @@ from robosac.signatures import show_public_key
 from service import schemas
 from service.app import create_app
 from service.arriving import bodies
-from service.arriving.limits import HEADER_BYTES, HEADERS, TARGET_BYTES
+from service.arriving.limits import HEADER_BYTES, HEADERS, TARGET_BYTES, UNREAD_BYTES
 from service.settings import Settings
 from tests.service.conftest import problem, serve
 from tests.service.test_identity import ANYBODY, EGO_ONLY, KEY, KEY_HOLDER, OTHER_KEY, RULES, bearer
@@ -51,6 +51,36 @@ async def test_strangers_are_refused_from_their_headers_alone(route, media_type)
 @pytest.mark.parametrize("route", [route for route, rule in RULES.items() if rule == ANYBODY])
 async def test_a_body_that_nobody_needs_is_not_read(route, served):
     assert (await head(served, *route.split(), "application/json", Settings().max_body_bytes)).status_code == 200
+
+
+@pytest.mark.parametrize(
+    ("size", "token", "closes"),
+    [(UNREAD_BYTES + 1, None, True), (32 * 2**20, None, True), (33 * 2**20, None, True), (UNREAD_BYTES, None, False)],
+)
+async def test_a_large_body_that_is_not_wanted_is_not_waited_for(size, token, closes):
+    async with serve(api_key=KEY, api_keys=KEY) as served:
+        session = await served.open()
+        for path in ("/v1/sessions", f"/v1/sessions/{session.session_id}/frames"):
+            refused = await head(served, "POST", path, "application/vnd.msgpack", size, token)
+            assert refused.status_code in (401, 413)
+            assert (refused.headers.get("connection") == "close") is closes
+        assert "connection" not in (await served.http.get("/healthz")).headers
+
+
+async def test_a_body_of_unknown_length_is_not_waited_for_either_unless_it_was_read(good_frame):
+    async def sent(body):
+        yield body
+
+    async with serve() as served:
+        session = await served.open()
+        path = f"/v1/sessions/{session.session_id}/frames"
+        headers = {"Content-Type": "application/vnd.msgpack"}
+        refused = await served.http.post(path, content=unread(), headers=headers)
+        assert (refused.status_code, refused.headers["connection"]) == (401, "close")
+        answered = await served.http.post(
+            path, content=sent(good_frame(0)), headers=headers | bearer(session.ego_token)
+        )
+        assert (answered.status_code, "connection" in answered.headers) == (200, False)
 
 
 def test_no_route_leaves_its_body_to_the_framework():
