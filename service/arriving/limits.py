@@ -99,8 +99,9 @@ class BodyLimit:
             return
         headers = Headers(scope=scope)
         announced = announced_bytes(headers)
+        unannounced = announced == 0 and "transfer-encoding" in headers
         taken = 0
-        complete = announced == 0 and "transfer-encoding" not in headers
+        complete = False
         end: float | None = None
 
         async def bounded() -> Message:
@@ -124,7 +125,7 @@ class BodyLimit:
 
         async def hanging_up(message: Message) -> None:
             if message["type"] == "http.response.start" and not complete:
-                left = math.inf if announced == 0 else announced - taken
+                left = math.inf if unannounced else announced - taken
                 if left > UNREAD_BYTES and "connection" not in Headers(raw=message["headers"]):
                     message = {**message, "headers": [*message["headers"], (b"connection", b"close")]}
             await send(message)

@@ -102,6 +102,30 @@ async def test_a_slow_body_is_cut_off(messages, benign):
         problem(opening, 408, "slow-body")
 
 
+@pytest.mark.parametrize("length", [None, "0", "+5", "9" * 30])
+async def test_a_body_is_bounded_whatever_its_headers_say(length):
+    """Servers refuse such headers themselves; nothing here rests on it."""
+
+    async def dripping():
+        for _ in range(30):
+            yield b" "
+            await asyncio.sleep(0.05)
+
+    async def call(served, body):
+        headers = {"content-type": "application/json"} | ({} if length is None else {"content-length": length})
+        return await served.http.post("/v1/sessions", content=body, headers=headers)
+
+    async with serve(body_timeout_s=0.2) as served:
+        problem(await call(served, dripping()), 408, "slow-body")
+    async with serve(max_body_bytes=2048) as served:
+        problem(await call(served, _endless()), 413, "too-large")
+
+
+async def _endless():
+    for _ in range(1000):
+        yield bytes(1024)
+
+
 async def test_opening_sessions_costs_little_and_ends_at_the_limit():
     async with serve(max_sessions=300) as served:
         for number in range(300):
