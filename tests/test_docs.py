@@ -10,9 +10,8 @@ from typer.testing import CliRunner
 
 import robosac
 from clients.simulation import Fleet
-from robosac import attacks, defenses, detectors
+from robosac import attacks, defenses, detectors, plugins
 from robosac.cli import app
-from robosac.defenses import registry
 from service.settings import Settings
 from tests.service.conftest import serve
 
@@ -62,7 +61,7 @@ def test_the_table_of_defences_is_what_they_say_of_themselves():
 def test_the_page_on_defences_knows_all_that_one_has_to_have():
     text = (ROOT / "docs" / "own-defense.md").read_text()
     (table,) = re.findall(r"^\| it has .*?\n\n", text, re.MULTILINE | re.DOTALL)
-    for part in registry._PARTS:
+    for part in plugins.parts(defenses.Defense):
         assert f"`{part}" in table
 
 

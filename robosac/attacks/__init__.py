@@ -2,7 +2,8 @@
 
 from __future__ import annotations
 
-from robosac import references
+from collections.abc import Mapping
+
 from robosac.attacks.adaptive import Erase, Invent, InventSteady, Shift
 from robosac.attacks.base import Attack, IterativeAttack, Knowledge, inverted_pseudo_truth
 from robosac.attacks.campaign import BEHAVIOURS, HONEST, SEPARATOR, Campaign
@@ -11,22 +12,11 @@ from robosac.attacks.geometric import NoGeometry
 from robosac.attacks.gradient import BIM, PGD
 from robosac.attacks.noise import GaussianNoise
 from robosac.attacks.still import EraseStill, InventStill, ShiftStill
+from robosac.plugins import Kind
 
-_ALL: tuple[type[Attack], ...] = (
-    PGD,
-    BIM,
-    CarliniWagner,
-    GaussianNoise,
-    Erase,
-    EraseStill,
-    Invent,
-    InventStill,
-    InventSteady,
-    Shift,
-    ShiftStill,
-)
-ATTACKS: dict[str, type[Attack]] = {attack.name: attack for attack in _ALL}
-"""All attacks by name."""
+KIND: Kind[Attack] = Kind("attack", __name__, Attack)
+ATTACKS: Mapping[str, type[Attack]] = dict(sorted(KIND.shipped.items()))
+"""All attacks that ship, by name."""
 
 
 CAMPAIGN_HELP = (
@@ -42,22 +32,15 @@ def load(attack: str) -> Attack:
     Parameters
     ----------
     attack : str
-        A name of `ATTACKS`, or ``module:callable``, where the callable takes no arguments and returns an attack of the
-        user's own.
+        A name of `ATTACKS`, an entry point of the group ``robosac.attacks``, or ``module:callable``, where the callable
+        takes no arguments and returns an attack.
 
     Raises
     ------
     ValueError
         If there is no such attack.
     """
-    if attack in ATTACKS:
-        return ATTACKS[attack]()
-    if not references.is_reference(attack):
-        raise ValueError(f"unknown attack {attack!r}; known: {', '.join(ATTACKS)}; or give module:callable")
-    made = references.make(attack)
-    if not isinstance(made, Attack):
-        raise ValueError(f"{attack} made no attack but {made!r:.200}")
-    return made
+    return KIND.make(attack)
 
 
 def load_campaign(spec: str) -> Campaign:

@@ -6,7 +6,7 @@ import hashlib
 import json
 from collections.abc import Collection, Mapping, Sequence
 from pathlib import Path
-from typing import Any
+from typing import Any, ClassVar
 
 import numpy as np
 import torch
@@ -90,6 +90,8 @@ class EmbeddedDetector:
     WeightsError
         If the file is missing, damaged, or of another network.
     """
+
+    name: ClassVar[str] = NAME
 
     def __init__(self, weights: Path = SHIPPED_WEIGHTS) -> None:
         tensors, self.recipe = read_weights(weights)

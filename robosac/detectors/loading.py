@@ -2,23 +2,22 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable
 from pathlib import Path
 
-from robosac import references
 from robosac.detectors.base import Detector
 from robosac.detectors.embedded import NAME as EMBEDDED
 from robosac.detectors.embedded import EmbeddedDetector, WeightsError, read_weights
 from robosac.detectors.v2xsim import FAMILY as V2XSIM
 from robosac.detectors.v2xsim import V2XSimDetector
+from robosac.plugins import Kind
 
-_REGISTRY: dict[str, Callable[[], Detector]] = {EMBEDDED: EmbeddedDetector}
+DETECTORS: Kind[Detector] = Kind("detector", str(__package__), Detector, forms="a weights file, or module:callable")
 DEFAULT_DETECTOR = EMBEDDED
 
 
 def available() -> tuple[str, ...]:
     """Names of the detectors whose weights ship."""
-    return tuple(_REGISTRY)
+    return tuple(DETECTORS.shipped)
 
 
 def load(detector: str = DEFAULT_DETECTOR) -> Detector:
@@ -27,8 +26,8 @@ def load(detector: str = DEFAULT_DETECTOR) -> Detector:
     Parameters
     ----------
     detector : str
-        A name of `available`, the path of a weights file, or ``module:callable``, where the callable takes no arguments
-        and returns a detector of the user's own.
+        A name of `available`, the path of a weights file, an entry point of the group ``robosac.detectors``, or
+        ``module:callable``, where the callable takes no arguments and returns a detector.
 
     Raises
     ------
@@ -37,18 +36,9 @@ def load(detector: str = DEFAULT_DETECTOR) -> Detector:
     ValueError
         If there is no such detector.
     """
-    if detector in _REGISTRY:
-        return _REGISTRY[detector]()
-    if references.is_reference(detector):
-        made = references.make(detector)
-        if not isinstance(made, Detector):
-            raise ValueError(f"{detector} made no detector but {made!r:.200}")
-        return made
-    if not Path(detector).exists():
-        raise ValueError(
-            f"no detector {detector!r}: give one of {', '.join(available())}, a weights file, or module:callable"
-        )
-    return _open_weights(Path(detector))
+    if detector not in DETECTORS.shipped and Path(detector).exists():
+        return _open_weights(Path(detector))
+    return DETECTORS.make(detector)
 
 
 def _open_weights(path: Path) -> Detector:

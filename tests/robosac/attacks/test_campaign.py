@@ -127,7 +127,7 @@ def test_campaigns_by_name():
 @pytest.mark.parametrize(
     ("spec", "complaint"),
     [
-        ("nonesuch@asleep", "unknown attack 'nonesuch'"),
+        ("nonesuch@asleep", "no attack 'nonesuch'"),
         ("pgd@nonesuch", "unknown behaviour 'nonesuch'; known: asleep"),
         ("noise@framing", "only an attack that optimises"),
         ("honest@covering", "only an attack that optimises can have an alibi, not honest"),

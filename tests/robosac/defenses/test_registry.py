@@ -134,11 +134,11 @@ def test_the_defences_that_ship():
 def test_a_new_file_is_all_that_a_new_defence_needs(tmp_path, monkeypatch):
     (tmp_path / "halves.py").write_text(FILE)
     monkeypatch.setattr(defenses, "__path__", [*defenses.__path__, str(tmp_path)])
-    shipped.cache_clear()
+    vars(registry.DEFENSES).pop("shipped", None)
     try:
         assert build({"kind": "halves", "consensus_threshold": 0.4}) == defenses.Halving(consensus_threshold=0.4)
     finally:
-        shipped.cache_clear()
+        del vars(registry.DEFENSES)["shipped"]
         del sys.modules["robosac.defenses.halves"], defenses.halves
 
 
@@ -159,7 +159,7 @@ def test_a_reference_gives_settings():
         ("nonesuch", "no defence 'nonesuch': give one of a2cp, .*, or module:callable"),
         ("nonesuch:Thing", "No module named 'nonesuch'"),
         ("own:missing", "no attribute 'missing'"),
-        ("own:number", "own:number made no defence but 7: it has to derive from DefenseSettings"),
+        ("own:number", "own:number made no defence but 7, which has to derive from DefenseSettings"),
         ("own:Undefended", "has to derive from DefenseSettings"),
         ("own:Mute", "own:Mute .* which lacks converse .The conversation about one frame with the teammates present"),
         ("own:Vague", "kind has to be a Literal of one name"),
@@ -193,7 +193,7 @@ def test_an_installed_package_can_offer_a_defence(tmp_path, monkeypatch):
     info = tmp_path / "mine-1.0.dist-info"
     info.mkdir()
     (info / "METADATA").write_text("Metadata-Version: 2.1\nName: mine\nVersion: 1.0\n")
-    (info / "entry_points.txt").write_text(f"[{registry.GROUP}]\nwhole = own:Whole\nmisnamed = own:Whole\n")
+    (info / "entry_points.txt").write_text(f"[{registry.DEFENSES.package}]\nwhole = own:Whole\nmisnamed = own:Whole\n")
     assert "whole" not in known()
     with pytest.raises(DomainError, match="no defence of kind 'whole'"):
         read_settings({"kind": "whole"})

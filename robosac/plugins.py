@@ -1,0 +1,147 @@
+"""What can be added by one file: defences, attacks, detectors, scene sources.
+
+Nothing lists them. `Kind` finds one by its name: a class in a module of the kind's package, an entry point of an
+installed package, or the user's own ``module:callable``. What is found is checked, so that its author learns which
+method is missing and what it is for. The code of what is found is run: never take a name from a stranger.
+"""
+
+from __future__ import annotations
+
+import inspect
+import pkgutil
+import re
+from collections.abc import Callable, Mapping
+from dataclasses import dataclass
+from functools import cached_property
+from importlib import import_module
+from importlib.metadata import entry_points
+from typing import Any, Generic, TypeVar
+
+T = TypeVar("T")
+
+_REFERENCE = re.compile(r"[\w.]+:[\w.]+")
+
+
+def own_name(candidate: type) -> str:
+    """The class's own attribute ``name``; empty if it has none, or if it is abstract."""
+    name = vars(candidate).get("name")
+    return name if isinstance(name, str) and not inspect.isabstract(candidate) else ""
+
+
+@dataclass(frozen=True)
+class Kind(Generic[T]):
+    """Things of one kind, such as attacks.
+
+    Attributes
+    ----------
+    noun : str
+        What one of them is called in messages.
+    package : str
+        Whose modules hold those that ship. Other packages offer theirs as entry points of the group of that name.
+    contract : type
+        What each has to be: a protocol, or a class to derive from.
+    name_of : callable
+        The name of a class that is found in the package; empty if it is none of this kind.
+    takes_argument : bool
+        Whether ``name:argument`` is a way to ask for one.
+    forms : str
+        Other ways to ask for one than a name, for messages.
+    error : type
+        Raised where one cannot be had.
+    """
+
+    noun: str
+    package: str
+    contract: type[Any]
+    name_of: Callable[[type[Any]], str] = own_name
+    takes_argument: bool = False
+    forms: str = "or module:callable"
+    error: type[ValueError] = ValueError
+
+    @cached_property
+    def shipped(self) -> Mapping[str, type[T]]:
+        """The classes that ship, by name, in the order of their modules.
+
+        Raises
+        ------
+        error
+            If two have the same name.
+        """
+        found: dict[str, type[T]] = {}
+        for entry in pkgutil.iter_modules(import_module(self.package).__path__):
+            module = import_module(f"{self.package}.{entry.name}")
+            for value in vars(module).values():
+                own = isinstance(value, type) and value.__module__.startswith(module.__name__)
+                if own and (name := self.name_of(value)) and found.setdefault(name, value) is not value:
+                    raise self.error(f"there are two {self.noun}s {name!r}: {found[name]} and {value}")
+        return found
+
+    def make(self, text: str) -> T:
+        """The one that a text asks for.
+
+        Parameters
+        ----------
+        text : str
+            A name of `shipped` or of an entry point, after which ``:argument`` may stand if the kind takes one; or
+            ``module:callable``. What has that name is called, with the argument if there is one.
+
+        Raises
+        ------
+        error
+            If there is no such thing, the user's code fails, or what it returns is none of this kind.
+        """
+        name, *arguments = text.split(":", 1) if self.takes_argument else [text]
+        own: Callable[..., T] | None = self.shipped.get(name)
+        made = own(*arguments) if own is not None else self._foreign(name, arguments, text)
+        self.check(made, self.contract, text)
+        return made
+
+    def check(self, candidate: object, contract: type[Any], who: str) -> None:
+        """Refuse what does not fulfil a contract, with what it lacks; ``who`` made it."""
+        faults = [lacks(candidate, contract)]
+        if not _is_protocol(contract) and not isinstance(candidate, contract):
+            faults.insert(0, f"has to derive from {contract.__name__}")
+        if any(faults):
+            said = " and ".join(filter(None, faults))
+            raise self.error(f"{who} made no {self.noun} but {candidate!r:.100}, which {said}")
+
+    def _foreign(self, name: str, arguments: list[str], text: str) -> T:
+        offered = next((f"{point.module}:{point.attr}" for point in entry_points(group=self.package, name=name)), None)
+        if offered is None and not _REFERENCE.fullmatch(text):
+            raise self.error(f"no {self.noun} {text!r}: give one of {', '.join(self.shipped)}, {self.forms}")
+        try:
+            made: T = pkgutil.resolve_name(text)() if offered is None else pkgutil.resolve_name(offered)(*arguments)
+        except Exception as error:  # the user's code may raise anything
+            said = " ".join(str(error).split())
+            raise self.error(f"{text}: {type(error).__name__}: {said}") from error
+        return made
+
+
+def parts(contract: type[Any]) -> dict[str, str]:
+    """What an object needs to have to fulfil a contract, and what each part is for.
+
+    Returns
+    -------
+    mapping of name to str
+        All public methods and properties of a protocol, the abstract ones of a class, each with the first line of its
+        docstring.
+    """
+    protocol = _is_protocol(contract)
+    return {
+        name: (inspect.getdoc(part) or "").partition("\n")[0]
+        for base in reversed(contract.__mro__)
+        for name, part in vars(base).items()
+        if not name.startswith("_")
+        and (callable(part) or isinstance(part, property))
+        and (protocol or getattr(part, "__isabstractmethod__", False))
+    }
+
+
+def lacks(candidate: object, contract: type[Any]) -> str:
+    """The parts of a contract that an object lacks, with what each is for; empty if it has all."""
+    missing = [f"{name} ({purpose})" for name, purpose in parts(contract).items() if not hasattr(candidate, name)]
+    return f"lacks {', '.join(missing)}" if missing else ""
+
+
+def _is_protocol(contract: type[Any]) -> bool:
+    return bool(getattr(contract, "_is_protocol", False))

@@ -1,0 +1,133 @@
+"""The one way in which defences, attacks, detectors and scene sources are found."""
+
+import sys
+from abc import ABC, abstractmethod
+from typing import Protocol
+
+import pytest
+
+from robosac.plugins import Kind, lacks, parts
+
+FILES = {
+    "__init__": "",
+    "square": "class Square:\n    name = 'square'\n    def area(self): return 4.0\n",
+    "others": (
+        "from house.square import Square\n"
+        "class Nameless:\n    pass\n"
+        "class Sized:\n"
+        "    name = 'sized'\n"
+        "    def __init__(self, size='1'): self.size = float(size)\n"
+        "    def area(self): return self.size\n"
+        "class Wall:\n    name = 'wall'\n"
+        "class Derived(Sized):\n    pass\n"
+        "def fail(): raise KeyError('two\\nlines')\n"
+    ),
+}
+
+
+class Shape(Protocol):
+    """A shape."""
+
+    def area(self) -> float:
+        """Square metres.
+
+        More of it.
+        """
+        ...
+
+
+class Room(ABC):
+    @abstractmethod
+    def door(self):
+        """The way in."""
+
+    def window(self):
+        return "not needed"
+
+
+@pytest.fixture
+def house(tmp_path, monkeypatch):
+    """A package of shapes; the folder that it is in is on Python's path."""
+    (tmp_path / "house").mkdir()
+    for name, text in FILES.items():
+        (tmp_path / "house" / f"{name}.py").write_text(text)
+    monkeypatch.syspath_prepend(tmp_path)
+    yield tmp_path
+    for name in [name for name in sys.modules if name.partition(".")[0] == "house"]:
+        del sys.modules[name]
+
+
+def shapes(**options):
+    return Kind("shape", "house", Shape, **options)
+
+
+@pytest.mark.usefixtures("house")
+def test_the_modules_of_a_package_are_searched_for_classes_with_a_name_of_their_own():
+    assert list(shapes().shipped) == ["sized", "wall", "square"]
+    assert shapes().make("square").area() == 4.0
+
+
+def test_a_new_file_is_found(house):
+    (house / "house" / "added.py").write_text("class Added:\n    name = 'added'\n    def area(self): return 9.0\n")
+    assert shapes().make("added").area() == 9.0
+
+
+def test_two_of_one_name_are_refused(house):
+    (house / "house" / "added.py").write_text("class Added:\n    name = 'square'\n")
+    with pytest.raises(ValueError, match=r"two shapes 'square': .*Added.* and .*Square"):
+        _ = shapes().shipped
+
+
+@pytest.mark.usefixtures("house")
+def test_an_argument_follows_the_name_where_the_kind_takes_one():
+    kind = shapes(takes_argument=True)
+    assert kind.make("sized").area() == 1.0
+    assert kind.make("sized:2.5").area() == 2.5
+    assert kind.make("house.square:Square").area() == 4.0
+    with pytest.raises(ValueError, match=r"no shape 'sized:2\.5/x': .*, or what you like"):
+        shapes(forms="or what you like").make("sized:2.5/x")
+
+
+@pytest.mark.usefixtures("house")
+@pytest.mark.parametrize(
+    ("text", "complaint"),
+    [
+        ("nonesuch", "no shape 'nonesuch': give one of sized, wall, square, or module:callable$"),
+        ("wall", r"wall made no shape but <house.* which lacks area \(Square metres.\)$"),
+        ("house.others:Wall", r"others:Wall made no shape but .* which lacks area"),
+        ("house.others:fail", r"^house.others:fail: KeyError: 'two\\nlines'$"),
+        ("house.others:nothing", "no attribute 'nothing'"),
+        ("elsewhere:shape", "ModuleNotFoundError: No module named 'elsewhere'"),
+    ],
+)
+def test_what_cannot_be_had_is_explained_in_a_line(text, complaint):
+    with pytest.raises(LookupError, match=complaint) as refused:
+        shapes(error=type("Refused", (LookupError, ValueError), {})).make(text)
+    assert "\n" not in str(refused.value)
+
+
+def test_an_installed_package_offers_its_own(house):
+    info = house / "mine-1.0.dist-info"
+    info.mkdir()
+    (info / "METADATA").write_text("Metadata-Version: 2.1\nName: mine\nVersion: 1.0\n")
+    (info / "entry_points.txt").write_text("[house]\nbrought = house.others:Sized\nsquare = house.others:Sized\n")
+    assert shapes().make("brought").area() == 1.0
+    assert shapes(takes_argument=True).make("brought:3").area() == 3.0
+    assert shapes().make("square").area() == 4.0, "what ships keeps its name"
+
+
+def test_a_class_asks_for_its_abstract_methods_and_to_be_derived_from():
+    assert parts(Room) == {"door": "The way in."}
+    assert lacks(7, Room) == "lacks door (The way in.)"
+    with pytest.raises(ValueError, match=r"x made no room but 7, which has to derive from Room and lacks door"):
+        Kind("room", "house", Room).check(7, Room, "x")
+
+
+def test_all_parts_of_a_protocol_are_asked_for_those_inherited_too():
+    class Solid(Shape, Protocol):
+        @property
+        def height(self) -> float:
+            """Metres."""
+
+    assert parts(Solid) == {"area": "Square metres.", "height": "Metres."}
+    assert lacks(7, Solid) == "lacks area (Square metres.), height (Metres.)"
