@@ -10,7 +10,7 @@ from __future__ import annotations
 import inspect
 import pkgutil
 import re
-from collections.abc import Callable, Mapping
+from collections.abc import Callable, Iterator, Mapping
 from dataclasses import dataclass
 from functools import cached_property
 from importlib import import_module
@@ -20,6 +20,15 @@ from typing import Any, Generic, TypeVar
 T = TypeVar("T")
 
 _REFERENCE = re.compile(r"[\w.]+:[\w.]+")
+
+
+def classes(package: str) -> Iterator[type[Any]]:
+    """The classes that the modules of a package define, in the order of the modules; all are imported."""
+    for entry in pkgutil.iter_modules(import_module(package).__path__):
+        module = import_module(f"{package}.{entry.name}")
+        for value in vars(module).values():
+            if isinstance(value, type) and value.__module__.startswith(module.__name__):
+                yield value
 
 
 def own_name(candidate: type) -> str:
@@ -68,12 +77,10 @@ class Kind(Generic[T]):
             If two have the same name.
         """
         found: dict[str, type[T]] = {}
-        for entry in pkgutil.iter_modules(import_module(self.package).__path__):
-            module = import_module(f"{self.package}.{entry.name}")
-            for value in vars(module).values():
-                own = isinstance(value, type) and value.__module__.startswith(module.__name__)
-                if own and (name := self.name_of(value)) and found.setdefault(name, value) is not value:
-                    raise self.error(f"there are two {self.noun}s {name!r}: {found[name]} and {value}")
+        for candidate in classes(self.package):
+            name = self.name_of(candidate)
+            if name and found.setdefault(name, candidate) is not candidate:
+                raise self.error(f"there are two {self.noun}s {name!r}: {found[name]} and {candidate}")
         return found
 
     def make(self, text: str) -> T:

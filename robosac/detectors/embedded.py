@@ -19,7 +19,6 @@ from robosac.detectors.network import FEATURES, MAP, MeanFusionNetwork, fold_bat
 from robosac.detectors.voxels import AREA_M, occupancy
 from robosac.detectors.warp import sampling_matrix, warp
 
-NAME = "intersection-mean"
 SHIPPED_WEIGHTS = Path(__file__).parent / "weights" / "intersection-mean.safetensors"
 ADVERSARIAL_WEIGHTS = SHIPPED_WEIGHTS.with_name("intersection-mean-adversarial.safetensors")
 """The same network after adversarial training against PGD, at the same feature gain: a baseline, not a defence to
@@ -91,7 +90,8 @@ class EmbeddedDetector:
         If the file is missing, damaged, or of another network.
     """
 
-    name: ClassVar[str] = NAME
+    name: ClassVar[str] = "intersection-mean"
+    opens: ClassVar[tuple[str, ...]] = (name,)
 
     def __init__(self, weights: Path = SHIPPED_WEIGHTS) -> None:
         tensors, self.recipe = read_weights(weights)
@@ -99,7 +99,7 @@ class EmbeddedDetector:
         try:
             network.load_state_dict({name: tensor.float() for name, tensor in tensors.items()})
         except RuntimeError as error:
-            raise WeightsError(f"{weights} does not fit the network of {NAME}: {error}") from error
+            raise WeightsError(f"{weights} does not fit the network of {self.name}: {error}") from error
         self._configure(
             network,
             gain=_number(self.recipe, "feature_gain", np.inf),
@@ -137,7 +137,7 @@ class EmbeddedDetector:
         self._score_threshold = score_threshold
         specs = {_TENSOR: _SPEC}
         self._info = DetectorInfo(
-            name=NAME,
+            name=self.name,
             tensors={"ego": specs, "teammate": specs},
             area_m=(-AREA_M, -AREA_M, AREA_M, AREA_M),
             cell_m=2 * AREA_M / MAP,

@@ -1,22 +1,23 @@
-"""Detectors that ship, that weights files are for, or that the user brings along."""
+"""Detectors by name, by a weights file, or brought along by the user.
+
+A class in a module of this package ships under its ``name``, if it has one, and is then made without arguments. One
+that ``opens`` weights files lists the detectors that they are for, and is then made with the file's path.
+"""
 
 from __future__ import annotations
 
 from pathlib import Path
 
 from robosac.detectors.base import Detector
-from robosac.detectors.embedded import NAME as EMBEDDED
 from robosac.detectors.embedded import EmbeddedDetector, WeightsError, read_weights
-from robosac.detectors.v2xsim import FAMILY as V2XSIM
-from robosac.detectors.v2xsim import V2XSimDetector
-from robosac.plugins import Kind
+from robosac.plugins import Kind, classes
 
+DEFAULT_DETECTOR = EmbeddedDetector.name
 DETECTORS: Kind[Detector] = Kind("detector", str(__package__), Detector, forms="a weights file, or module:callable")
-DEFAULT_DETECTOR = EMBEDDED
 
 
 def available() -> tuple[str, ...]:
-    """Names of the detectors whose weights ship."""
+    """Names of the detectors that ship."""
     return tuple(DETECTORS.shipped)
 
 
@@ -44,9 +45,9 @@ def load(detector: str = DEFAULT_DETECTOR) -> Detector:
 def _open_weights(path: Path) -> Detector:
     """The detector that a weights file is for, with those weights."""
     _, recipe = read_weights(path)
-    name = str(recipe.get("detector"))
-    if name == EMBEDDED:
-        return EmbeddedDetector(path)
-    if name.startswith(f"{V2XSIM}-"):
-        return V2XSimDetector(path)
+    name = recipe.get("detector")
+    for candidate in classes(DETECTORS.package):
+        if name in vars(candidate).get("opens", ()):
+            opened: Detector = candidate(path)
+            return opened
     raise WeightsError(f"{path} is for an unknown detector, {name!r}")

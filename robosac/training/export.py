@@ -10,7 +10,7 @@ from typing import Any
 import torch
 from safetensors.torch import save_file
 
-from robosac.detectors.embedded import NAME, tensors_digest
+from robosac.detectors.embedded import EmbeddedDetector, tensors_digest
 from robosac.detectors.network import MeanFusionNetwork
 from robosac.scenes.splits import TRAINING_SEEDS, VALIDATION_SEEDS
 from robosac.training.loop import TrainingConfig
@@ -47,7 +47,7 @@ def export_weights(
     """
     tensors = shipped_tensors(network)
     recipe = {
-        "detector": NAME,
+        "detector": EmbeddedDetector.name,
         "command": command,
         "seed": config.seed,
         "training": asdict(config),

@@ -1,11 +1,15 @@
 """The one way in which defences, attacks, detectors and scene sources are found."""
 
+import shutil
+import subprocess
 import sys
 from abc import ABC, abstractmethod
+from pathlib import Path
 from typing import Protocol
 
 import pytest
 
+import robosac
 from robosac.plugins import Kind, lacks, parts
 
 FILES = {
@@ -131,3 +135,58 @@ def test_all_parts_of_a_protocol_are_asked_for_those_inherited_too():
 
     assert parts(Solid) == {"area": "Square metres.", "height": "Metres."}
     assert lacks(7, Solid) == "lacks area (Square metres.), height (Metres.)"
+
+
+ADDED = {
+    "defenses": """
+from typing import Literal
+from robosac.defenses.settings import ConsensusSettings
+from robosac.defenses.halving import Halving
+
+class Halves(ConsensusSettings):
+    kind: Literal["halves"] = "halves"
+    makes = Halving
+""",
+    "attacks": """
+from robosac.attacks import GaussianNoise
+
+class Louder(GaussianNoise):
+    name = "louder"
+""",
+    "detectors": """
+from robosac.detectors.embedded import EmbeddedDetector
+
+class Twin(EmbeddedDetector):
+    name = "twin"
+    opens = ("other-weights",)
+""",
+}
+USE = """
+import json
+import sys
+import robosac
+from safetensors.torch import save_file
+from robosac import attacks, defenses, detectors
+from robosac.detectors.embedded import SHIPPED_WEIGHTS, read_weights
+
+assert robosac.__file__.startswith(sys.argv[1]), robosac.__file__
+assert defenses.build({"kind": "halves", "consensus_threshold": 0.4}) == defenses.Halving(consensus_threshold=0.4)
+assert attacks.load_campaign("louder@asleep").name == "louder"
+assert "louder" in attacks.CAMPAIGN_HELP
+assert set(detectors.available()) == {"twin", "intersection-mean"}
+assert type(detectors.load("twin")).__name__ == "Twin"
+tensors, recipe = read_weights(SHIPPED_WEIGHTS)
+save_file(tensors, "w.safetensors", metadata={"robosac": json.dumps({**recipe, "detector": "other-weights"})})
+assert type(detectors.load("w.safetensors")).__name__ == "Twin"
+"""
+
+
+def test_one_new_file_is_all_that_a_defence_an_attack_or_a_detector_needs(tmp_path):
+    """In a copy of the package, and in a process of its own."""
+    copy = tmp_path / "robosac"
+    shutil.copytree(Path(robosac.__file__).parent, copy, ignore=shutil.ignore_patterns("__pycache__"))
+    for package, text in ADDED.items():
+        (copy / package / "added.py").write_text(text)
+    command = [sys.executable, "-c", USE, str(tmp_path)]
+    done = subprocess.run(command, check=False, capture_output=True, text=True, cwd=tmp_path, env={"PYTHONPATH": "."})
+    assert done.returncode == 0, done.stderr

@@ -11,7 +11,7 @@ import hashlib
 import json
 from collections.abc import Collection, Mapping
 from pathlib import Path
-from typing import Any
+from typing import Any, ClassVar
 
 import numpy as np
 import torch
@@ -26,8 +26,6 @@ from robosac.detectors.v2xsim.network import FEATURES, MAP, Context, V2XSimNetwo
 from robosac.detectors.v2xsim.voxels import AREA_M, PACKED_SHAPE, BoolArray, occupancy, pack, unpack
 from robosac.detectors.warp import sampling_matrix, warp
 
-FAMILY = "v2x-sim"
-"""A detector of this family is called so and, after a hyphen, by its fusion."""
 _FEATURES = "features"
 _GRID = "grid"
 _MIRROR = np.array([[1.0, -1.0, -1.0], [-1.0, 1.0, 1.0]])
@@ -73,7 +71,7 @@ def name_of(fusion: str) -> str:
     """The name of the detector with a fusion; KeyError if there is no such fusion."""
     if fusion not in FUSIONS:
         raise KeyError(f"no fusion {fusion!r}; known: {', '.join(FUSIONS)}")
-    return f"{FAMILY}-{fusion}"
+    return f"v2x-sim-{fusion}"
 
 
 def mirrored_matrix(ego_pose: FloatArray, pose: FloatArray) -> FloatArray:
@@ -99,13 +97,15 @@ class V2XSimDetector:
         If the file is missing, damaged, or of another network.
     """
 
+    opens: ClassVar[tuple[str, ...]] = tuple(map(name_of, FUSIONS))
+
     def __init__(self, weights: Path) -> None:
         tensors, self.recipe = read_weights(weights)
         fusion = self.recipe.get("fusion", "mean")
         if fusion not in FUSIONS or self.recipe.get("detector") != name_of(fusion):
             raise WeightsError(
                 f"{weights} is for the detector {self.recipe.get('detector')!r} with the fusion {fusion!r}, not one of "
-                f"{', '.join(name_of(known) for known in FUSIONS)}"
+                f"{', '.join(self.opens)}"
             )
         try:
             self._network = V2XSimNetwork(select_published(tensors))

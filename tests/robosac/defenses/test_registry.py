@@ -5,7 +5,6 @@ from typing import Literal
 
 import pytest
 
-from robosac import defenses
 from robosac.budget import DomainError
 from robosac.defenses import (
     A2CP,
@@ -23,16 +22,6 @@ from robosac.defenses import (
     shipped,
 )
 from robosac.defenses.group_testing import CalibrationError
-
-FILE = """
-from typing import Literal
-from robosac.defenses.halving import Halving
-from robosac.defenses.settings import ConsensusSettings
-
-class HalvesSettings(ConsensusSettings):
-    kind: Literal["halves"] = "halves"
-    makes = Halving
-"""
 
 
 class Mute(ConsensusSettings):
@@ -129,17 +118,6 @@ def test_the_defences_that_ship():
         assert load(kind) == model(kind=kind)
         assert model.summary().endswith(".")
         assert model.needs_calibration or build({"kind": kind}).kind == kind
-
-
-def test_a_new_file_is_all_that_a_new_defence_needs(tmp_path, monkeypatch):
-    (tmp_path / "halves.py").write_text(FILE)
-    monkeypatch.setattr(defenses, "__path__", [*defenses.__path__, str(tmp_path)])
-    vars(registry.DEFENSES).pop("shipped", None)
-    try:
-        assert build({"kind": "halves", "consensus_threshold": 0.4}) == defenses.Halving(consensus_threshold=0.4)
-    finally:
-        del vars(registry.DEFENSES)["shipped"]
-        del sys.modules["robosac.defenses.halves"], defenses.halves
 
 
 @pytest.mark.usefixtures("own")
