@@ -10,7 +10,7 @@ from __future__ import annotations
 import inspect
 import pkgutil
 import re
-from collections.abc import Callable, Iterator, Mapping
+from collections.abc import Callable, Collection, Iterator, Mapping
 from dataclasses import dataclass
 from functools import cached_property
 from importlib import import_module
@@ -144,10 +144,24 @@ def parts(contract: type[Any]) -> dict[str, str]:
     }
 
 
-def lacks(candidate: object, contract: type[Any]) -> str:
-    """The parts of a contract that an object lacks, with what each is for; empty if it has all."""
-    missing = [f"{name} ({purpose})" for name, purpose in parts(contract).items() if not hasattr(candidate, name)]
-    return f"lacks {', '.join(missing)}" if missing else ""
+def lacks(candidate: object, contract: type[Any], needed: Collection[str] | None = None) -> str:
+    """Which parts of a contract an object lacks, and what each is for.
+
+    Parameters
+    ----------
+    candidate : object
+    contract : type
+    needed : collection of str, optional
+        The names that count; by default all `parts` of the contract.
+
+    Returns
+    -------
+    str
+        ``lacks NAME (PURPOSE), ...``; empty if it lacks nothing.
+    """
+    purposes = parts(contract)
+    missing = [name for name in (purposes if needed is None else needed) if not hasattr(candidate, name)]
+    return f"lacks {', '.join(f'{name} ({purposes.get(name)})' for name in missing)}" if missing else ""
 
 
 def _is_protocol(contract: type[Any]) -> bool:

@@ -13,9 +13,8 @@ from typing import TypeVar
 import numpy as np
 import torch
 
-from robosac.boxes import pose_matrix
 from robosac.deadline import Deadline
-from robosac.detectors import Detector, Message, available, load
+from robosac.detectors import Detector, Message, available, blank, load
 from robosac.fusion import FusionResult
 from robosac.session import Session
 
@@ -92,13 +91,8 @@ class Engine:
 
 
 def _warm_up(detector: Detector) -> None:
-    blank = {
-        role: Message(
-            pose_matrix(0, 0, 0, 0), {name: np.zeros(spec.shape, dtype=spec.dtype) for name, spec in specs.items()}
-        )
-        for role, specs in detector.info.tensors.items()
-    }
+    ego, teammate = blank(detector.info, "ego"), blank(detector.info, "teammate")
     for _ in range(2):
-        prepared = detector.prepare(blank["ego"], {"a": blank["teammate"], "b": blank["teammate"]})
+        prepared = detector.prepare(ego, {"a": teammate, "b": teammate})
         prepared.detect()
         prepared.detect(["a", "b"])

@@ -6,7 +6,7 @@ from collections.abc import Mapping
 
 from robosac.attacks.adaptive import Erase, Invent, InventSteady, Shift
 from robosac.attacks.base import Attack, IterativeAttack, Knowledge, inverted_pseudo_truth
-from robosac.attacks.campaign import BEHAVIOURS, HONEST, SEPARATOR, Campaign
+from robosac.attacks.campaign import BEHAVIOURS, HONEST, SEPARATOR, Campaign, lacking
 from robosac.attacks.carlini_wagner import CarliniWagner
 from robosac.attacks.geometric import NoGeometry
 from robosac.attacks.gradient import BIM, PGD
@@ -87,6 +87,7 @@ __all__ = [
     "Shift",
     "ShiftStill",
     "inverted_pseudo_truth",
+    "lacking",
     "load",
     "load_campaign",
 ]

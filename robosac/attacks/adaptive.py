@@ -10,7 +10,7 @@ import torch
 from torch.nn import functional
 
 from robosac.attacks.base import SEEN, Aim, Knowledge, Tensors
-from robosac.attacks.geometric import Perception, average, balanced, displacement, geometric
+from robosac.attacks.geometric import SHOWN, Perception, average, balanced, displacement, geometric
 from robosac.attacks.gradient import BIM
 from robosac.detectors.base import AttackSurface
 
@@ -63,6 +63,7 @@ class Invent(BIM):
     """
 
     name: ClassVar[str] = "invent"
+    needs: ClassVar[tuple[str, ...]] = SHOWN
 
     objects: int = 12
 
@@ -169,6 +170,7 @@ class Shift(BIM):
     """
 
     name: ClassVar[str] = "shift"
+    needs: ClassVar[tuple[str, ...]] = SHOWN
 
     distance: float = 0.9
 

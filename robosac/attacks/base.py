@@ -75,6 +75,8 @@ class Attack(ABC):
     """
 
     name: ClassVar[str]
+    needs: ClassVar[tuple[str, ...]] = ()
+    """What the attack calls of an attack surface, besides its ``messages``."""
 
     epsilon: float = 0.5
 
@@ -127,6 +129,8 @@ class IterativeAttack(Attack):
     step_size : float
         The optimiser's; for signed steps, in units of the message.
     """
+
+    needs: ClassVar[tuple[str, ...]] = ("class_logits",)
 
     steps: int = 15
     step_size: float = 0.1

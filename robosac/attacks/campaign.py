@@ -15,8 +15,10 @@ import numpy as np
 
 from robosac.attacks.alibi import Alibi, Covering, Framing, with_alibi
 from robosac.attacks.base import Attack, IterativeAttack
+from robosac.attacks.geometric import SHOWN
 from robosac.boxes import FloatArray, pose_matrix
-from robosac.detectors.base import Detector, Message
+from robosac.detectors.base import Detector, Encoder, GeometricSurface, Message, Preparer, blank
+from robosac.plugins import lacks
 
 SEPARATOR = "@"
 HONEST = "honest"
@@ -136,8 +138,8 @@ class Campaign:
             raise ValueError(f"only an attack that optimises can have an alibi, not {self.name}")
 
     @classmethod
-    def of(cls, attack: Attack | Campaign) -> Campaign:
-        """The campaign itself, or the attack in every frame."""
+    def of(cls, attack: Attack | Campaign | None) -> Campaign:
+        """The campaign itself, or the attack in every frame; without one, everybody is honest."""
         return attack if isinstance(attack, Campaign) else cls(attack)
 
     @property
@@ -149,6 +151,11 @@ class Campaign:
     def epsilon(self) -> float:
         """The attack's bound; 0 where the tensors are honest."""
         return self.attack.epsilon if self.attack is not None else 0.0
+
+    @property
+    def needs(self) -> tuple[str, ...]:
+        """What the attack and its alibi call of an attack surface; see `Attack.needs`."""
+        return (*(self.attack.needs if self.attack is not None else ()), *(SHOWN if self.alibi is not None else ()))
 
     def messages(
         self,
@@ -195,6 +202,32 @@ class Campaign:
         else:
             tensors = self.attack.run(surface, acting, rng)
         return {name: detector.perturbed(sent[name], tensor) for name, tensor in tensors.items()}
+
+
+def lacking(attack: Attack | Campaign | None, detector: Preparer) -> str | None:
+    """Say what a detector lacks for scenes with an attack, before work begins.
+
+    Parameters
+    ----------
+    attack : Attack, Campaign or None
+        None for scenes without an attack.
+    detector : Preparer
+        Its attack surface is looked at in a frame of zeros.
+
+    Returns
+    -------
+    str or None
+        A sentence with each missing method and what it is for; None if nothing is missing.
+    """
+    campaign = Campaign.of(attack)
+    name = detector.info.name
+    if missing := lacks(detector, Encoder if campaign.attack is None else Detector):
+        return f"the detector {name} cannot be used in scenes with the attack {campaign.name!r}: it {missing}"
+    if campaign.attack is None or not isinstance(detector, Detector):
+        return None
+    surface = detector.attack_surface(blank(detector.info, "ego"), {"a": blank(detector.info, "teammate")})
+    missing = lacks(surface, GeometricSurface, dict.fromkeys(campaign.needs))
+    return f"{campaign.name} cannot attack the detector {name}: its attack surface {missing}" if missing else None
 
 
 BEHAVIOURS: dict[str, Callable[[Campaign], Campaign]] = {

@@ -14,6 +14,9 @@ from robosac.detectors.base import AttackSurface, GeometricSurface
 CERTAIN = 0.5
 """Places with a score from here on hold a box for certain; these are the ones whose movement a defence can judge."""
 
+SHOWN = ("class_logits", "perceive")
+"""What attacks that look at boxes call of an attack surface."""
+
 
 class NoGeometry(ValueError):
     """An attack needs boxes of a detector that shows attackers class scores only."""

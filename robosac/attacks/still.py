@@ -10,7 +10,7 @@ import torch
 
 from robosac.attacks.adaptive import Erase, Invent, Shift
 from robosac.attacks.base import SEEN, Aim, IterativeAttack, Tensors
-from robosac.attacks.geometric import CERTAIN, Perception, displacement, geometric
+from robosac.attacks.geometric import CERTAIN, SHOWN, Perception, displacement, geometric
 from robosac.detectors.base import AttackSurface
 
 STILLNESS = 2.0
@@ -26,6 +26,8 @@ class HoldingStill(IterativeAttack):
     fusion with the attackers, for T everybody honest and for T nobody (the ego alone), times `STILLNESS`. Steps are
     smaller and more than elsewhere: a signed step of 0.1 shakes the boxes by itself.
     """
+
+    needs: ClassVar[tuple[str, ...]] = SHOWN
 
     steps: int = 30
     step_size: float = 0.04

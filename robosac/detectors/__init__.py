@@ -8,12 +8,14 @@ from robosac.detectors.base import (
     AttackSurface,
     Detector,
     DetectorInfo,
+    Encoder,
     GeometricSurface,
     Message,
     PreparedFrame,
     Preparer,
     Role,
     TensorSpec,
+    blank,
 )
 from robosac.lazy import lazily
 
@@ -40,6 +42,7 @@ __all__ = [
     "Detector",
     "DetectorInfo",
     "EmbeddedDetector",
+    "Encoder",
     "GeometricSurface",
     "Message",
     "PreparedFrame",
@@ -49,5 +52,6 @@ __all__ = [
     "V2XSimDetector",
     "WeightsError",
     "available",
+    "blank",
     "load",
 ]

@@ -92,6 +92,12 @@ def for_role(message: Message, info: DetectorInfo, role: Role) -> Message:
     return Message(message.pose, {name: message.tensors[name] for name in info.tensors[role]})
 
 
+def blank(info: DetectorInfo, role: Role) -> Message:
+    """A message of zeros, as if sent from the origin by a vehicle in this role."""
+    tensors = {name: np.zeros(spec.shape, dtype=spec.dtype) for name, spec in info.tensors[role].items()}
+    return Message(np.eye(4), tensors)
+
+
 class PreparedFrame(Protocol):
     """One frame, encoded and warped once, to be decoded for many subsets of teammates."""
 
@@ -129,7 +135,9 @@ class GeometricSurface(AttackSurface, Protocol):
     """A surface that shows boxes too: what an attack needs that moves them, or leaves them where they are."""
 
     def perceive(self, messages: Mapping[str, torch.Tensor]) -> tuple[torch.Tensor, torch.Tensor]:
-        """What the ego fused with these messages makes of every place where it might find a vehicle.
+        """Give the box of every class logit too.
+
+        The ego is fused with these messages. Its places are all those where it might find a vehicle.
 
         Returns
         -------
@@ -151,24 +159,45 @@ class Preparer(Protocol):
         ...
 
     def prepare(self, ego: Message, teammates: Mapping[str, Message]) -> PreparedFrame:
-        """Do once what all hypotheses of a frame share. Messages must already be checked against `info`."""
+        """Do once what all hypotheses of a frame share.
+
+        The messages must already be checked against `info`.
+        """
+        ...
+
+
+class Encoder(Preparer, Protocol):
+    """What scenes without an attack need of a detector."""
+
+    def encode(self, points: FloatArray, pose: FloatArray) -> Message:
+        """Make the message for a LiDAR scan.
+
+        Parameters
+        ----------
+        points : (P, 3) ndarray
+            Returns in the sensor's frame, metres.
+        pose : (4, 4) ndarray
+            world_from_sensor.
+
+        Returns
+        -------
+        Message
+            With all that an ego sends; `for_role` leaves what a teammate sends.
+        """
         ...
 
 
 @runtime_checkable
-class Detector(Preparer, Protocol):
-    """A collaborative detector. Implementations hold no state but their weights, and may be used from one thread at
-    a time.
+class Detector(Encoder, Protocol):
+    """All that a collaborative detector can have: what scenes with an attack need of it.
+
+    Implementations hold no state but their weights, and may be used from one thread at a time.
     """
 
-    def encode(self, points: FloatArray, pose: FloatArray) -> Message:
-        """The message for a LiDAR scan (P, 3) in the sensor's frame, taken at ``pose`` (world_from_sensor)."""
-        ...
-
     def attack_surface(self, ego: Message, teammates: Mapping[str, Message]) -> AttackSurface:
-        """The same frame for an attacker."""
+        """Show a frame to an attacker."""
         ...
 
     def perturbed(self, message: Message, tensor: torch.Tensor) -> Message:
-        """The teammate's message with its features replaced by ``tensor`` (as in `AttackSurface.messages`)."""
+        """Put an attacker's tensor, as in `AttackSurface.messages`, into a teammate's message."""
         ...

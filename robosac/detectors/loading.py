@@ -8,12 +8,12 @@ from __future__ import annotations
 
 from pathlib import Path
 
-from robosac.detectors.base import Detector
+from robosac.detectors.base import Detector, Preparer
 from robosac.detectors.embedded import EmbeddedDetector, WeightsError, read_weights
 from robosac.plugins import Kind, classes
 
 DEFAULT_DETECTOR = EmbeddedDetector.name
-DETECTORS: Kind[Detector] = Kind("detector", str(__package__), Detector, forms="a weights file, or module:callable")
+DETECTORS: Kind[Detector] = Kind("detector", str(__package__), Preparer, forms="a weights file, or module:callable")
 
 
 def available() -> tuple[str, ...]:
@@ -23,6 +23,9 @@ def available() -> tuple[str, ...]:
 
 def load(detector: str = DEFAULT_DETECTOR) -> Detector:
     """Load a detector.
+
+    It is checked for what a gateway needs of it, `Preparer`. Whoever encodes scans or attacks asks
+    `robosac.attacks.lacking` first.
 
     Parameters
     ----------
@@ -35,7 +38,7 @@ def load(detector: str = DEFAULT_DETECTOR) -> Detector:
     WeightsError
         If the weights cannot be used.
     ValueError
-        If there is no such detector.
+        If there is no such detector, or it lacks what a gateway needs.
     """
     if detector not in DETECTORS.shipped and Path(detector).exists():
         return _open_weights(Path(detector))

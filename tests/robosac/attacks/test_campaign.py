@@ -1,7 +1,20 @@
+from dataclasses import replace
+from types import SimpleNamespace
+
 import numpy as np
 import pytest
 
-from robosac.attacks import ATTACKS, BEHAVIOURS, BIM, PGD, Campaign, GaussianNoise, load_campaign
+from robosac.attacks import (
+    ATTACKS,
+    BEHAVIOURS,
+    BIM,
+    PGD,
+    Campaign,
+    GaussianNoise,
+    IterativeAttack,
+    lacking,
+    load_campaign,
+)
 from robosac.attacks.alibi import Covering, Framing
 from robosac.attacks.campaign import Always, Asleep, FalsePose, Flicker, Turns
 from robosac.boxes import from_world, pose_matrix
@@ -143,3 +156,52 @@ def test_impossible_campaigns_are_explained(spec, complaint):
 def test_an_attacker_that_is_not_there_is_an_error(detector, messages):
     with pytest.raises(KeyError):
         under(load_campaign("honest@false-pose"), messages, detector, attackers=("nobody",))
+
+
+class Showing:
+    """A detector whose attack surface has these methods only."""
+
+    def __init__(self, detector, *shown):
+        self.info, self.prepare, self.encode = detector.info, detector.prepare, detector.encode
+        self.perturbed, self._detector, self._shown = detector.perturbed, detector, shown
+
+    def attack_surface(self, ego, teammates):
+        whole = self._detector.attack_surface(ego, teammates)
+        return SimpleNamespace(messages=whole.messages, **{name: getattr(whole, name) for name in self._shown})
+
+
+@pytest.mark.parametrize("spec", [*ATTACKS, "bim@framing"])
+def test_what_an_attack_needs_is_enough_and_its_lack_is_said_before(spec, detector, messages):
+    campaign = load_campaign(spec)
+    if isinstance(campaign.attack, IterativeAttack):
+        campaign = replace(campaign, attack=replace(campaign.attack, steps=1))
+    enough = Showing(detector, *campaign.needs)
+    assert lacking(campaign, enough) is None
+    assert under(campaign, messages, enough).attackers == {"car-2"}
+    for part in campaign.needs:
+        said = lacking(campaign, Showing(detector, *{*campaign.needs} - {part}))
+        start = f"{campaign.name} cannot attack the detector intersection-mean: its attack surface lacks {part} ("
+        assert said.startswith(start)
+
+
+class Served:
+    def __init__(self, detector):
+        self.info, self.prepare = detector.info, detector.prepare
+
+
+class Sensing(Served):
+    def __init__(self, detector):
+        super().__init__(detector)
+        self.encode = detector.encode
+
+
+def test_what_a_detector_lacks_for_a_scene_is_said_with_its_purpose(detector):
+    assert lacking(None, Sensing(detector)) is None
+    assert lacking(load_campaign("honest@false-pose"), Sensing(detector)) is None
+    said = lacking(None, Served(detector))
+    assert said == (
+        "the detector intersection-mean cannot be used in scenes with the attack 'honest': "
+        "it lacks encode (Make the message for a LiDAR scan.)"
+    )
+    said = lacking(PGD(), Sensing(detector))
+    assert "with the attack 'pgd': it lacks attack_surface (Show a frame to an attacker.), perturbed (Put " in said
