@@ -26,7 +26,7 @@ from robosac.defenses.group_testing import model as likelihoods
 from robosac.defenses.group_testing.geometry import PairMeasure
 from robosac.detectors import Detector, load
 from robosac.evaluation.average_precision import AveragePrecision
-from robosac.evaluation.frames import DecodedOnce, EvaluationFrame, encode_all, under_attack
+from robosac.evaluation.frames import DecodedOnce, EvaluationFrame, Sensed, under_attack
 from robosac.scenes import IntersectionScene
 from robosac.scenes.splits import TEST_SEEDS
 from robosac.session import Session
@@ -155,8 +155,8 @@ def play_scenes(teammates: int, attackers: int, kind: str, frames: int, sequence
         bad = frozenset(str(name) for name in rng.choice(team, attackers, replace=False))
         session, spent, done, accused = Session(detector, team, defense, rng=rng), 0, None, set()
         for index, met in enumerate(_attacked(detector, scene, kind, bad, frames, rng)):
-            decoded = DecodedOnce(detector, met.ego, met.received)
-            result = session.answer(index, met.ego, met.received, detector=decoded)
+            decoded = DecodedOnce.of(met)
+            result = session.answer(index, met.ego, met.teammates, detector=decoded)
             if result.fault is not None:
                 raise RuntimeError(f"scene {seed}, frame {index}: {result.fault}")
             spent += result.sampling_steps
@@ -182,8 +182,8 @@ def _attacked(
     detector: Detector, scene: IntersectionScene, kind: str, bad: frozenset[str], frames: int, rng: np.random.Generator
 ) -> Iterator[EvaluationFrame]:
     attack = attacks.load(kind)
-    for frame in scene.frames(frames):
-        yield under_attack(detector, encode_all(detector, frame), frame.truth(EGO), EGO, bad, attack, rng, frame.index)
+    for index in range(frames):
+        yield under_attack(detector, Sensed.of(detector, scene.frame(index), EGO, 0.0, rng), bad, attack, rng)
 
 
 def _print_named(until_named: Sequence[int | None]) -> None:

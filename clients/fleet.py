@@ -25,7 +25,7 @@ from robosac import attacks, defenses, detectors
 from robosac.answers import FrameAnswer, Reason
 from robosac.attacks import CAMPAIGN_HELP
 from robosac.detectors import DEFAULT_DETECTOR
-from robosac.scenes import FRAME_PERIOD_S, IntersectionScene
+from robosac.scenes import DATA_HELP, DEFAULT_DATA, SOURCES, first_scenes
 
 RECENT = 12
 
@@ -38,12 +38,12 @@ class FleetOptions:
     ----------
     url : str
     scenes, frames : int
-        Sequences, and frames of each at 5 Hz of simulated time.
+        Test sequences, and frames of each.
     first_scene : int
-        Seed of the first scene; the others follow.
+        How many scenes are left out before.
     egos, attackers : int
-    attack, detector : str
-        As `robosac.attacks.load_campaign` and `robosac.detectors.load` take them.
+    attack, detector, data : str
+        As `robosac.attacks.load_campaign`, `robosac.detectors.load` and `robosac.scenes.SOURCES` take them.
     defense : mapping or None
         The ``defense`` of the sessions; None leaves it to the gateway.
     seed : int
@@ -51,7 +51,7 @@ class FleetOptions:
     budget_ms : float or None
         Latency budget of the sessions; None leaves it to the gateway.
     real_time : bool
-        Hold the frames to 5 Hz of the clock, where the machine can keep up.
+        Hold the frames to the clock, where the machine can keep up.
     report : Path or None
         Folder for the summary and the picture.
     api_key : str or None
@@ -72,6 +72,7 @@ class FleetOptions:
     real_time: bool
     report: Path | None
     api_key: str | None = field(default=None, repr=False)
+    data: str = DEFAULT_DATA
 
 
 class _Screen:
@@ -160,14 +161,15 @@ async def run_fleet(options: FleetOptions, console: Console) -> FleetSummary:
     clients.errors.GatewayError
         If any message or frame is not accepted as it should be; that a teammate's message comes too late is no error.
     ValueError
-        If there is no such attack or detector, or the gateway's has other weights.
+        If there is no such attack, detector or data, or the gateway's detector has other weights.
     """
     detector, attack = detectors.load(options.detector), attacks.load_campaign(options.attack)
+    count = options.first_scene + options.scenes
+    scenes = first_scenes(SOURCES.make(options.data), "test", count, options.frames)
     summary = FleetSummary(detector)
     screen = _Screen(console, options.scenes * options.frames * options.egos)
     with screen.live:
-        for seed in range(options.first_scene, options.first_scene + options.scenes):
-            scene = IntersectionScene(seed)
+        for scene in scenes[options.first_scene :]:
             fleet = Fleet(scene, detector, options.egos, options.attackers, attack, options.seed)
             await _run_scene(options, fleet, summary, screen)
     return summary
@@ -192,11 +194,11 @@ async def _run_scene(options: FleetOptions, fleet: Fleet, summary: FleetSummary,
         for index in range(options.frames):
             frames = await asyncio.to_thread(fleet.sense, index)
             if options.real_time:
-                await asyncio.sleep(max(0.0, start + index * FRAME_PERIOD_S - time.monotonic()))
+                await asyncio.sleep(max(0.0, start + index * fleet.scene.frame_period_s - time.monotonic()))
             answers = await asyncio.gather(*(_exchange(vehicles, frame, index) for frame in frames))
             for frame, (answer, latency_ms) in zip(frames, answers, strict=True):
                 await asyncio.to_thread(summary.add, frame, answer, latency_ms)
-                screen.add(fleet.scene.seed, frame, answer, latency_ms)
+                screen.add(fleet.scene.number, frame, answer, latency_ms)
         for ego_id in fleet.egos:
             await vehicles[ego_id].leave()
     finally:
@@ -213,9 +215,9 @@ async def _exchange(vehicles: dict[str, _Vehicle], frame: EgoFrame, index: int) 
 def main(
     url: Annotated[str, typer.Option(help="The gateway.")] = "http://127.0.0.1:8000",
     scenes: Annotated[int, typer.Option(min=1, help="Sequences, each a session of its own.")] = 4,
-    frames: Annotated[int, typer.Option(min=1, help="Frames of a sequence, at 5 Hz of simulated time.")] = 25,
-    first_scene: Annotated[int, typer.Option(min=0, help="Seed of the first scene; 0 to 999 are test scenes.")] = 0,
-    egos: Annotated[int, typer.Option(min=1, help="Vehicles that ask; the first cars.")] = 1,
+    frames: Annotated[int, typer.Option(min=1, help="Frames of a sequence.")] = 25,
+    first_scene: Annotated[int, typer.Option(min=0, help="Test scenes to leave out before.")] = 0,
+    egos: Annotated[int, typer.Option(min=1, help="Vehicles that ask.")] = 1,
     attackers: Annotated[int, typer.Option(min=0, help="Vehicles that attack.")] = 1,
     attack: Annotated[str, typer.Option(help=CAMPAIGN_HELP)] = "pgd",
     detector: Annotated[
@@ -230,8 +232,9 @@ def main(
     collaborators: Annotated[int | None, typer.Option(help="Teammates in a hypothesis.")] = None,
     seed: Annotated[int, typer.Option(help="Of the attackers' choice and starts.")] = 0,
     budget_ms: Annotated[float | None, typer.Option(min=1, help="Latency budget; by default the gateway's.")] = None,
-    real_time: Annotated[bool, typer.Option(help="Hold frames to 5 Hz of the clock.")] = False,
+    real_time: Annotated[bool, typer.Option(help="Hold frames to the clock.")] = False,
     report: Annotated[Path | None, typer.Option(help="Folder for summary.json and example.png.")] = None,
+    data: Annotated[str, typer.Option(help=DATA_HELP)] = DEFAULT_DATA,
     api_key: Annotated[
         str | None, typer.Option(envvar=API_KEY_VARIABLE, help="Opens sessions, where the gateway asks for one.")
     ] = None,
@@ -241,7 +244,11 @@ def main(
     console = Console()
     if report is not None:
         make_picture_folder(report, "--report")
-    for option, load, value in (("--attack", attacks.load_campaign, attack), ("--detector", detectors.load, detector)):
+    for option, load, value in (
+        ("--attack", attacks.load_campaign, attack),
+        ("--detector", detectors.load, detector),
+        ("--data", SOURCES.make, data),
+    ):
         try:
             load(value)
         except ValueError as error:
@@ -263,6 +270,7 @@ def main(
         real_time=real_time,
         report=report,
         api_key=api_key,
+        data=data,
     )
     try:
         summary = asyncio.run(run_fleet(options, console))

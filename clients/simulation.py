@@ -13,10 +13,10 @@ import typer
 from robosac.attacks import Attack, Campaign
 from robosac.boxes import FloatArray
 from robosac.detectors import Detector, Message
-from robosac.evaluation.frames import encode_all, under_attack
+from robosac.evaluation.frames import Sensed, encode_all, under_attack
 from robosac.extras import MissingExtra
 from robosac.figures import need_figures
-from robosac.scenes import IntersectionScene, SceneFrame
+from robosac.scenes import Frame, Scene
 
 
 @dataclass(frozen=True)
@@ -26,7 +26,7 @@ class EgoFrame:
     Attributes
     ----------
     scene : int
-        Its seed.
+        Its number.
     ego_id : str
     attackers : frozenset of str
         Those whose message of this frame is not what an honest one would send.
@@ -76,11 +76,11 @@ class Fleet:
 
     Parameters
     ----------
-    scene : IntersectionScene
+    scene : Scene
     detector : Detector
         The vehicles' own copy.
     egos : int
-        The first cars are egos.
+        The first of those that may be.
     attackers : int
         Chosen at random among the vehicles that are not egos.
     attack : Attack or Campaign
@@ -94,25 +94,25 @@ class Fleet:
 
     def __init__(
         self,
-        scene: IntersectionScene,
+        scene: Scene,
         detector: Detector,
         egos: int,
         attackers: int,
         attack: Attack | Campaign,
         seed: int,
     ) -> None:
-        others = scene.agents[egos:]
-        if not 1 <= egos <= scene.car_agents:
-            raise ValueError(f"egos must be between 1 and the {scene.car_agents} cars, got {egos}")
+        others = [name for name in scene.agents if name not in scene.egos[:egos]]
+        if not 1 <= egos <= len(scene.egos):
+            raise ValueError(f"egos must be between 1 and the {len(scene.egos)} that may be one, got {egos}")
         if not 0 <= attackers <= len(others):
             raise ValueError(
                 f"attackers must be between 0 and the {len(others)} vehicles that are no egos, got {attackers}"
             )
         self.scene = scene
-        self.egos = scene.agents[:egos]
+        self.egos = scene.egos[:egos]
         self.detector = detector
         self._attack = attack
-        self._rng = np.random.default_rng([seed, scene.seed])
+        self._rng = np.random.default_rng([seed, scene.number])
         chosen = self._rng.choice(len(others), attackers, replace=False)
         self.attackers = frozenset(others[i] for i in chosen)
 
@@ -124,17 +124,17 @@ class Fleet:
         """Frame ``index`` from the side of each ego."""
         frame = self.scene.frame(index)
         messages = encode_all(self.detector, frame)
-        return [self._for_ego(ego_id, frame, messages) for ego_id in self.egos]
+        return [self._for_ego(ego_id, frame, messages) for ego_id in self.egos if ego_id in messages]
 
-    def _for_ego(self, ego_id: str, frame: SceneFrame, messages: Mapping[str, Message]) -> EgoFrame:
-        truth = frame.truth(ego_id)
-        met = under_attack(self.detector, messages, truth, ego_id, self.attackers, self._attack, self._rng, frame.index)
+    def _for_ego(self, ego_id: str, frame: Frame, messages: Mapping[str, Message]) -> EgoFrame:
+        sensed = Sensed(frame.index, ego_id, messages, frame.truth(ego_id))
+        met = under_attack(self.detector, sensed, self.attackers, self._attack, self._rng)
         return EgoFrame(
-            self.scene.seed,
+            self.scene.number,
             ego_id,
             met.attackers,
             met.benign,
-            met.received,
+            met.teammates,
             met.ego,
             met.truth,
             frame.views[ego_id].points,

@@ -36,6 +36,7 @@ LARGEST_RATIO = 4.0
 LARGEST_CHANGE_RATIO = 3.0
 """Those of comparisons with the frame before, which are made again and again, are clipped here."""
 _FEW = 1e-12
+_WHERE = ("", ", attackers among the joining", ", attackers among the joined", ", attackers among both")
 _KERNEL = (0.25, 0.5, 0.25)
 
 
@@ -53,7 +54,8 @@ def fit(verdicts: Verdicts, kinds: Sequence[str], pose_error_m: float) -> Eviden
        the ego never incriminates, whatever attackers in the calibration did.
     4. The kind `OPEN` has a uniform histogram for every attacked pair.
     5. Where nobody was complementary, the histogram of all unattacked pairs stands.
-    6. Of boxes that come and go there is a histogram for each number of boxes, smoothed over the neighbouring numbers.
+    6. Fusions that are larger than the largest team that was observed have the histograms of the largest fusions.
+    7. Of boxes that come and go there is a histogram for each number of boxes, smoothed over the neighbouring numbers.
        Its ratio is clipped to ``exp(+-3)`` and made not to fall with the changes, and `OPEN` shows what nobody's
        attack shows: an attacker that is not among the kinds may well hold its boxes.
 
@@ -72,31 +74,43 @@ def fit(verdicts: Verdicts, kinds: Sequence[str], pose_error_m: float) -> Eviden
     """
     rows = [(None, cell) for cell in range(CLEAN)] + [(kind, cell) for kind in kinds for cell in range(1, 1 + CELLS)]
     pairs = np.full((len(rows) + CELLS, len(SIZES), BINS), 1.0 / BINS)
+    missing = []
     for row, (kind, cell) in enumerate(rows):
-        for size, (a, d) in enumerate(SIZES):
+        for size in range(len(SIZES)):
+            shown = _largest_shown(size, verdicts.team)
+            a, d = SIZES[shown]
             seen = cell if a else min(cell, 1)  # nobody is in the ego alone, to attack
-            counts = [verdicts.pairs[kind, seen, size, b] for b in range(BINS)]
-            if kind is None and cell and not any(counts):  # nobody was complementary
+            counts = np.array([verdicts.pairs[kind, seen, shown, b] for b in range(BINS)], dtype=np.float64)
+            if counts.any():
+                pairs[row, size] = _density(counts.reshape(LOSS_BINS, NOVELTY_BINS), kind)
+            elif kind is None and cell:  # nobody was complementary
                 pairs[row, size] = pairs[0, size]
-                continue
-            grid = np.array(counts, dtype=np.float64).reshape(LOSS_BINS, NOVELTY_BINS)
-            pairs[row, size] = _density(grid, kind, f"cell {seen}, sizes {a} and {d}")
-    attacked = _bounded(pairs[:1], pairs[CLEAN:])
-    clean = _change_density(verdicts, None)
-    changes = [_change_ratio_bounded(clean, _change_density(verdicts, kind)) for kind in kinds]
+            elif shown == size:
+                missing.append(f"{kind or 'no attack'}: {d} joining {a}{_WHERE[seen]}")
+    clean, *attacked = (_change_density(verdicts, kind, missing) for kind in (None, *kinds))
+    if missing:
+        raise TooFewVerdicts(f"never observed: {'; '.join(missing[:3])}{'; and more' if len(missing) > 3 else ''}")
+    bounded = _bounded(pairs[:1], pairs[CLEAN:])
+    changes = [_change_ratio_bounded(clean, density) for density in attacked]
     return EvidenceModel(
-        pose_error_m, (*kinds, OPEN), np.concatenate([pairs[:CLEAN], attacked]), np.stack([clean, *changes, clean])
+        pose_error_m, (*kinds, OPEN), np.concatenate([pairs[:CLEAN], bounded]), np.stack([clean, *changes, clean])
     )
 
 
-def _change_density(verdicts: Verdicts, kind: str | None) -> FloatArray:
-    """Histograms (CHANGE_SIZES, CROWD_BINS, CHANGE_BINS), each last axis by itself."""
+def _largest_shown(size: int, team: int) -> int:
+    """The row of `SIZES` that stands for a row in a team of this size."""
+    a, d = SIZES[size]
+    a = min(a, max(team, 1) - 1)
+    return SIZES.index((a, min(d, max(team - a, 1))))
+
+
+def _change_density(verdicts: Verdicts, kind: str | None, missing: list[str]) -> FloatArray:
+    """Histograms (CHANGE_SIZES, CROWD_BINS, CHANGE_BINS), each last axis by itself; what is ``missing`` is added."""
     counts = np.zeros((CHANGE_SIZES, CROWD_BINS, CHANGE_BINS))
-    for index in np.ndindex(counts.shape):
-        counts[index] = verdicts.changes[kind, *index]
-    for size, counted in enumerate(counts.sum(axis=(1, 2)), start=1):
-        if not counted:
-            raise TooFewVerdicts(f"no successive frames of {kind or 'honest teammates'} with {size} in the fusion")
+    for size, crowd, change in np.ndindex(counts.shape):
+        counts[size, crowd, change] = verdicts.changes[kind, max(0, min(size, verdicts.team - 1)), crowd, change]
+    unseen = [size for size, counted in enumerate(counts.sum(axis=(1, 2)), start=1) if not counted]
+    missing += [f"{kind or 'no attack'}: {size} in successive frames" for size in unseen]
     padded = np.pad(counts, [(0, 0), (1, 1), (0, 0)], mode="edge")
     smooth = np.sum([w * padded[:, i : i + CROWD_BINS] for i, w in enumerate(_KERNEL)], axis=0)
     total = smooth.sum(axis=-1, keepdims=True)
@@ -118,11 +132,9 @@ def _change_ratio_bounded(clean: FloatArray, attacked: FloatArray) -> FloatArray
     return normal
 
 
-def _density(counts: FloatArray, kind: str | None, what: str) -> FloatArray:
+def _density(counts: FloatArray, kind: str | None) -> FloatArray:
     """A smoothed histogram (n * m,) from counts (n, m)."""
     total = counts.sum()
-    if not total:
-        raise TooFewVerdicts(f"no verdicts of {kind or 'honest teammates'}, {what}")
     smooth = counts / total
     for axis in range(2):
         if counts.shape[axis] > 1:

@@ -10,13 +10,13 @@ import numpy as np
 
 from robosac import attacks
 from robosac.attacks import Attack
-from robosac.calibration.fit import fit
-from robosac.calibration.verdicts import STRETCH, collect, validation_stretches
+from robosac.calibration.fit import TooFewVerdicts, fit
+from robosac.calibration.verdicts import STRETCH, STRETCH_STRIDE, Trial, collect, validation_stretches
 from robosac.defenses.group_testing import Calibration, EvidenceModel, GroupTesting
 from robosac.detectors import Detector
 from robosac.evaluation.playing import play
 from robosac.evaluation.recordings import RecordedFrame
-from robosac.scenes.splits import VALIDATION_SEEDS
+from robosac.scenes import DEFAULT_DATA, SOURCES, Scene, first_scenes
 
 RELIABILITY_EDGES = (0.0, 0.01, 0.05, 0.2, 0.5, 0.8, 0.95, 0.99, 1.0)
 _STREAM = 41
@@ -32,7 +32,7 @@ class Recipe:
     attacks : tuple of str
         Names of `robosac.attacks.ATTACKS`, or ``module:callable``; each is a kind.
     attackers : tuple of int
-        Each attack comes with each of these numbers of attackers.
+        Each attack comes with each of these numbers of attackers; a number from 2 on must be among them.
     scenes, stretches_per_scene : int
         The first validation scenes, and stretches of two successive frames of each.
     check_scenes : int
@@ -40,6 +40,8 @@ class Recipe:
     pose_errors_m : tuple of float
         Ascending; a level each.
     seed : int
+    data : str
+        As `robosac.scenes.SOURCES` takes it.
     """
 
     attacks: tuple[str, ...] = ("pgd", "erase", "invent", "shift")
@@ -49,14 +51,17 @@ class Recipe:
     check_scenes: int = 12
     pose_errors_m: tuple[float, ...] = (0.0, 0.2, 0.4)
     seed: int = 0
+    data: str = DEFAULT_DATA
 
     def __post_init__(self) -> None:
         if not self.attacks or not self.attackers or not self.pose_errors_m:
             raise ValueError("attacks, attackers and pose errors must not be empty")
         if min(self.attackers) < 1 or min(self.pose_errors_m) < 0:
             raise ValueError("attackers must be at least 1, pose errors at least 0")
-        if self.scenes < 1 or self.check_scenes < 0 or self.scenes + self.check_scenes > len(VALIDATION_SEEDS):
-            raise ValueError(f"there are {len(VALIDATION_SEEDS)} validation scenes")
+        if max(self.attackers) < 2:
+            raise ValueError("attackers must hold 2 or more: a calibration has to show what two do together")
+        if self.scenes < 1 or self.check_scenes < 0:
+            raise ValueError("scenes must be at least 1, check_scenes at least 0")
 
     @property
     def frames_per_level(self) -> int:
@@ -106,27 +111,36 @@ def calibrate(
     Raises
     ------
     ValueError
-        If there is no such attack.
+        If there is no such attack or data, or the detector lacks what an attack needs.
+    robosac.scenes.SceneError
+        If the data have too few scenes, or too short ones, or too small teams.
     robosac.calibration.fit.TooFewVerdicts
         If the scenes do not show all that is needed.
     """
     chosen = {name: attacks.load(name) for name in recipe.attacks}
+    faults = [fault for attack in chosen.values() if (fault := attacks.lacking(attack, detector))]
+    if faults:
+        raise ValueError("; ".join(faults))
+    scenes = _scenes(recipe)
     levels: list[EvidenceModel] = []
     reliability: dict[float, list[ReliabilityBin]] = {}
-    fitted = VALIDATION_SEEDS[: recipe.scenes]
-    held_out = VALIDATION_SEEDS[recipe.scenes : recipe.scenes + recipe.check_scenes]
     for number, error in enumerate(sorted(recipe.pose_errors_m)):
+        trial = Trial(chosen, recipe.attackers, error, recipe.stretches_per_scene)
 
         def stretches(
-            seeds: Sequence[int], *stream: int, error: float = error
+            part: Sequence[Scene], *stream: int, trial: Trial = trial
         ) -> Iterator[tuple[str | None, list[RecordedFrame]]]:
             rng = np.random.default_rng([recipe.seed, _STREAM, *stream])
-            count = recipe.stretches_per_scene
-            return validation_stretches(detector, seeds, count, chosen, recipe.attackers, error, rng, tick)
+            return validation_stretches(detector, part, trial, rng, tick)
 
-        model = fit(collect(stretches(fitted, number)), recipe.attacks, error)
+        verdicts = collect(stretches(scenes[: recipe.scenes], number))
+        try:
+            model = fit(verdicts, recipe.attacks, error)
+        except TooFewVerdicts as few:
+            # had it happened in one scene of as many, three times as many would have shown it with 95 %
+            raise TooFewVerdicts(f"{recipe.scenes} scenes are too few ({few}): take {3 * recipe.scenes}") from few
         levels.append(model)
-        reliability[error] = check(model, stretches(held_out, number, _CHECK))
+        reliability[error] = check(model, stretches(scenes[recipe.scenes :], number, _CHECK))
     made_by = {
         "command": command,
         **asdict(recipe),
@@ -135,6 +149,13 @@ def calibrate(
     }
     info = detector.info
     return Calibration(info.name, info.weights_digest, made_by, tuple(levels)), reliability
+
+
+def _scenes(recipe: Recipe) -> list[Scene]:
+    """Those to fit to, and after them those to check on."""
+    frames = STRETCH_STRIDE * (recipe.stretches_per_scene - 1) + STRETCH
+    source, count = SOURCES.make(recipe.data), recipe.scenes + recipe.check_scenes
+    return first_scenes(source, "validation", count, frames, max(recipe.attackers))
 
 
 def check(

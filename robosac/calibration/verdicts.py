@@ -15,12 +15,12 @@ from robosac.consensus import at_least
 from robosac.defenses.group_testing.geometry import changes, crowd, followed, measure
 from robosac.defenses.group_testing.model import CHANGE_SIZES, change_bin, crowd_bin, pair_bin, size_row
 from robosac.detectors import Detector
-from robosac.evaluation.frames import encode_all, misplaced, under_attack
-from robosac.evaluation.recordings import RecordedFrame, Subset, record
-from robosac.scenes import IntersectionScene
+from robosac.evaluation.frames import Sensed, under_attack
+from robosac.evaluation.recordings import RecordedFrame, Subset, record, subsets
+from robosac.scenes import Scene
 
 STRETCH_STRIDE = 10
-"""Stretches of a scene begin this many periods of 0.2 s apart, so that they differ."""
+"""Stretches of a scene begin this many frames apart, so that they differ."""
 STRETCH = 2
 """Successive frames of a stretch."""
 ADDED_BOXES = 1.0
@@ -43,32 +43,34 @@ class Verdicts:
     ----------
     pairs : Counter of PairKey
     changes : Counter of ChangeKey
+    team : int
+        Teammates of the largest team.
     """
 
     pairs: Counter[PairKey] = field(default_factory=Counter)
     changes: Counter[ChangeKey] = field(default_factory=Counter)
+    team: int = 0
 
     def add_stretch(self, stretch: Sequence[RecordedFrame], kind: str | None) -> None:
         """Count what successive frames show, each by itself and from one to the next; the same ones attack in all."""
         for frame in stretch:
             self.add(frame, kind)
         for before, frame in pairwise(stretch):
-            for size in range(1, len(frame.team) + 1):
-                for subset in map(frozenset, combinations(frame.team, size)):
-                    if kind is not None and subset.isdisjoint(frame.attackers):
-                        continue
-                    then, now = (followed(f.detect(subset), f.pose) for f in (before, frame))
-                    which = min(size, CHANGE_SIZES) - 1
-                    self.changes[kind, which, crowd_bin(crowd(now)), change_bin(changes(then, now))] += 1
+            for subset in subsets(frame.team)[1:]:
+                if subset not in before.boxes or (kind is not None and subset.isdisjoint(frame.attackers)):
+                    continue
+                then, now = (followed(f.detect(subset), f.pose) for f in (before, frame))
+                which = min(len(subset), CHANGE_SIZES) - 1
+                self.changes[kind, which, crowd_bin(crowd(now)), change_bin(changes(then, now))] += 1
 
     def add(self, frame: RecordedFrame, kind: str | None) -> None:
         """Count what all pairs of a frame show; of an attacked frame, those that an attacker has a part in."""
+        self.team = max(self.team, len(frame.team))
         special = complementary(frame) if kind is None else frame.attackers
-        subsets = [s for size in range(1, len(frame.team) + 1) for s in combinations(frame.team, size)]
-        for larger in map(frozenset, subsets):
+        for larger in subsets(frame.team)[1:]:
             if kind is not None and larger.isdisjoint(special):
                 continue
-            for smaller in _proper_parts(larger):
+            for smaller in subsets(sorted(larger))[:-1]:
                 pair = measure(_boxes(frame, smaller), frame.detect(larger))
                 if pair is not None:
                     joining = larger - smaller
@@ -97,54 +99,56 @@ def _boxes(frame: RecordedFrame, subset: Subset) -> FloatArray:
     return boxes if subset else at_least(boxes, frame.info.consensus_score)
 
 
-def validation_stretches(
-    detector: Detector,
-    seeds: Sequence[int],
-    stretches_per_scene: int,
-    attacks: Mapping[str, Attack],
-    attackers: Sequence[int],
-    pose_error_m: float,
-    rng: np.random.Generator,
-    tick: Callable[[], None] = lambda: None,
-) -> Iterator[tuple[str | None, list[RecordedFrame]]]:
-    """Successive frames without an attack, then the same frames under every attack, the cars taking turns as ego.
+@dataclass(frozen=True)
+class Trial:
+    """What verdicts are observed under.
 
-    Parameters
+    Attributes
     ----------
-    detector : Detector
-    seeds : sequence of int
-        Scenes.
-    stretches_per_scene : int
     attacks : mapping of kind to Attack
     attackers : sequence of int
         Each attack comes once with each number of attackers, drawn anew.
     pose_error_m : float
         Standard deviation of the error of each teammate's position along either axis, metres; each frame has its own.
-    rng : numpy.random.Generator
-    tick : callable
-        Called after each recorded frame.
+    stretches_per_scene : int
+    """
+
+    attacks: Mapping[str, Attack]
+    attackers: Sequence[int]
+    pose_error_m: float = 0.0
+    stretches_per_scene: int = 1
+
+
+def validation_stretches(
+    detector: Detector,
+    scenes: Sequence[Scene],
+    trial: Trial,
+    rng: np.random.Generator,
+    tick: Callable[[], None] = lambda: None,
+) -> Iterator[tuple[str | None, list[RecordedFrame]]]:
+    """Successive frames without an attack, then the same frames under every attack, the vehicles taking turns as ego.
+
+    ``tick`` is called after each recorded frame.
 
     Yields
     ------
     kind, stretch : str or None, list of RecordedFrame
     """
-    for turn, (seed, number) in enumerate((s, n) for s in seeds for n in range(stretches_per_scene)):
-        scene = IntersectionScene(seed)
-        ego_id = f"car-{turn % scene.car_agents + 1}"
-        met = []
-        for frame in scene.frames(STRETCH, start=number * STRETCH_STRIDE):
-            messages = encode_all(detector, frame)
-            placed = {n: m if n == ego_id else misplaced(m, pose_error_m, rng) for n, m in messages.items()}
-            met.append((placed, frame.truth(ego_id)))
-        team = sorted(set(met[0][0]) - {ego_id})
+    some = next(iter(trial.attacks.values()))
+    for turn, (scene, number) in enumerate((s, n) for s in scenes for n in range(trial.stretches_per_scene)):
+        ego_id = scene.egos[turn % len(scene.egos)]
+        start = number * STRETCH_STRIDE
+        frames = [scene.frame(index) for index in range(start, start + STRETCH)]
+        met = [Sensed.of(detector, frame, ego_id, trial.pose_error_m, rng) for frame in frames]
+        team = sorted(set(met[0].messages) - {ego_id})
         honest: list[RecordedFrame] = []
-        for kind, attack, count in [(None, None, 0), *((k, a, n) for k, a in attacks.items() for n in attackers)]:
+        attacked = [(kind, attack, count) for kind, attack in trial.attacks.items() for count in trial.attackers]
+        for kind, attack, count in [(None, some, 0), *attacked]:
             chosen = [team[i] for i in rng.choice(len(team), count, replace=False)]
-            some = attack or next(iter(attacks.values()))
             stretch = []
-            for index, (messages, truth) in enumerate(met):
-                frame_met = under_attack(detector, messages, truth, ego_id, chosen, some, rng)
-                stretch.append(record(detector, frame_met, honest[index] if honest else None))
+            for index, sensed in enumerate(met):
+                frame_met = under_attack(detector, sensed, chosen, attack, rng)
+                stretch.append(record(frame_met, honest[index] if honest else None))
                 tick()
             honest = honest or stretch
             yield kind, stretch
@@ -156,9 +160,3 @@ def collect(stretches: Iterable[tuple[str | None, Sequence[RecordedFrame]]]) -> 
     for kind, stretch in stretches:
         verdicts.add_stretch(stretch, kind)
     return verdicts
-
-
-def _proper_parts(larger: Subset) -> Iterator[Subset]:
-    members = sorted(larger)
-    for size in range(len(members)):
-        yield from map(frozenset, combinations(members, size))

@@ -8,13 +8,13 @@ from typing import Annotated
 import torch
 import typer
 from rich.console import Console
-from rich.progress import BarColumn, MofNCompleteColumn, Progress, TextColumn, TimeElapsedColumn, TimeRemainingColumn
 from rich.table import Table
 
-from robosac import detectors
 from robosac.attacks import ATTACKS
-from robosac.calibration import Recipe, ReliabilityBin, TooFewVerdicts, calibrate
+from robosac.calibration import Recipe, ReliabilityBin, calibrate
+from robosac.cli.options import DataName, DetectorName, Seed, command, load_detector, progress
 from robosac.detectors import DEFAULT_DETECTOR
+from robosac.scenes import DEFAULT_DATA
 
 _DEFAULTS = Recipe()
 
@@ -24,13 +24,12 @@ def run(
         Path,
         typer.Option(help="The file to write; NAME.calibration.json beside NAME.safetensors is found there."),
     ],
-    detector: Annotated[str, typer.Option(help="A detector's name, its weights file, or module:callable.")] = (
-        DEFAULT_DETECTOR
-    ),
+    detector: DetectorName = DEFAULT_DETECTOR,
+    data: DataName = DEFAULT_DATA,
     attack: Annotated[
         list[str] | None, typer.Option(help=f"A kind of attack: one of {', '.join(ATTACKS)}, or module:callable.")
     ] = None,
-    attackers: Annotated[list[int] | None, typer.Option(min=1, max=5, help="Attackers at a time.")] = None,
+    attackers: Annotated[list[int] | None, typer.Option(min=1, help="Attackers at a time.")] = None,
     pose_error: Annotated[
         list[float] | None, typer.Option(min=0.0, help="Standard deviation of the teammates' positions, metres.")
     ] = None,
@@ -39,7 +38,7 @@ def run(
     stretches: Annotated[
         int, typer.Option(min=1, help="Stretches of two successive frames of each, 2 s apart.")
     ] = _DEFAULTS.stretches_per_scene,
-    seed: Annotated[int, typer.Option(min=0, help="Of everything random.")] = _DEFAULTS.seed,
+    seed: Seed = _DEFAULTS.seed,
 ) -> None:
     """Observe what tests show when it is known who attacks, write the likelihoods, and check them.
 
@@ -48,6 +47,7 @@ def run(
     """
     torch.set_num_threads(1)
     console = Console()
+    chosen = load_detector(detector)
     try:
         recipe = Recipe(
             attacks=tuple(attack or _DEFAULTS.attacks),
@@ -57,16 +57,13 @@ def run(
             check_scenes=check_scenes,
             pose_errors_m=tuple(sorted(pose_error or _DEFAULTS.pose_errors_m)),
             seed=seed,
+            data=data,
         )
-        chosen = detectors.load(detector)
-        columns = (BarColumn(), MofNCompleteColumn(), TimeElapsedColumn(), TimeRemainingColumn())
-        with Progress(TextColumn("{task.description}"), *columns, console=console) as progress:
-            task = progress.add_task("frames", total=recipe.frames_per_level * len(recipe.pose_errors_m))
-            calibration, reliability = calibrate(
-                chosen, recipe, command(recipe, detector), lambda: progress.advance(task)
-            )
+        with progress(console) as bar:
+            task = bar.add_task("frames", total=recipe.frames_per_level * len(recipe.pose_errors_m))
+            calibration, reliability = calibrate(chosen, recipe, _command(recipe, detector), lambda: bar.advance(task))
         calibration.write(out)
-    except (OSError, ValueError, TooFewVerdicts) as error:
+    except (OSError, ValueError) as error:
         console.print(f"[red]{error}[/red]")
         raise typer.Exit(1) from error
     for error_m, bins in reliability.items():
@@ -74,17 +71,20 @@ def run(
     console.print(f"{out}: {calibration.detector}, weights {calibration.weights_digest:.12}...")
 
 
-def command(recipe: Recipe, detector: str) -> str:
+def _command(recipe: Recipe, detector: str) -> str:
     """The command that makes this calibration."""
-    parts = ["robosac calibrate --out FILE"]
-    if detector != DEFAULT_DETECTOR:
-        parts.append(f"--detector {detector}")
-    parts += [f"--attack {name}" for name in recipe.attacks]
-    parts += [f"--attackers {count}" for count in recipe.attackers]
-    parts += [f"--pose-error {error:g}" for error in recipe.pose_errors_m]
-    parts.append(f"--scenes {recipe.scenes} --check-scenes {recipe.check_scenes}")
-    parts.append(f"--stretches {recipe.stretches_per_scene} --seed {recipe.seed}")
-    return " ".join(parts)
+    given = {
+        "--detector": detector if detector != DEFAULT_DETECTOR else None,
+        "--data": recipe.data if recipe.data != DEFAULT_DATA else None,
+        "--attack": recipe.attacks,
+        "--attackers": recipe.attackers,
+        "--pose-error": recipe.pose_errors_m,
+        "--scenes": recipe.scenes,
+        "--check-scenes": recipe.check_scenes,
+        "--stretches": recipe.stretches_per_scene,
+        "--seed": recipe.seed,
+    }
+    return command("calibrate --out FILE", given)
 
 
 def _print(console: Console, pose_error_m: float, bins: list[ReliabilityBin]) -> None:

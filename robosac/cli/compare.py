@@ -2,9 +2,8 @@
 
 from __future__ import annotations
 
-import shlex
 import time
-from collections.abc import Mapping, Sequence
+from collections.abc import Sequence
 from dataclasses import replace
 from pathlib import Path
 from typing import Annotated
@@ -12,10 +11,21 @@ from typing import Annotated
 import torch
 import typer
 from rich.console import Console
-from rich.progress import BarColumn, MofNCompleteColumn, Progress, TextColumn, TimeElapsedColumn, TimeRemainingColumn
 
-from robosac import defenses, detectors
-from robosac.attacks import NoGeometry
+from robosac import defenses
+from robosac.attacks import lacking, load_campaign
+from robosac.cli.options import (
+    DataName,
+    DetectorName,
+    Seed,
+    blaming,
+    check_known,
+    command,
+    load_data,
+    load_detector,
+    make_folder,
+    progress,
+)
 from robosac.defenses import Defense
 from robosac.detectors import DEFAULT_DETECTOR, Detector
 from robosac.evaluation.comparison import (
@@ -31,7 +41,7 @@ from robosac.evaluation.comparison import (
 )
 from robosac.evaluation.comparison.rows import EARLY
 from robosac.figures import need_figures
-from robosac.scenes.splits import TEST_SEEDS
+from robosac.scenes import DEFAULT_DATA, SceneError
 
 
 def run(
@@ -46,8 +56,8 @@ def run(
         list[str] | None,
         typer.Option(help="CAMPAIGN:NUMBER of attackers, as in erase@asleep:2; may be repeated."),
     ] = None,
-    scenes: Annotated[int | None, typer.Option(min=1, max=len(TEST_SEEDS), help="Test sequences.")] = None,
-    frames: Annotated[int | None, typer.Option(min=EARLY + 1, help="Of each sequence, at 5 Hz.")] = None,
+    scenes: Annotated[int | None, typer.Option(min=1, help="Test sequences.")] = None,
+    frames: Annotated[int | None, typer.Option(min=EARLY + 1, help="Of each sequence.")] = None,
     recordings: Annotated[
         Path | None, typer.Option(help="Folder in which recorded frames are kept, to be used again.")
     ] = None,
@@ -56,10 +66,9 @@ def run(
     ] = 0.0,
     live: Annotated[bool, typer.Option(help="Record nothing: each defence decodes for itself, and is timed.")] = False,
     jobs: Annotated[int, typer.Option(min=1, help="Processes that share the sequences.")] = 1,
-    seed: Annotated[int, typer.Option(min=0, help="Of everything random.")] = 0,
-    detector: Annotated[
-        str, typer.Option("--detector", "--weights", help="A detector's name, its weights file, or module:callable.")
-    ] = DEFAULT_DETECTOR,
+    seed: Seed = 0,
+    detector: DetectorName = DEFAULT_DETECTOR,
+    data: DataName = DEFAULT_DATA,
 ) -> None:
     """Play every defence against every attack on the same test sequences, and write tables and pictures."""
     if live and recordings is not None:
@@ -68,24 +77,22 @@ def run(
     extent = _extent(QUICK if quick else FULL, setting or (), scenes, frames)
     torch.set_num_threads(1)
     console = Console()
-    _make_folder(out, "--out")
+    make_folder(out, "--out")
     if recordings is not None:
-        _make_folder(recordings, "--recordings")
-    try:
-        chosen = detectors.load(detector)
-    except ValueError as error:
-        raise typer.BadParameter(str(error), param_hint="--detector") from error
-    plan = Plan(chosen, _defenses(only or (), defense or (), chosen), extent, seed, recordings, pose_error, live)
+        make_folder(recordings, "--recordings")
+    chosen, source = load_detector(detector), load_data(data)
+    columns, left_out = _defenses(only or (), defense or (), chosen)
+    possible, impossible = _possible(extent, chosen, asked=bool(setting))
+    for why in (*left_out, *impossible):
+        console.print(f"Left out: {why}")
+    extent = replace(extent, settings=possible)
+    plan = Plan(chosen, columns, extent, seed, recordings, pose_error, live, source)
     started = time.monotonic()
-    columns = (TextColumn("{task.description}"), BarColumn(), MofNCompleteColumn())
-    with Progress(*columns, TimeElapsedColumn(), TimeRemainingColumn(), console=console) as progress:
-        task = progress.add_task("frames", total=len(extent.settings) * extent.scenes * extent.frames)
-        try:
-            rows = compare_defenses(plan, jobs, lambda: progress.advance(task))
-        except NoGeometry as error:
-            raise typer.BadParameter(str(error), param_hint="--detector") from error
+    with blaming("--data", SceneError), progress(console) as bar:
+        task = bar.add_task("frames", total=len(extent.settings) * extent.scenes * extent.frames)
+        rows = compare_defenses(plan, jobs, lambda: bar.advance(task))
     given = {
-        "--seed": [str(seed)],
+        "--seed": seed,
         "--only": only,
         "--defense": defense,
         "--quick": quick,
@@ -93,58 +100,50 @@ def run(
         "--scenes": scenes,
         "--frames": frames,
         "--recordings": None if recordings is None else "DIR",
-        "--pose-error": f"{pose_error:g}" if pose_error else None,
+        "--pose-error": pose_error or None,
         "--live": live,
         "--jobs": jobs if jobs > 1 else None,
         "--detector": detector if detector != DEFAULT_DETECTOR else None,
+        "--data": data if data != DEFAULT_DATA else None,
     }
-    path = write_comparison(rows, plan, out, command(given))
+    path = write_comparison(rows, plan, out, command("compare --out DIR", given))
     console.print(f"{path}: {len(rows)} rows in {(time.monotonic() - started) / 60:.1f} minutes")
 
 
-def command(given: Mapping[str, object]) -> str:
-    """The command with these options: lists are repeated, True is a flag, None and False are left out."""
-    words = ["robosac", "compare", "--out", "DIR"]
-    for option, value in given.items():
-        if value is True:
-            words.append(option)
-        elif value is not None and value is not False:
-            for each in value if isinstance(value, list) else [value]:
-                words += [option, str(each)]
-    return shlex.join(words)
+def _possible(extent: Extent, detector: Detector, asked: bool) -> tuple[tuple[Setting, ...], list[str]]:
+    """The settings that the detector can be attacked in, and why others are left out; to ask for one of those fails."""
+    faults = {setting: lacking(load_campaign(setting.campaign), detector) for setting in extent.settings}
+    impossible = [f"{setting.label}: {fault}" for setting, fault in faults.items() if fault]
+    if impossible and (asked or len(impossible) == len(faults)):
+        raise typer.BadParameter("; ".join(impossible), param_hint="--detector")
+    return tuple(setting for setting, fault in faults.items() if not fault), impossible
 
 
-def _defenses(only: Sequence[str], own: Sequence[str], detector: Detector) -> dict[str, Defense]:
-    """What is compared, by name: the defences that ship, or only some of them, and one's own."""
-    unknown = sorted(set(only) - set(DEFENSES))
-    if unknown:
-        raise typer.BadParameter(f"unknown {', '.join(unknown)}; known: {', '.join(DEFENSES)}", param_hint="--only")
+def _defenses(only: Sequence[str], own: Sequence[str], detector: Detector) -> tuple[dict[str, Defense], list[str]]:
+    """What is compared, by name: the defences that ship, or only some of them, and one's own.
+
+    Those that the detector is not calibrated for are left out, and it is said why; to ask for one of them fails.
+    """
+    check_known(only, DEFENSES, "--only")
     chosen = {name: settings for name, settings in DEFENSES.items() if not only or name in only}
-    try:
+    with blaming("--defense", ValueError):
         for name in own:
             if name in DEFENSES:
                 raise ValueError(f"{name} ships and has its column: see --only")
             chosen[name] = defenses.load(name)
-        return built(chosen, detector)
-    except ValueError as error:
-        raise typer.BadParameter(str(error), param_hint="--defense") from error
+        made, left_out = built(chosen, detector)
+        reasons = [f"{name}: {why}" for name, why in left_out.items()]
+        if not left_out.keys().isdisjoint((*only, *own)):
+            raise ValueError("; ".join(reasons))
+        return made, reasons
 
 
 def _extent(extent: Extent, settings: list[str] | tuple[()], scenes: int | None, frames: int | None) -> Extent:
-    try:
+    with blaming("--setting", ValueError):
         chosen = tuple(dict.fromkeys(Setting.parse(text) for text in settings))
-    except ValueError as error:
-        raise typer.BadParameter(str(error), param_hint="--setting") from error
     return replace(
         extent,
         settings=chosen or extent.settings,
         scenes=scenes or extent.scenes,
         frames=frames or extent.frames,
     )
-
-
-def _make_folder(path: Path, option: str) -> None:
-    try:
-        path.mkdir(parents=True, exist_ok=True)
-    except OSError as error:
-        raise typer.BadParameter(str(error), param_hint=option) from error

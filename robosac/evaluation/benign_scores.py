@@ -8,30 +8,28 @@ from robosac.answers import Verdict
 from robosac.consensus import at_least, compare
 from robosac.detectors import Detector
 from robosac.evaluation.frames import encode_all
-from robosac.scenes import IntersectionScene
+from robosac.scenes import Scene
 
 
 def single_teammate_indices(
-    detector: Detector, seeds: Sequence[int], tick: Callable[[], None] = lambda: None
+    detector: Detector, scenes: Sequence[Scene], tick: Callable[[], None] = lambda: None
 ) -> list[float]:
     """Jaccard indices of the ego fused with one honest teammate against the ego alone, ascending.
 
-    One frame of every scene, the cars taking turns as ego, every teammate in turn; fusions without evidence are left
-    out.
+    The first frame of every scene counts, and every teammate in it; the scenes' vehicles take turns as ego. Fusions
+    without evidence are left out.
 
     Parameters
     ----------
     detector : Detector
-    seeds : sequence of int
-        Scenes.
+    scenes : sequence of Scene
     tick : callable
         Called after each scene.
     """
     indices = []
-    for turn, seed in enumerate(seeds):
-        scene = IntersectionScene(seed)
+    for turn, scene in enumerate(scenes):
         messages = encode_all(detector, scene.frame(0))
-        ego_id = f"car-{turn % scene.car_agents + 1}"
+        ego_id = scene.egos[turn % len(scene.egos)]
         frame = detector.prepare(messages.pop(ego_id), messages)
         own = at_least(frame.detect(), detector.info.consensus_score)
         for name in messages:

@@ -3,16 +3,15 @@
 from __future__ import annotations
 
 from collections.abc import Callable, Iterable, Mapping, Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from itertools import combinations
 
 import numpy as np
 
 from robosac.answers import Verdict
 from robosac.attacks import Attack, Campaign
-from robosac.consensus import at_least, compare
+from robosac.consensus import compare
 from robosac.defenses import SampleConsensus
-from robosac.detectors import Detector, PreparedFrame
 from robosac.evaluation.average_precision import AveragePrecision
 from robosac.evaluation.frames import DecodedOnce, EvaluationFrame
 from robosac.fusion import fuse
@@ -75,7 +74,6 @@ class BoundsReport:
 
 
 def evaluate_bounds(
-    detector: Detector,
     frames: Iterable[EvaluationFrame | None],
     attack: Attack | Campaign,
     *,
@@ -90,9 +88,8 @@ def evaluate_bounds(
 
     Parameters
     ----------
-    detector : Detector
     frames : iterable of EvaluationFrame or None
-        From `robosac.evaluation.frames`, made with this detector, attack and number of attackers; None is skipped.
+        From `robosac.evaluation.frames`, made with this attack and number of attackers; None is skipped.
     attack : Attack or Campaign
     attackers : int
         Among the five teammates: the ratio that the defence assumes.
@@ -122,7 +119,7 @@ def evaluate_bounds(
         ratio, sampling_budget=budgets[0], collaborators=collaborators
     )
     samplers["gateway default"] = SampleConsensus(ratio)
-    table = _Table(detector, collaborators, samplers, repeats)
+    table = _Table(collaborators, samplers, repeats)
     for index, frame in enumerate(frames):
         table.add(frame, [seed, 1, index])  # each row has the same luck, whatever else is evaluated
         tick()
@@ -130,10 +127,7 @@ def evaluate_bounds(
 
 
 class _Table:
-    def __init__(
-        self, detector: Detector, collaborators: int, samplers: Mapping[str, SampleConsensus], repeats: int
-    ) -> None:
-        self._detector = detector
+    def __init__(self, collaborators: int, samplers: Mapping[str, SampleConsensus], repeats: int) -> None:
         self._s = collaborators
         self._samplers = samplers
         self._repeats = repeats
@@ -149,34 +143,31 @@ class _Table:
         if frame is None:
             self._skipped += 1
             return
-        benign = DecodedOnce(self._detector, frame.ego, frame.benign)
-        received = DecodedOnce(self._detector, frame.ego, frame.received)
+        benign, received = DecodedOnce.of(replace(frame, teammates=frame.benign)), DecodedOnce.of(frame)
         team = list(frame.benign)
         for subset in combinations(team, self._s):
             self._ap[f"{self._s} benign"].add(benign.detect(subset), frame.truth)
         self._ap["all benign"].add(benign.detect(team), frame.truth)
         self._ap["ego only"].add(benign.detect(), frame.truth)
         self._ap["no defence"].add(received.detect(team), frame.truth)
-        self._judge_all(received, frame)
+        self._judge_all(received)
         for name in self._samplers:
             for repeat in range(self._repeats):
-                self._sample(received, frame, name, np.random.default_rng([*seed, repeat]))
+                self._sample(received, name, np.random.default_rng([*seed, repeat]))
         magnitudes = np.abs(np.concatenate([t.ravel() for m in frame.benign.values() for t in m.tensors.values()]))
         self._magnitudes.append(float(np.percentile(magnitudes, 95)))
         self._frames += 1
 
-    def _judge_all(self, received: PreparedFrame, frame: EvaluationFrame) -> None:
-        score = self._detector.info.consensus_score
-        reference = at_least(received.detect(), score)
+    def _judge_all(self, frame: DecodedOnce) -> None:
         for subset in combinations(frame.benign, self._s):
-            verdict = compare(reference, at_least(received.detect(subset), score)).verdict
+            verdict = compare(frame.confident(), frame.confident(subset)).verdict
             if frame.attackers.isdisjoint(subset):
                 self._refused.append(verdict is Verdict.DISSENSUS)
             else:
                 self._missed.append(verdict is Verdict.CONSENSUS)
 
-    def _sample(self, received: DecodedOnce, frame: EvaluationFrame, name: str, rng: np.random.Generator) -> None:
-        result = fuse(received, self._samplers[name], frame.ego, frame.received, rng=rng)
+    def _sample(self, frame: DecodedOnce, name: str, rng: np.random.Generator) -> None:
+        result = fuse(frame, self._samplers[name], frame.ego, frame.teammates, rng=rng)
         self._ap[name].add(result.boxes, frame.truth)
         infiltrated = not frame.attackers.isdisjoint(result.accepted)
         self._runs[name].append((result.sampling_steps, bool(result.accepted), infiltrated))

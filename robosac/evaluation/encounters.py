@@ -1,22 +1,19 @@
-"""Test sequences as one ego meets them under a campaign; the same ones whoever asks, in whatever order."""
+"""Sequences as one ego meets them under a campaign; the same ones whoever asks, in whatever order."""
 
 from __future__ import annotations
 
 import zlib
-from collections.abc import Callable, Collection, Iterator, Mapping, Sequence
-from dataclasses import dataclass
+from collections.abc import Callable, Collection, Iterator, Sequence
 from typing import NamedTuple
 
 import numpy as np
 
 from robosac.attacks import BEHAVIOURS, HONEST, load_campaign
 from robosac.attacks.campaign import SEPARATOR
-from robosac.boxes import FloatArray
-from robosac.detectors import Detector, DetectorInfo, Message, PreparedFrame
-from robosac.evaluation.frames import EvaluationFrame, encode_all, misplaced, under_attack
-from robosac.scenes import IntersectionScene
+from robosac.detectors import Detector
+from robosac.evaluation.frames import EvaluationFrame, Sensed, under_attack
+from robosac.scenes import Scene
 
-EGO = "car-1"
 _POSES = 53
 _ATTACK = 54
 
@@ -48,7 +45,7 @@ def _unscheduled(campaign: str) -> str:
 
 
 class Encounters:
-    """Frames of test sequences as `EGO` meets them.
+    """Frames of sequences as the first ego of a scene meets them.
 
     Parameters
     ----------
@@ -64,106 +61,56 @@ class Encounters:
         self._detector = detector
         self._seed = seed
         self._pose_error_m = pose_error_m
-        self._scene: int | None = None
-        self._sensed: list[tuple[dict[str, Message], FloatArray]] = []
+        self._scene: Scene | None = None
+        self._sensed: list[Sensed] = []
 
-    def met(self, scene: int, frames: int, act: Act, indices: Sequence[int]) -> Iterator[EvaluationFrame]:
-        """Frames of a sequence in all of which the same is done.
+    def sequence(
+        self,
+        scene: Scene,
+        frames: int,
+        campaign: str = HONEST,
+        attackers: Collection[str] = (),
+        tick: Callable[[], None] = lambda: None,
+    ) -> list[EvaluationFrame]:
+        """A scene's first frames; nothing of them is decoded yet.
 
         Parameters
         ----------
-        scene : int
-            Its seed. What was sensed in it is held until the next one is asked for.
+        scene : Scene
         frames : int
-            Of the sequence, at 5 Hz.
-        act : Act
-        indices : sequence of int
-            Numbers of the frames.
+        campaign : str
+            As `robosac.attacks.load_campaign` takes it.
+        attackers : collection of str
+            Under the adversary's control.
+        tick : callable
+            Called after each frame.
+        """
+        chosen = acts(campaign, attackers, frames)
+        sequence: dict[int, EvaluationFrame] = {}
+        for act in dict.fromkeys(chosen):
+            indices = [index for index, other in enumerate(chosen) if other == act]
+            for index, met in zip(indices, self.met(scene, frames, act, indices), strict=True):
+                sequence[index] = met
+                tick()
+        return [sequence[index] for index in range(frames)]
+
+    def met(self, scene: Scene, frames: int, act: Act, indices: Sequence[int]) -> Iterator[EvaluationFrame]:
+        """Those frames of a sequence that have these numbers, if the same is done in all of them.
+
+        What was sensed in a scene is held until the next scene is asked for.
         """
         self._sense(scene, frames)
         campaign = load_campaign(act.attack)
         stream = zlib.crc32(repr(tuple(act)).encode())
         for index in indices:
-            messages, truth = self._sensed[index]
-            rng = np.random.default_rng([self._seed, _ATTACK, scene, index, stream])
-            yield under_attack(self._detector, messages, truth, EGO, act.acting, campaign, rng, index)
+            rng = np.random.default_rng([self._seed, _ATTACK, scene.number, index, stream])
+            yield under_attack(self._detector, self._sensed[index], act.acting, campaign, rng)
 
-    def _sense(self, scene: int, frames: int) -> None:
+    def _sense(self, scene: Scene, frames: int) -> None:
         if scene == self._scene and len(self._sensed) >= frames:
             return
         self._scene, self._sensed = scene, []
-        for index, frame in enumerate(IntersectionScene(scene).frames(frames)):
-            poses = np.random.default_rng([scene, _POSES, index])
-            messages = {
-                name: message if name == EGO else misplaced(message, self._pose_error_m, poses)
-                for name, message in encode_all(self._detector, frame).items()
-            }
-            self._sensed.append((messages, frame.truth(EGO)))
-
-
-@dataclass(frozen=True)
-class LiveFrame:
-    """A test frame that is decoded by the detector itself, whenever it is asked."""
-
-    detector: Detector
-    met: EvaluationFrame
-
-    @property
-    def info(self) -> DetectorInfo:
-        """The detector's."""
-        return self.detector.info
-
-    @property
-    def ego(self) -> Message:
-        """The ego's message."""
-        return self.met.ego
-
-    @property
-    def teammates(self) -> Mapping[str, Message]:
-        """The teammates' messages, as received."""
-        return self.met.received
-
-    @property
-    def team(self) -> tuple[str, ...]:
-        """Teammates, sorted."""
-        return tuple(sorted(self.met.received))
-
-    @property
-    def attackers(self) -> frozenset[str]:
-        """Those whose message of this frame is not honest."""
-        return self.met.attackers
-
-    @property
-    def truth(self) -> FloatArray:
-        """True boxes (G, 5), ego frame."""
-        return self.met.truth
-
-    def prepare(self, ego: Message, teammates: Mapping[str, Message]) -> PreparedFrame:
-        """As the detector does."""
-        return self.detector.prepare(ego, teammates)
-
-
-class Live:
-    """Test sequences of which nothing is decoded in advance; parameters as those of `Encounters`."""
-
-    def __init__(self, detector: Detector, *, seed: int = 0, pose_error_m: float = 0.0) -> None:
-        self._detector = detector
-        self._encounters = Encounters(detector, seed=seed, pose_error_m=pose_error_m)
-
-    def sequence(
-        self,
-        scene: int,
-        frames: int,
-        campaign: str = HONEST,
-        attackers: Collection[str] = (),
-        tick: Callable[[], None] = lambda: None,
-    ) -> list[LiveFrame]:
-        """A scene's first frames, as `robosac.evaluation.recordings.Recordings.sequence` has them."""
-        chosen = acts(campaign, attackers, frames)
-        sequence: dict[int, LiveFrame] = {}
-        for act in dict.fromkeys(chosen):
-            indices = [index for index, other in enumerate(chosen) if other == act]
-            for index, met in zip(indices, self._encounters.met(scene, frames, act, indices), strict=True):
-                sequence[index] = LiveFrame(self._detector, met)
-                tick()
-        return [sequence[index] for index in range(frames)]
+        for index in range(frames):
+            rng = np.random.default_rng([scene.number, _POSES, index])
+            frame = scene.frame(index)
+            self._sensed.append(Sensed.of(self._detector, frame, scene.egos[0], self._pose_error_m, rng))

@@ -1,18 +1,19 @@
-"""Test frames as their egos meet them: messages, some of them an attacker's, and true boxes."""
+"""Frames as their egos meet them: messages, some of them an attacker's, and true boxes."""
 
 from __future__ import annotations
 
-from collections.abc import Collection, Iterator, Mapping, Sequence
+from collections.abc import Collection, Iterable, Iterator, Mapping
 from dataclasses import dataclass
-from pathlib import Path
+from functools import cached_property
 
 import numpy as np
 
 from robosac.attacks import Attack, Campaign
 from robosac.boxes import FloatArray, pose_matrix
-from robosac.detectors import Detector, Message, PreparedFrame, V2XSimDetector
+from robosac.consensus import at_least
+from robosac.detectors import Detector, DetectorInfo, Message, PreparedFrame
 from robosac.detectors.base import for_role
-from robosac.scenes import FRAMES_PER_SECOND, IntersectionScene, SceneFrame, v2xsim
+from robosac.scenes import Frame, Scene, SceneError, seconds_apart
 
 YAW_PER_METRE = np.deg2rad(2.0)
 """Standard deviation of the heading's error for each metre of the position's."""
@@ -20,28 +21,77 @@ YAW_PER_METRE = np.deg2rad(2.0)
 
 @dataclass(frozen=True)
 class EvaluationFrame:
-    """One test frame as its ego meets it.
+    """One frame as its ego meets it.
 
     Attributes
     ----------
+    detector : Detector
     ego : Message
-    benign : dict of teammate to Message
-    received : dict of teammate to Message
-        With the attackers' messages in place of their benign ones.
+    benign : mapping of teammate to Message
+        What honest teammates would send.
+    teammates : mapping of teammate to Message
+        What is received: the attackers' messages stand in the place of their benign ones.
     attackers : frozenset of str
         Those whose message of this frame is not what an honest one would send.
     truth : (G, 5) ndarray
         Ego frame.
     """
 
+    detector: Detector
     ego: Message
-    benign: dict[str, Message]
-    received: dict[str, Message]
+    benign: Mapping[str, Message]
+    teammates: Mapping[str, Message]
     attackers: frozenset[str]
     truth: FloatArray
 
+    @property
+    def info(self) -> DetectorInfo:
+        """The detector's."""
+        return self.detector.info
 
-def encode_all(detector: Detector, frame: SceneFrame) -> dict[str, Message]:
+    @property
+    def team(self) -> tuple[str, ...]:
+        """Teammates, sorted."""
+        return tuple(sorted(self.teammates))
+
+    def prepare(self, ego: Message, teammates: Mapping[str, Message]) -> PreparedFrame:
+        """As the detector does."""
+        return self.detector.prepare(ego, teammates)
+
+
+class DecodedOnce(EvaluationFrame):
+    """A frame in which each subset is decoded once, whoever asks."""
+
+    @classmethod
+    def of(cls, frame: EvaluationFrame) -> DecodedOnce:
+        """The same frame; nothing of it is decoded yet."""
+        return cls(**{name: getattr(frame, name) for name in EvaluationFrame.__dataclass_fields__})
+
+    @cached_property
+    def _prepared(self) -> PreparedFrame:
+        return self.detector.prepare(self.ego, self.teammates)
+
+    @cached_property
+    def _boxes(self) -> dict[frozenset[str], FloatArray]:
+        return {}
+
+    def prepare(self, ego: Message, teammates: Mapping[str, Message]) -> PreparedFrame:  # noqa: ARG002 (always the same)
+        """The frame itself."""
+        return self
+
+    def detect(self, teammates: Collection[str] = ()) -> FloatArray:
+        """Boxes (n, 6) of a subset."""
+        key = frozenset(teammates)
+        if key not in self._boxes:
+            self._boxes[key] = self._prepared.detect(teammates)
+        return self._boxes[key]
+
+    def confident(self, teammates: Collection[str] = ()) -> FloatArray:
+        """Boxes of a subset that take part in the consensus test."""
+        return at_least(self.detect(teammates), self.info.consensus_score)
+
+
+def encode_all(detector: Detector, frame: Frame) -> dict[str, Message]:
     """Every agent's message, with all that it would send as an ego."""
     return {name: detector.encode(view.points, view.pose) for name, view in frame.views.items()}
 
@@ -59,117 +109,86 @@ def misplaced(message: Message, pose_error_m: float, rng: np.random.Generator) -
     return Message(wrong, message.tensors)
 
 
-def under_attack(
-    detector: Detector,
-    messages: Mapping[str, Message],
-    truth: FloatArray,
-    ego_id: str,
-    attackers: Collection[str],
-    attack: Attack | Campaign,
-    rng: np.random.Generator,
-    index: int = 0,
-) -> EvaluationFrame:
-    """One instant as one ego meets it, with some teammates under the adversary's control.
+@dataclass(frozen=True)
+class Sensed:
+    """One frame before anybody attacks.
 
-    Parameters
+    Attributes
     ----------
-    detector : Detector
+    index : int
+        Its number in the scene, which a campaign's schedule goes by.
+    ego_id : str
     messages : mapping of agent to Message
         Everybody's, the ego's among them, each with all that it would send as an ego.
     truth : (G, 5) ndarray
         For that ego, in its frame.
-    ego_id : str
-    attackers : collection of str
-        Optimised jointly.
-    attack : Attack or Campaign
-    rng : numpy.random.Generator
-        The attack's.
-    index : int
-        The frame's number in its sequence, which a campaign's schedule goes by.
     """
-    ego = messages[ego_id]
-    benign = {name: for_role(m, detector.info, "teammate") for name, m in messages.items() if name != ego_id}
-    sent = Campaign.of(attack).messages(detector, ego, benign, attackers, index, rng)
-    return EvaluationFrame(ego, benign, {**benign, **sent}, frozenset(sent), truth)
+
+    index: int
+    ego_id: str
+    messages: Mapping[str, Message]
+    truth: FloatArray
+
+    @classmethod
+    def of(cls, detector: Detector, frame: Frame, ego_id: str, pose_error_m: float, rng: np.random.Generator) -> Sensed:
+        """Encode all views; each teammate is wrong about its pose, as `misplaced` has it.
+
+        Raises
+        ------
+        SceneError
+            If the ego is not in the frame.
+        """
+        if ego_id not in frame.views:
+            raise SceneError(f"frame {frame.index}: {ego_id} is to be the ego, and is not there")
+        messages = encode_all(detector, frame)
+        placed = {n: m if n == ego_id else misplaced(m, pose_error_m, rng) for n, m in messages.items()}
+        return cls(frame.index, ego_id, placed, frame.truth(ego_id))
+
+
+def under_attack(
+    detector: Detector,
+    sensed: Sensed,
+    attackers: Collection[str],
+    attack: Attack | Campaign,
+    rng: np.random.Generator,
+) -> EvaluationFrame:
+    """One frame with some teammates under the adversary's control, who optimises their messages together.
+
+    Those who are not in the frame send nothing. ``rng`` is the attack's.
+    """
+    ego = sensed.messages[sensed.ego_id]
+    others = {name: message for name, message in sensed.messages.items() if name != sensed.ego_id}
+    benign = {name: for_role(message, detector.info, "teammate") for name, message in others.items()}
+    present = [name for name in attackers if name in benign]
+    sent = Campaign.of(attack).messages(detector, ego, benign, present, sensed.index, rng)
+    return EvaluationFrame(detector, ego, benign, {**benign, **sent}, frozenset(sent), sensed.truth)
 
 
 def evaluation_frames(
     detector: Detector,
-    seeds: Sequence[int],
+    scenes: Iterable[Scene],
     frames_per_scene: int,
     attack: Attack | Campaign,
     attackers: int,
     rng: np.random.Generator,
-) -> Iterator[EvaluationFrame]:
-    """Frames 1 s apart of every scene, the cars taking turns as ego, random teammates attacking."""
-    turn = 0
-    for seed in seeds:
-        scene = IntersectionScene(seed)
-        for frame in scene.frames(frames_per_scene, stride=FRAMES_PER_SECOND):
-            ego_id = f"car-{turn % scene.car_agents + 1}"
-            turn += 1
-            chosen = _draw(set(scene.agents) - {ego_id}, attackers, rng)
-            messages, truth = encode_all(detector, frame), frame.truth(ego_id)
-            yield under_attack(detector, messages, truth, ego_id, chosen, attack, rng, frame.index)
-
-
-def v2xsim_frames(
-    detector: V2XSimDetector,
-    root: Path,
-    scenes: Sequence[int],
-    frames_per_scene: int,
-    attack: Attack | Campaign,
-    attackers: int,
-    collaborators: int,
-    rng: np.random.Generator,
+    team: int = 1,
 ) -> Iterator[EvaluationFrame | None]:
-    """The same of V2X-Sim samples: every fifth frame of each scene, its vehicles taking turns as ego.
+    """Frames 1 s apart of every scene, its vehicles taking turns as ego, random teammates attacking.
 
     Yields
     ------
     EvaluationFrame or None
-        None for a frame in which there is no vehicle, or fewer than ``attackers + collaborators`` teammates.
-
-    Raises
-    ------
-    robosac.scenes.v2xsim.SampleError
-        If a file is not a sample.
+        None for a frame in which there is no ego, or fewer than ``team`` teammates.
     """
     turn = 0
     for scene in scenes:
-        for frame in v2xsim.frames(root, scene, frames_per_scene, stride=FRAMES_PER_SECOND):
-            vehicles = sorted(set(frame.samples) - {v2xsim.ROADSIDE_UNIT})
-            if not vehicles or len(frame.samples) - 1 < attackers + collaborators:
+        for frame in seconds_apart(scene, frames_per_scene):
+            egos = [name for name in scene.egos if name in frame.views]
+            if not egos or len(frame.views) - 1 < team:
                 yield None
                 continue
-            ego_id = vehicles[turn % len(vehicles)]
+            ego_id = egos[turn % len(egos)]
             turn += 1
-            messages = {
-                name: detector.encode_grid(sample.grid, frame.pose(name)) for name, sample in frame.samples.items()
-            }
-            chosen = _draw(set(messages) - {ego_id}, attackers, rng)
-            yield under_attack(detector, messages, frame.truth(ego_id), ego_id, chosen, attack, rng, frame.index)
-
-
-def _draw(team: Collection[str], attackers: int, rng: np.random.Generator) -> list[str]:
-    return [str(name) for name in rng.choice(sorted(team), attackers, replace=False)]
-
-
-class DecodedOnce:
-    """A prepared frame that decodes each subset once, posing as the detector that prepared it."""
-
-    def __init__(self, detector: Detector, ego: Message, teammates: Mapping[str, Message]) -> None:
-        self.info = detector.info
-        self._prepared = detector.prepare(ego, teammates)
-        self._boxes: dict[frozenset[str], FloatArray] = {}
-
-    def prepare(self, ego: Message, teammates: Mapping[str, Message]) -> PreparedFrame:  # noqa: ARG002 (always the same)
-        """The frame itself."""
-        return self
-
-    def detect(self, teammates: Collection[str] = ()) -> FloatArray:
-        """Boxes of a subset, decoded at most once."""
-        key = frozenset(teammates)
-        if key not in self._boxes:
-            self._boxes[key] = self._prepared.detect(teammates)
-        return self._boxes[key]
+            drawn = rng.choice(sorted(set(frame.views) - {ego_id}), attackers, replace=False)
+            sensed = Sensed.of(detector, frame, ego_id, 0.0, rng)
+            yield under_attack(detector, sensed, [str(name) for name in drawn], attack, rng)

@@ -79,7 +79,8 @@ def play(defense: Defense, sequence: Sequence[PlayableFrame], rng: np.random.Gen
     FaultyDefense
         If a fusion failed.
     """
-    session = Session(sequence[0], sequence[0].team, defense, rng=rng)
+    team = sorted({name for frame in sequence for name in frame.team})
+    session = Session(sequence[0], team, defense, rng=rng)
     answers = []
     for index, frame in enumerate(sequence):
         started = time.perf_counter()

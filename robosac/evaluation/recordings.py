@@ -18,6 +18,7 @@ from robosac.boxes import FloatArray
 from robosac.detectors import Detector, DetectorInfo, Message, PreparedFrame
 from robosac.evaluation.encounters import NOBODY_ACTS, Act, Encounters, acts
 from robosac.evaluation.frames import EvaluationFrame
+from robosac.scenes import DEFAULT_DATA, Scene
 
 Subset = frozenset[str]
 FORMAT = 1
@@ -73,30 +74,27 @@ class RecordedFrame:
         return self.boxes[frozenset(teammates)]
 
 
-def record(detector: Detector, frame: EvaluationFrame, unattacked: RecordedFrame | None = None) -> RecordedFrame:
+def record(frame: EvaluationFrame, unattacked: RecordedFrame | None = None) -> RecordedFrame:
     """Decode all subsets of a frame's teammates, ``2 ** S`` of them; boxes are rounded to float32, as files hold them.
 
     Parameters
     ----------
-    detector : Detector
     frame : EvaluationFrame
     unattacked : RecordedFrame, optional
         The same frame without an attack, to take the subsets without an attacker from.
     """
-    prepared = detector.prepare(frame.ego, frame.received)
-    team = tuple(sorted(frame.received))
+    prepared = frame.prepare(frame.ego, frame.teammates)
     boxes: dict[Subset, FloatArray] = {}
-    for size in range(len(team) + 1):
-        for subset in combinations(team, size):
-            if unattacked is not None and frame.attackers.isdisjoint(subset):
-                boxes[frozenset(subset)] = unattacked.detect(subset)
-            else:
-                boxes[frozenset(subset)] = prepared.detect(subset).astype(np.float32).astype(np.float64)
-    return RecordedFrame(detector.info, frame.ego.pose, team, frame.attackers, frame.truth, boxes)
+    for subset in subsets(frame.team):
+        if unattacked is not None and frame.attackers.isdisjoint(subset):
+            boxes[subset] = unattacked.detect(subset)
+        else:
+            boxes[subset] = prepared.detect(sorted(subset)).astype(np.float32).astype(np.float64)
+    return RecordedFrame(frame.info, frame.ego.pose, frame.team, frame.attackers, frame.truth, boxes)
 
 
 class Recordings:
-    """Recorded frames of test sequences: as one ego meets them, under any campaign.
+    """Recorded frames of sequences, as one ego meets them under any campaign.
 
     A frame is determined by the scene, its number, the attack, who acts in it, and the seed, whatever else is recorded:
     a campaign's schedule only chooses among such frames, so campaigns share them.
@@ -106,46 +104,39 @@ class Recordings:
     detector : Detector
     folder : Path, optional
         Where they are kept and looked for; by default nowhere.
-    seed : int
-        Of attacks.
-    pose_error_m : float
-        Standard deviation of the error of each teammate's position along either axis, metres; the same errors whatever
-        the attack.
+    seed, pose_error_m : int, float
+        As for `Encounters`.
+    data : str
+        Name of the scenes' source.
     """
 
     def __init__(
-        self, detector: Detector, folder: Path | None = None, *, seed: int = 0, pose_error_m: float = 0.0
+        self,
+        detector: Detector,
+        folder: Path | None = None,
+        *,
+        seed: int = 0,
+        pose_error_m: float = 0.0,
+        data: str = DEFAULT_DATA,
     ) -> None:
         self._detector = detector
         self._folder = folder
         self._seed = seed
         self._pose_error_m = pose_error_m
+        self._data = data
         self._encounters = Encounters(detector, seed=seed, pose_error_m=pose_error_m)
-        self._scene: int | None = None
+        self._scene: Scene | None = None
         self._recorded: dict[Act, dict[int, RecordedFrame]] = {}
 
     def sequence(
         self,
-        scene: int,
+        scene: Scene,
         frames: int,
         campaign: str = HONEST,
         attackers: Collection[str] = (),
         tick: Callable[[], None] = lambda: None,
     ) -> list[RecordedFrame]:
-        """A scene's first frames at 5 Hz as `robosac.evaluation.encounters.EGO` meets them.
-
-        Parameters
-        ----------
-        scene : int
-            Its seed. What was recorded of one scene is held until the next one is asked for.
-        frames : int
-        campaign : str
-            As `robosac.attacks.load_campaign` takes it.
-        attackers : collection of str
-            Under the adversary's control.
-        tick : callable
-            Called after each frame.
-        """
+        """As `Encounters.sequence`, recorded. What was recorded of a scene is held until the next is asked for."""
         if scene != self._scene:
             self._scene, self._recorded = scene, {}
         chosen = acts(campaign, attackers, frames)
@@ -161,9 +152,9 @@ class Recordings:
             tick()
         return sequence
 
-    def _complete(self, scene: int, frames: int, act: Act, indices: Sequence[int]) -> None:
+    def _complete(self, scene: Scene, frames: int, act: Act, indices: Sequence[int]) -> None:
         """Read or record the frames of these numbers."""
-        path = None if self._folder is None else self._folder / self._file(scene, act)
+        path = None if self._folder is None else self._folder / self._file(scene.number, act)
         known = self._recorded.setdefault(act, {})
         if not known and path is not None and path.exists():
             known.update(load(path, self._detector.info))
@@ -172,13 +163,14 @@ class Recordings:
             return
         for index, met in zip(missing, self._encounters.met(scene, frames, act, missing), strict=True):
             honest = self._recorded[NOBODY_ACTS][index] if act.acting else None
-            known[index] = record(self._detector, met, honest)
+            known[index] = record(met, honest)
         if path is not None:
             save(path, known)
 
     def _file(self, scene: int, act: Act) -> str:
         info = self._detector.info
-        identity = [FORMAT, info.name, info.weights_digest, scene, act.attack, *act.acting]
+        data = [self._data] if self._data != DEFAULT_DATA else []
+        identity = [FORMAT, *data, info.name, info.weights_digest, scene, act.attack, *act.acting]
         digest = hashlib.sha256(json.dumps([*identity, self._seed, self._pose_error_m]).encode()).hexdigest()
         return f"{scene}-{re.sub('[^A-Za-z0-9-]', '-', act.attack)}-{len(act.acting)}-{digest[:16]}.npz"
 
@@ -187,7 +179,7 @@ def save(path: Path, frames: Mapping[int, RecordedFrame]) -> None:
     """Write frames of one team, by their numbers, to an ``.npz`` file, which takes its place at once."""
     ordered = sorted(frames.items())
     head = [{"index": i, "attackers": sorted(f.attackers), "team": list(f.team)} for i, f in ordered]
-    subsets = [(f, boxes) for _, f in ordered for _, boxes in _in_order(f)]
+    boxes = [frame.boxes[subset] for _, frame in ordered for subset in subsets(frame.team)]
     partial = path.with_name(f"{path.stem}.{os.getpid()}.npz")
     np.savez_compressed(
         partial,
@@ -195,8 +187,8 @@ def save(path: Path, frames: Mapping[int, RecordedFrame]) -> None:
         pose=np.stack([f.pose for _, f in ordered]),
         truth=np.concatenate([f.truth for _, f in ordered]),
         truths=np.array([len(f.truth) for _, f in ordered]),
-        boxes=np.concatenate([boxes for _, boxes in subsets]).astype(np.float32),
-        counts=np.array([len(boxes) for _, boxes in subsets]),
+        boxes=np.concatenate(boxes).astype(np.float32),
+        counts=np.array([len(each) for each in boxes]),
     )
     partial.replace(path)
 
@@ -210,14 +202,11 @@ def load(path: Path, info: DetectorInfo) -> dict[int, RecordedFrame]:
     frames = {}
     for entry, pose, truth in zip(head, poses, truths, strict=True):
         team = tuple(entry["team"])
-        decoded = {subset: next(boxes) for subset in _subsets(team)}
+        decoded = {subset: next(boxes) for subset in subsets(team)}
         frames[entry["index"]] = RecordedFrame(info, pose, team, frozenset(entry["attackers"]), truth, decoded)
     return frames
 
 
-def _subsets(team: tuple[str, ...]) -> list[Subset]:
+def subsets(team: Sequence[str]) -> list[Subset]:
+    """All subsets of a team, the smaller ones first."""
     return [frozenset(c) for size in range(len(team) + 1) for c in combinations(team, size)]
-
-
-def _in_order(frame: RecordedFrame) -> list[tuple[Subset, FloatArray]]:
-    return [(subset, frame.boxes[subset]) for subset in _subsets(frame.team)]

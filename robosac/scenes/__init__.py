@@ -1,6 +1,47 @@
-"""Where sensor data comes from: the synthetic intersection."""
+"""Where scenes come from: the synthetic intersection, V2X-Sim samples, or the user's own data."""
 
-from robosac.scenes.intersection import FRAME_PERIOD_S, FRAMES_PER_SECOND, AgentView, IntersectionScene, SceneFrame
+from robosac.plugins import Kind
+from robosac.scenes.base import (
+    Frame,
+    Scene,
+    SceneError,
+    SceneSource,
+    Split,
+    View,
+    first_scenes,
+    seconds_apart,
+)
+from robosac.scenes.intersection import FRAME_PERIOD_S, AgentView, IntersectionScene, SceneFrame
 from robosac.scenes.lidar import Lidar
 
-__all__ = ["FRAMES_PER_SECOND", "FRAME_PERIOD_S", "AgentView", "IntersectionScene", "Lidar", "SceneFrame"]
+DEFAULT_DATA = "synthetic"
+DATA_HELP = "Where scenes come from: synthetic, v2x-sim:DIR, or module:callable."
+SOURCES: Kind[SceneSource] = Kind(
+    noun="scene source",
+    package="robosac.scenes",
+    contract=SceneSource,
+    name_of=lambda candidate: vars(candidate).get("kind", ""),
+    takes_argument=True,
+    forms="v2x-sim:DIR, or module:callable",
+    error=SceneError,
+)
+"""All sources by name; `Kind.make` makes one."""
+
+__all__ = [
+    "DATA_HELP",
+    "DEFAULT_DATA",
+    "FRAME_PERIOD_S",
+    "AgentView",
+    "Frame",
+    "IntersectionScene",
+    "Lidar",
+    "Scene",
+    "SceneError",
+    "SceneFrame",
+    "SceneSource",
+    "SOURCES",
+    "Split",
+    "View",
+    "first_scenes",
+    "seconds_apart",
+]

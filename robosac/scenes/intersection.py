@@ -2,38 +2,33 @@
 
 from __future__ import annotations
 
-from collections.abc import Iterator, Mapping
+from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, field
 from functools import cached_property
 
 import numpy as np
 
 from robosac.boxes import FloatArray, from_world, pose_matrix
+from robosac.scenes.base import Split, View
 from robosac.scenes.lidar import IntArray, Lidar
+from robosac.scenes.splits import TEST_SEEDS, VALIDATION_SEEDS
 from robosac.scenes.world import CAR_SENSOR_HEIGHT_M, RSU_HEIGHT_M, Traffic, build_traffic
 
-FRAMES_PER_SECOND = 5
-FRAME_PERIOD_S = 1 / FRAMES_PER_SECOND
+FRAME_PERIOD_S = 0.2
 TRUTH_MIN_HITS = 6
 TRUTH_RANGE_M = 31.0
 
 
 @dataclass(frozen=True)
-class AgentView:
-    """What one agent senses in one frame.
+class AgentView(View):
+    """What one agent senses in one frame; the z of its pose is the sensor's height above ground.
 
     Attributes
     ----------
-    pose : (4, 4) ndarray
-        world_from_sensor; its translation's z is the sensor's height above ground.
-    points : (P, 3) float32 ndarray
-        LiDAR returns in the sensor's frame, metres.
     hits : (V,) int ndarray
         Returns from each vehicle of the scene.
     """
 
-    pose: FloatArray
-    points: FloatArray
     hits: IntArray
 
 
@@ -106,15 +101,27 @@ class IntersectionScene:
     seed: int
     car_agents: int = 5
     lidar: Lidar = field(default_factory=Lidar)
+    length = None
+    frame_period_s = FRAME_PERIOD_S
 
     @cached_property
     def _traffic(self) -> Traffic:
         return build_traffic(np.random.default_rng([self.seed, 0]), self.car_agents)
 
     @property
+    def number(self) -> int:
+        """The seed."""
+        return self.seed
+
+    @property
+    def egos(self) -> tuple[str, ...]:
+        """The cars."""
+        return tuple(f"car-{i + 1}" for i in range(self.car_agents))
+
+    @property
     def agents(self) -> tuple[str, ...]:
         """Ids of all agents, the cars first."""
-        return (*(f"car-{i + 1}" for i in range(self.car_agents)), "rsu")
+        return (*self.egos, "rsu")
 
     def frame(self, index: int) -> SceneFrame:
         """The views of all agents at time ``index * 0.2 s``.
@@ -147,7 +154,12 @@ class IntersectionScene:
             views[agent] = AgentView(pose_matrix(x, y, height, yaw), points, all_hits[: len(vehicles)])
         return SceneFrame(index, vehicles, views, carriers)
 
-    def frames(self, count: int, start: int = 0, stride: int = 1) -> Iterator[SceneFrame]:
-        """``count`` frames from ``start``, every ``stride``-th."""
-        for i in range(count):
-            yield self.frame(start + i * stride)
+
+class Synthetic:
+    """Scenes of five cars and a roadside unit at the intersection; those of one purpose serve no other."""
+
+    kind = name = "synthetic"
+
+    def scenes(self, split: Split) -> Sequence[IntersectionScene]:
+        """A thousand scenes."""
+        return [IntersectionScene(seed) for seed in (TEST_SEEDS if split == "test" else VALIDATION_SEEDS)]

@@ -1,4 +1,4 @@
-"""Reader for preprocessed V2X-Sim samples, brought along by the user.
+"""Preprocessed V2X-Sim samples, brought along by the user, as scenes.
 
 A sample is ``<root>/agent{i}/{scene}_{frame}/0.npy``: a pickled dict, or the number 0 where the agent is absent. Agent
 0 is the roadside unit. Nothing but arrays is unpickled, see `robosac.scenes.plain_pickle`.
@@ -10,8 +10,9 @@ No sample was at hand when this was written. It follows the published implementa
 from __future__ import annotations
 
 import re
-from collections.abc import Iterator, Mapping
+from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
+from functools import cached_property
 from pathlib import Path
 from typing import Any
 
@@ -20,19 +21,23 @@ import numpy as np
 from robosac.boxes import FloatArray
 from robosac.detectors.v2xsim.anchors import anchor_boxes, decode, to_lidar
 from robosac.detectors.v2xsim.network import ANCHORS, CODE, GRID, LAYERS
-from robosac.detectors.v2xsim.voxels import BoolArray, from_indices
+from robosac.detectors.v2xsim.voxels import BOTTOM_M, ROADSIDE_BOTTOM_M, centres
+from robosac.scenes.base import SceneError, Split, View
 from robosac.scenes.plain_pickle import PlainArray, UnsafePickle, load_npy
 
 AGENTS = 6
 ROADSIDE_UNIT = "agent0"
+FRAME_PERIOD_S = 0.2
 _VOXELS = "voxel_indices_0"
 _MAPS = (GRID, GRID, ANCHORS)
 _FOLDER = re.compile(r"(\d+)_(\d+)")
+_SPLITS: Mapping[Split, str] = {"test": "test", "validation": "val"}
 
 _Array = np.ndarray[tuple[Any, ...], np.dtype[Any]]
+_Indices = np.ndarray[Any, np.dtype[np.int64]]
 
 
-class SampleError(ValueError):
+class SampleError(SceneError):
     """A file that is not a V2X-Sim sample."""
 
 
@@ -42,8 +47,8 @@ class V2XSimSample:
 
     Attributes
     ----------
-    grid : (256, 256, 13) bool ndarray
-        Occupancy, as `robosac.detectors.v2xsim.V2XSimDetector.encode_grid` takes it.
+    voxels : (K, 3) int64 ndarray
+        Occupied cells along +x, +y, +z of the sensor, see `robosac.detectors.v2xsim.voxels`.
     trans_matrices : (6, 4, 4) float64 ndarray
         [k] maps agent k's points into this agent's frame; zero for absent agents.
     truth : (G, 5) float64 ndarray
@@ -55,94 +60,149 @@ class V2XSimSample:
         Of each true box.
     """
 
-    grid: BoolArray
+    voxels: _Indices
     trans_matrices: FloatArray
     truth: FloatArray
-    category: np.ndarray[Any, np.dtype[np.int64]]
+    category: _Indices
 
 
 @dataclass(frozen=True)
 class V2XSimFrame:
-    """One instant of a scene.
+    """One instant of a scene; the world is the frame of the first agent present.
 
     Attributes
     ----------
-    scene, index : int
-    samples : mapping of agent id to V2XSimSample
-        Those present; ids are ``agent0`` to ``agent5``.
+    index : int
+        As its folder says.
+    views : mapping of agent id to View
+        Those present. Points are the centres of occupied voxels. The roadside unit's are moved down with its pose, by
+        5 m, so that its voxels are as high above its sensor as a vehicle's.
+    boxes : mapping of agent id to (G, 5) ndarray
+        True boxes, in that agent's frame.
     """
 
-    scene: int
     index: int
-    samples: Mapping[str, V2XSimSample]
-
-    def pose(self, agent: str) -> FloatArray:
-        """world_from_sensor (4, 4) of an agent; the world is the frame of the first agent present.
-
-        Raises
-        ------
-        SampleError
-            If that agent's sample does not say where this one is.
-        """
-        first = next(iter(self.samples.values()))
-        pose: FloatArray = first.trans_matrices[int(agent.removeprefix("agent"))]
-        if not np.allclose(pose[:3, :3] @ pose[:3, :3].T, np.eye(3), atol=1e-3):
-            raise SampleError(f"scene {self.scene}, frame {self.index}: no pose of {agent}")
-        return pose
+    views: Mapping[str, View]
+    boxes: Mapping[str, FloatArray]
 
     def truth(self, ego: str) -> FloatArray:
         """True boxes (G, 5) for an ego, in its LiDAR frame."""
-        return self.samples[ego].truth
+        return self.boxes[ego]
 
 
-def scenes(root: Path) -> dict[int, list[int]]:
-    """The scenes in a folder, and the indices of the frames of each, in order.
+@dataclass(frozen=True)
+class V2XSimScene:
+    """A scene at 5 Hz; its agents are those present in its first frame, ``agent1`` to ``agent5`` and ``agent0``.
+
+    From frame to frame the world stays where it is only if the roadside unit is present.
 
     Parameters
     ----------
     root : Path
-        The folder that holds ``agent0`` to ``agent5``; not all need to exist.
+        The folder that holds ``agent0`` to ``agent5``.
+    number : int
     """
+
+    root: Path
+    number: int
+    frame_period_s = FRAME_PERIOD_S
+
+    @cached_property
+    def _indices(self) -> list[int]:
+        return _listed(self.root)[self.number]
+
+    @property
+    def length(self) -> int:
+        """Number of frames that are listed."""
+        return len(self._indices)
+
+    @cached_property
+    def agents(self) -> tuple[str, ...]:
+        """Those present in the first frame, the roadside unit last."""
+        return tuple(sorted(self._samples(self._indices[0]), key=lambda name: (name == ROADSIDE_UNIT, name)))
+
+    @property
+    def egos(self) -> tuple[str, ...]:
+        """The vehicles among them."""
+        return tuple(name for name in self.agents if name != ROADSIDE_UNIT)
+
+    def frame(self, index: int) -> V2XSimFrame:
+        """The listed frame of a number.
+
+        Raises
+        ------
+        SampleError
+            If a file is not a sample, or does not say where a present agent is.
+        """
+        listed = self._indices[index]
+        samples = self._samples(listed)
+        views = {}
+        for name, sample in samples.items():
+            pose = next(iter(samples.values())).trans_matrices[int(name.removeprefix("agent"))].copy()
+            if not np.allclose(pose[:3, :3] @ pose[:3, :3].T, np.eye(3), atol=1e-3):
+                raise SampleError(f"{self.root}: scene {self.number}, frame {listed}: no pose of {name}")
+            if name == ROADSIDE_UNIT:
+                pose[:3, 3] += pose[:3, 2] * (ROADSIDE_BOTTOM_M - BOTTOM_M)
+            views[name] = View(pose, centres(sample.voxels))
+        return V2XSimFrame(listed, views, {name: sample.truth for name, sample in samples.items()})
+
+    def _samples(self, index: int) -> dict[str, V2XSimSample]:
+        paths = {f"agent{k}": self.root / f"agent{k}" / f"{self.number}_{index}" / "0.npy" for k in range(AGENTS)}
+        read = {name: read_sample(path) for name, path in paths.items() if path.exists()}
+        return {name: sample for name, sample in read.items() if sample is not None}
+
+
+class V2XSim:
+    """All scenes of a folder.
+
+    Parameters
+    ----------
+    root : Path or str
+        The folder that holds ``agent0`` to ``agent5``, not all of which need to exist: its scenes serve any purpose.
+        Or one with the folders ``test`` and ``val``, that hold them.
+
+    Raises
+    ------
+    SceneError
+        If there is no such folder.
+    """
+
+    kind = "v2x-sim"
+
+    def __init__(self, root: Path | str = ".") -> None:
+        self.root = Path(root)
+        if not self.root.is_dir():
+            raise SceneError(f"{self.root} is no folder")
+
+    @property
+    def name(self) -> str:
+        """``v2x-sim`` and the folder."""
+        return f"v2x-sim:{self.root.resolve()}"
+
+    def scenes(self, split: Split) -> Sequence[V2XSimScene]:
+        """The scenes by their numbers.
+
+        Raises
+        ------
+        SceneError
+            If there is none.
+        """
+        part = self.root / _SPLITS[split]
+        root = part if part.is_dir() else self.root
+        numbers = list(_listed(root))
+        if not numbers:
+            raise SceneError(f"no folder agent*/<scene>_<frame> in {root}")
+        return [V2XSimScene(root, number) for number in numbers]
+
+
+def _listed(root: Path) -> dict[int, list[int]]:
+    """Numbers of scenes, and of the frames of each."""
     found = [_FOLDER.fullmatch(folder.name) for folder in root.glob(f"agent[0-{AGENTS - 1}]/*_*")]
     listed: dict[int, set[int]] = {}
     for match in found:
         if match:
             listed.setdefault(int(match[1]), set()).add(int(match[2]))
     return {scene: sorted(listed[scene]) for scene in sorted(listed)}
-
-
-def frames(root: Path, scene: int, count: int | None = None, stride: int = 1) -> Iterator[V2XSimFrame]:
-    """Frames of a scene, in order, that at least one agent is present in.
-
-    Parameters
-    ----------
-    root : Path
-        As for `scenes`.
-    scene : int
-    count : int, optional
-        At most so many, by default all.
-    stride : int
-        Every so many of the frames listed.
-
-    Raises
-    ------
-    SampleError
-        If a file is not a sample.
-    FileNotFoundError
-        If there is no frame of that scene.
-    """
-    listed = scenes(root)
-    if scene not in listed:
-        raise FileNotFoundError(f"no frame of scene {scene} in {root}")
-    for index in listed[scene][::stride][:count]:
-        samples = {}
-        for agent in range(AGENTS):
-            path = root / f"agent{agent}" / f"{scene}_{index}" / "0.npy"
-            sample = read_sample(path) if path.exists() else None
-            if sample is not None:
-                samples[f"agent{agent}"] = sample
-        if samples:
-            yield V2XSimFrame(scene, index, samples)
 
 
 def read_sample(path: Path) -> V2XSimSample | None:
@@ -174,10 +234,10 @@ def _sample(fields: Mapping[Any, Any]) -> V2XSimSample:
     best = _indices(fields, "gt_max_iou", (*_MAPS, 2**31))
     anchor = np.ravel_multi_index((best[:, 0], best[:, 1], best[:, 2]), _MAPS)
     boxes = to_lidar(decode(anchor_boxes(anchor), _codes(fields, anchor)))
-    return V2XSimSample(from_indices(voxels), matrices, boxes, best[:, 3])
+    return V2XSimSample(voxels, matrices, boxes, best[:, 3])
 
 
-def _codes(fields: Mapping[Any, Any], anchor: np.ndarray[Any, np.dtype[np.int64]]) -> FloatArray:
+def _codes(fields: Mapping[Any, Any], anchor: _Indices) -> FloatArray:
     """Codes (G, 6) of the true boxes at these anchors (G,); zero, the anchor itself, where there is none."""
     allocated = np.flatnonzero(_array(fields, "allocation_mask", _MAPS))
     sparse = _array(fields, "reg_target_sparse", (len(allocated), 1, CODE))[:, 0].astype(np.float64)
@@ -192,7 +252,7 @@ def _codes(fields: Mapping[Any, Any], anchor: np.ndarray[Any, np.dtype[np.int64]
     return codes
 
 
-def _indices(fields: Mapping[Any, Any], name: str, limits: tuple[int, ...]) -> np.ndarray[Any, np.dtype[np.int64]]:
+def _indices(fields: Mapping[Any, Any], name: str, limits: tuple[int, ...]) -> _Indices:
     """Rows of whole numbers, each at least 0 and below its column's limit."""
     value = _array(fields, name, None)
     if value.size == 0:

@@ -10,7 +10,7 @@ import numpy as np
 
 from robosac.boxes import FloatArray, IntArray
 from robosac.detectors.voxels import GRID, LAYERS, occupancy
-from robosac.scenes import FRAMES_PER_SECOND, IntersectionScene, SceneFrame
+from robosac.scenes import FRAME_PERIOD_S, IntersectionScene, SceneFrame
 
 
 @dataclass(frozen=True)
@@ -56,7 +56,8 @@ def generate(seeds: Sequence[int], frames_per_scene: int, tick: Callable[[], Non
     """Frames 1 s apart of every scene; ``tick`` is called after each."""
     frames = []
     for seed in seeds:
-        for frame in IntersectionScene(seed).frames(frames_per_scene, stride=FRAMES_PER_SECOND):
-            frames.append(TrainingFrame.from_scene(frame))
+        scene = IntersectionScene(seed)
+        for second in range(frames_per_scene):
+            frames.append(TrainingFrame.from_scene(scene.frame(second * round(1 / FRAME_PERIOD_S))))
             tick()
     return frames

@@ -16,7 +16,7 @@ from robosac.detectors import EmbeddedDetector
 from robosac.detectors.network import MeanFusionNetwork
 from robosac.evaluation.average_precision import AveragePrecision
 from robosac.evaluation.frames import EvaluationFrame, evaluation_frames
-from robosac.scenes.splits import VALIDATION_SEEDS
+from robosac.scenes.intersection import Synthetic
 
 GAINS = (1.0, 0.7, 0.5, 0.4, 0.35, 0.3, 0.25, 0.2)
 CONSENSUS_SCORES = (0.2, 0.25, 0.3, 0.35, 0.4, 0.5)
@@ -80,7 +80,8 @@ def choose_operating_point(
     for gain in gains:
         detector = EmbeddedDetector.from_network(network, gain, SCORE_THRESHOLD, SCORE_THRESHOLD)
         rng = np.random.default_rng(0)
-        frames = list(evaluation_frames(detector, VALIDATION_SEEDS[:SCENES], FRAMES_PER_SCENE, PGD(), 1, rng))
+        scenes = Synthetic().scenes("validation")[:SCENES]
+        frames = list(filter(None, evaluation_frames(detector, scenes, FRAMES_PER_SCENE, PGD(), 1, rng)))
         figures = _average_precision(detector, frames)
         tick()
         if figures["no_defence_ap50"] <= figures["ego_only_ap50"] - harm:
@@ -96,7 +97,7 @@ def _average_precision(detector: EmbeddedDetector, frames: list[EvaluationFrame]
         benign = detector.prepare(frame.ego, frame.benign)
         ap["ego_only_ap50"].add(benign.detect(), frame.truth)
         ap["all_benign_ap50"].add(benign.detect(team), frame.truth)
-        ap["no_defence_ap50"].add(detector.prepare(frame.ego, frame.received).detect(team), frame.truth)
+        ap["no_defence_ap50"].add(detector.prepare(frame.ego, frame.teammates).detect(team), frame.truth)
     return {name: value.at(0.5) for name, value in ap.items()}
 
 
@@ -104,9 +105,9 @@ def _consensus_score(detector: EmbeddedDetector, frames: list[EvaluationFrame]) 
     benign: dict[float, list[float]] = {score: [] for score in CONSENSUS_SCORES}
     attacked: dict[float, list[float]] = {score: [] for score in CONSENSUS_SCORES}
     for frame in frames:
-        received = detector.prepare(frame.ego, frame.received)
+        received = detector.prepare(frame.ego, frame.teammates)
         ego_only = received.detect()
-        for subset in combinations(frame.received, HYPOTHESIS):
+        for subset in combinations(frame.teammates, HYPOTHESIS):
             fused = received.detect(subset)
             indices = benign if frame.attackers.isdisjoint(subset) else attacked
             for score in CONSENSUS_SCORES:

@@ -65,6 +65,18 @@ def from_indices(indices: np.ndarray[Any, np.dtype[Any]]) -> BoolArray:
     return grid
 
 
+def centres(indices: np.ndarray[Any, np.dtype[Any]], bottom_m: float = BOTTOM_M) -> FloatArray:
+    """Points (K, 3) in the middle of voxels (K, 3) that are listed as for `from_indices`.
+
+    `occupancy` of these points is the grid of these voxels.
+    """
+    low, high = np.array([-AREA_M, -AREA_M, bottom_m]), np.array([AREA_M, AREA_M, bottom_m + DEPTH_M])
+    cell = np.array([CELL_M, CELL_M, LAYER_M])
+    begin = (np.floor(low / cell) + indices) * cell
+    middle: FloatArray = (np.maximum(begin, low) + np.minimum(begin + cell, high)) / 2
+    return middle
+
+
 def pack(grid: BoolArray) -> ByteArray:
     """A grid as bits (256, 416): each row's columns and layers in C order, the first in a byte's highest bit."""
     return np.packbits(grid.reshape(GRID, -1), axis=1)

@@ -14,13 +14,16 @@ from robosac.defenses import Defense
 from robosac.detectors import Detector
 from robosac.evaluation.average_precision import Matched, match
 from robosac.evaluation.comparison.settings import Extent, Setting
-from robosac.evaluation.encounters import EGO, Live
+from robosac.evaluation.encounters import Encounters
 from robosac.evaluation.playing import FaultyDefense, PlayableFrame, play
 from robosac.evaluation.recordings import Recordings
-from robosac.scenes import IntersectionScene
+from robosac.scenes import Scene, SceneError, SceneSource, first_scenes
+from robosac.scenes.intersection import Synthetic
 
 ORACLE = "oracle"
 EGO_ONLY = "ego only"
+MOST_RECORDED = 8
+"""Teammates of a scene of whose frames all subsets are recorded."""
 
 
 @dataclass(frozen=True)
@@ -40,6 +43,7 @@ class Plan:
         Of the teammates, as `Recordings` takes it.
     live : bool
         Record nothing: each defence decodes for itself, and is timed.
+    data : SceneSource
     """
 
     detector: Detector
@@ -49,6 +53,25 @@ class Plan:
     recordings: Path | None = None
     pose_error_m: float = 0.0
     live: bool = False
+    data: SceneSource = field(default_factory=Synthetic)
+
+    def scenes(self) -> list[Scene]:
+        """The scenes that are played.
+
+        Raises
+        ------
+        SceneError
+            If the source has too few, or they are too short or have too few teammates for the settings.
+        """
+        team = max(1, *(setting.attackers for setting in self.extent.settings))
+        scenes = first_scenes(self.data, "test", self.extent.scenes, self.extent.frames, team)
+        largest = max(len(scene.agents) - 1 for scene in scenes)
+        if largest > MOST_RECORDED and not self.live:
+            raise SceneError(
+                f"{self.data.name} has {largest} teammates in a scene: {2**largest} subsets would be recorded in each "
+                "frame; compare live, so that only those are decoded that a defence asks for"
+            )
+        return scenes
 
     @property
     def rows(self) -> tuple[str, ...]:
@@ -117,15 +140,13 @@ class Played:
         self.passes.append(passes)
 
 
-def play_scene(
-    plan: Plan, scene_seed: int, tick: Callable[[], None] = lambda: None
-) -> dict[tuple[Setting, str], Played]:
-    """Every defence in every setting, in one test scene.
+def play_scene(plan: Plan, scene: Scene, tick: Callable[[], None] = lambda: None) -> dict[tuple[Setting, str], Played]:
+    """Every defence in every setting, in one scene.
 
     Parameters
     ----------
     plan : Plan
-    scene_seed : int
+    scene : Scene
     tick : callable
         Called after each frame of each setting.
 
@@ -134,19 +155,21 @@ def play_scene(
     FaultyDefense
         If a defence fails.
     """
-    source: Live | Recordings
+    source: Encounters | Recordings
     if plan.live:
-        source = Live(plan.detector, seed=plan.seed, pose_error_m=plan.pose_error_m)
+        source = Encounters(plan.detector, seed=plan.seed, pose_error_m=plan.pose_error_m)
     else:
-        source = Recordings(plan.detector, plan.recordings, seed=plan.seed, pose_error_m=plan.pose_error_m)
+        source = Recordings(
+            plan.detector, plan.recordings, seed=plan.seed, pose_error_m=plan.pose_error_m, data=plan.data.name
+        )
     played: dict[tuple[Setting, str], Played] = {}
     for setting in plan.extent.settings:
-        chosen = attackers(scene_seed, setting.attackers, plan.seed)
-        sequence = source.sequence(scene_seed, plan.extent.frames, setting.campaign, chosen, tick)
+        chosen = attackers(scene, setting.attackers, plan.seed)
+        sequence = source.sequence(scene, plan.extent.frames, setting.campaign, chosen, tick)
         matcher = _Matcher(sequence)
         played[setting, ORACLE] = _reference(sequence, matcher, _honest)
         for name, defense in plan.defenses.items():
-            rng = np.random.default_rng([plan.seed, scene_seed, zlib.crc32(name.encode())])
+            rng = np.random.default_rng([plan.seed, scene.number, zlib.crc32(name.encode())])
             try:
                 played[setting, name] = _play(defense, sequence, matcher, chosen, rng)
             except FaultyDefense as fault:
@@ -155,10 +178,10 @@ def play_scene(
     return played
 
 
-def attackers(scene_seed: int, count: int, seed: int) -> list[str]:
+def attackers(scene: Scene, count: int, seed: int) -> list[str]:
     """Teammates of the scene that are under the adversary's control; the same ones and more with a higher count."""
-    team = sorted(set(IntersectionScene(scene_seed).agents) - {EGO})
-    order = np.random.default_rng([seed, scene_seed]).permutation(len(team))
+    team = sorted(set(scene.agents) - {scene.egos[0]})
+    order = np.random.default_rng([seed, scene.number]).permutation(len(team))
     return [team[i] for i in order[:count]]
 
 
@@ -223,7 +246,7 @@ def _naming(sequence: Sequence[PlayableFrame], named: Sequence[frozenset[str]], 
             after.setdefault(name, index - strikes[name] + 1)
         if strikes and all_after is None and named[index].issuperset(chosen):
             all_after = index - min(strikes.values()) + 1
-    honest = set(sequence[0].team) - set(chosen)
+    honest = {name for frame in sequence for name in frame.team} - set(chosen)
     return Naming(
         struck=len(strikes),
         after=tuple(after[name] for name in sorted(after)),

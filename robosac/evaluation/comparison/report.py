@@ -1,25 +1,28 @@
-"""The page, the table and the pictures of a comparison."""
+"""The page, the figures and the pictures of a comparison."""
 
 from __future__ import annotations
 
-import csv
 from collections.abc import Sequence
 from pathlib import Path
 
 from robosac.evaluation.comparison.pictures import draw_passes, draw_precision
 from robosac.evaluation.comparison.playing import Plan
-from robosac.evaluation.comparison.rows import EARLY, WINDOWS, Estimate, Figures, NamingFigures, Row
-from robosac.evaluation.comparison.settings import NOBODY
-from robosac.evaluation.comparison.tables import naming_table, number, pivot, quiet_table
+from robosac.evaluation.comparison.rows import WINDOWS, Estimate, Figures, NamingFigures, Row
+from robosac.evaluation.comparison.tables import sections
+from robosac.evaluation.report import write_csv, write_report
 
-TEXT = """# Defences against attacks
+HEAD = """# Defences against attacks
 
-`{command}`: {scenes} test sequences of {frames} frames at 5 Hz, car-1 the ego, attackers drawn among its five
+`{command}`: {scenes} test sequences of {frames} frames at {rate:g} Hz, {ego} the ego, attackers drawn among its
 teammates{poses}. In each setting all defences meet the same frames. *Oracle* fuses everybody who is honest in the
 frame. Passes are fused ones; that of the ego alone comes on top. Standard errors (+-) are over sequences, by the
 jackknife; those of differences and ratios to the oracle take both on the same sequences. All figures are in
 `comparison.csv`.
 """
+PRECISION, PASSES = "precision.png", "passes.png"
+ESTIMATES = ("ap50", "ap70", "ap50_difference", "ap70_difference", "ap70_ratio")
+OVERALL = ("passes_first", "passes_early", "passes_steady", "honest_refused", "milliseconds")
+NAMING = tuple(NamingFigures.__dataclass_fields__)
 
 
 def write_comparison(rows: Sequence[Row], plan: Plan, out: Path, command: str) -> Path:
@@ -30,62 +33,21 @@ def write_comparison(rows: Sequence[Row], plan: Plan, out: Path, command: str) -
     Path
         Of the Markdown page.
     """
-    _write_csv(rows, out / "comparison.csv")
-    draw_precision(rows, out / "precision.png")
-    draw_passes(rows, out / "passes.png")
-    poses = f", teammates wrong about their positions by {plan.pose_error_m:g} m" if plan.pose_error_m else ""
-    text = TEXT.format(command=command, scenes=plan.extent.scenes, frames=plan.extent.frames, poses=poses)
-    parts = [
-        text,
-        pivot("AP at IoU 0.5 / 0.7", rows, lambda row: f"{row.whole.ap50.value:.3f} / {row.whole.ap70.value:.3f}"),
-        "![AP at IoU 0.7, and what is lost against the oracle](precision.png)\n",
-        pivot(
-            f"Fused passes a frame: first / 2 to {EARLY} / later",
-            rows,
-            lambda row: f"{row.passes_first:.1f} / {row.passes_early:.1f} / {row.passes_steady:.1f}",
-        ),
-        "![Precision against passes](passes.png)\n",
-        pivot(
-            "Share of frames with an attacking message in the answer", rows, lambda row: f"{row.whole.infiltrated:.2f}"
-        ),
-        pivot("Share of honest messages left out", rows, lambda row: number(row.honest_refused)),
-    ]
-    timed = [row for row in rows if row.milliseconds is not None]
-    if timed:
-        parts.append(pivot("Time of a frame, median, ms", timed, lambda row: number(row.milliseconds)))
-    quiet = [row for row in rows if row.setting == NOBODY]
-    if quiet:
-        parts.append(quiet_table(quiet))
-    naming = {row.defense: row for row in rows if row.naming is not None}
-    if naming:
-        parts.append(
-            pivot(
-                "Naming: sequences with all attackers named / frames it took / honest teammates named",
-                [row for row in rows if row.naming is not None],
-                lambda row: "" if row.naming is None else _named(row.naming),
-            )
-        )
-    parts += [naming_table(name, rows) for name in naming]
-    path = out / "comparison.md"
-    path.write_text("\n".join(parts))
-    return path
-
-
-def _named(naming: NamingFigures) -> str:
-    return f"{number(naming.named_all)} / {number(naming.frames_to_name)} / {naming.honest_named} of {naming.honest}"
-
-
-ESTIMATES = ("ap50", "ap70", "ap50_difference", "ap70_difference", "ap70_ratio")
-OVERALL = ("passes_first", "passes_early", "passes_steady", "honest_refused", "milliseconds")
-NAMING = tuple(NamingFigures.__dataclass_fields__)
-
-
-def _write_csv(rows: Sequence[Row], path: Path) -> None:
-    with path.open("w", newline="") as file:
-        writer = csv.DictWriter(file, list(_flat(rows[0])))
-        writer.writeheader()
-        for row in rows:
-            writer.writerow(_flat(row))
+    lines = [_flat(row) for row in rows]
+    write_csv(out / "comparison.csv", list(lines[0]), [list(line.values()) for line in lines])
+    draw_precision(rows, out / PRECISION)
+    draw_passes(rows, out / PASSES)
+    scenes = plan.scenes()
+    egos = sorted({scene.egos[0] for scene in scenes})
+    head = HEAD.format(
+        command=command,
+        scenes=len(scenes),
+        frames=plan.extent.frames,
+        rate=1 / scenes[0].frame_period_s,
+        ego=" or ".join(egos),
+        poses=f", teammates wrong about their positions by {plan.pose_error_m:g} m" if plan.pose_error_m else "",
+    )
+    return write_report(out / "comparison.md", head, sections(rows, PRECISION, PASSES))
 
 
 def _flat(row: Row) -> dict[str, object]:
@@ -99,8 +61,7 @@ def _flat(row: Row) -> dict[str, object]:
         suffix = f"_from_{first}" if first else ""
         line |= {f"{name}{suffix}": value for name, value in _figures(row.windows.get(first)).items()}
     line |= {name: _rounded(getattr(row, name)) for name in OVERALL}
-    line |= {name: _rounded(getattr(row.naming, name, None)) for name in NAMING}
-    return line
+    return line | {name: _rounded(getattr(row.naming, name, None)) for name in NAMING}
 
 
 def _figures(figures: Figures | None) -> dict[str, object]:
@@ -112,5 +73,5 @@ def _figures(figures: Figures | None) -> dict[str, object]:
     return line | {"infiltrated": _rounded(figures.infiltrated if figures else None)}
 
 
-def _rounded(value: float | None) -> float | str:
-    return "" if value is None else round(value, 5)
+def _rounded(value: float | None) -> float | None:
+    return None if value is None else round(value, 5)

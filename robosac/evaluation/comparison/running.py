@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable, Sequence
+from collections.abc import Callable
 from concurrent.futures import FIRST_EXCEPTION, ProcessPoolExecutor, wait
 from multiprocessing import get_context
 from multiprocessing.sharedctypes import Synchronized
@@ -12,11 +12,10 @@ import torch
 from robosac.evaluation.comparison.playing import ORACLE, Plan, Played, play_scene
 from robosac.evaluation.comparison.rows import Row, precisions, sum_up
 from robosac.evaluation.comparison.settings import Setting
-from robosac.scenes.splits import TEST_SEEDS
 
 _POLL_S = 0.5
 
-Scene = dict[tuple[Setting, str], Played]
+PlayedScene = dict[tuple[Setting, str], Played]
 
 
 def compare_defenses(plan: Plan, jobs: int = 1, tick: Callable[[], None] = lambda: None) -> list[Row]:
@@ -41,9 +40,14 @@ def compare_defenses(plan: Plan, jobs: int = 1, tick: Callable[[], None] = lambd
     ------
     FaultyDefense
         If a defence fails.
+    robosac.scenes.SceneError
+        As `Plan.scenes`.
     """
-    seeds = TEST_SEEDS[: plan.extent.scenes]
-    scenes = [play_scene(plan, seed, tick) for seed in seeds] if jobs == 1 else _in_processes(plan, seeds, jobs, tick)
+    wanted = plan.scenes()
+    if jobs == 1:
+        scenes = [play_scene(plan, scene, tick) for scene in wanted]
+    else:
+        scenes = _in_processes(plan, len(wanted), jobs, tick)
     rows = []
     for setting in plan.extent.settings:
         oracle = precisions([scene[setting, ORACLE] for scene in scenes])
@@ -52,13 +56,13 @@ def compare_defenses(plan: Plan, jobs: int = 1, tick: Callable[[], None] = lambd
     return rows
 
 
-def _in_processes(plan: Plan, seeds: Sequence[int], jobs: int, tick: Callable[[], None]) -> list[Scene]:
+def _in_processes(plan: Plan, scenes: int, jobs: int, tick: Callable[[], None]) -> list[PlayedScene]:
     # spawned, as a process with threads (of the progress bar, of torch) must not be forked
     context = get_context("spawn")
     done: Synchronized[int] = context.Value("L", 0)
     told = 0
-    with ProcessPoolExecutor(min(jobs, len(seeds)), context, _begin, (plan, done)) as pool:
-        futures = [pool.submit(_play_scene, seed) for seed in seeds]
+    with ProcessPoolExecutor(min(jobs, scenes), context, _begin, (plan, done)) as pool:
+        futures = [pool.submit(_play_scene, number) for number in range(scenes)]
         try:
             while wait(futures, _POLL_S, FIRST_EXCEPTION).not_done:
                 told = _tell(tick, told, done.value)
@@ -87,7 +91,7 @@ def _begin(plan: Plan, done: Synchronized[int]) -> None:
     _worker = plan, done
 
 
-def _play_scene(seed: int) -> Scene:
+def _play_scene(number: int) -> PlayedScene:
     if _worker is None:
         raise RuntimeError("only in a process of the pool")
     plan, done = _worker
@@ -96,4 +100,4 @@ def _play_scene(seed: int) -> Scene:
         with done.get_lock():
             done.value += 1
 
-    return play_scene(plan, seed, tick)
+    return play_scene(plan, plan.scenes()[number], tick)

@@ -9,10 +9,8 @@ from typing import Any
 from robosac.attacks import HONEST, load_campaign
 from robosac.calibrated import calibration_of
 from robosac.defenses import Defense, DefenseSettings, build, read_settings, shipped
+from robosac.defenses.group_testing import CalibrationError
 from robosac.detectors import Detector
-
-TEAMMATES = 5
-"""Of the ego, in every test scene."""
 
 _PAPER = {"sampling_budget": 7, "collaborators": 3}
 _AS_PLAYED: Mapping[str, Mapping[str, Mapping[str, Any]]] = {
@@ -32,15 +30,26 @@ DEFENSES: Mapping[str, DefenseSettings] = {
 """The defences that ship, by the names they have in the report."""
 
 
-def built(defenses: Mapping[str, DefenseSettings], detector: Detector) -> dict[str, Defense]:
+def built(defenses: Mapping[str, DefenseSettings], detector: Detector) -> tuple[dict[str, Defense], dict[str, str]]:
     """The defences themselves, for a detector, as they may be calibrated for it.
+
+    Returns
+    -------
+    built, left_out : dict of name to Defense, dict of name to str
+        Those that the detector lacks a calibration for are left out; each with the reason.
 
     Raises
     ------
     DomainError
-        If one cannot be made for it.
+        If one cannot be made of its settings.
     """
-    return {name: build(settings, lambda: calibration_of(detector.info)) for name, settings in defenses.items()}
+    made, left_out = {}, {}
+    for name, settings in defenses.items():
+        try:
+            made[name] = build(settings, lambda: calibration_of(detector.info))
+        except CalibrationError as missing:
+            left_out[name] = str(missing)
+    return made, left_out
 
 
 @dataclass(frozen=True)
@@ -52,7 +61,7 @@ class Setting:
     campaign : str
         As `robosac.attacks.load_campaign` takes it.
     attackers : int
-        Among the five teammates of car-1.
+        Among the ego's teammates.
     """
 
     campaign: str
@@ -65,11 +74,11 @@ class Setting:
         Raises
         ------
         ValueError
-            If there is no such campaign, or no number from 0 to `TEAMMATES`.
+            If there is no such campaign, or no number.
         """
         campaign, _, number = text.rpartition(":")
-        if not campaign or not number.isdecimal() or int(number) > TEAMMATES:
-            raise ValueError(f"{text!r} is not CAMPAIGN:NUMBER with a number from 0 to {TEAMMATES}")
+        if not campaign or not number.isdecimal():
+            raise ValueError(f"{text!r} is not CAMPAIGN:NUMBER of attackers")
         load_campaign(campaign)
         return cls(campaign, int(number)) if int(number) else NOBODY
 
@@ -87,7 +96,7 @@ class Extent:
     ----------
     settings : tuple of Setting
     scenes, frames : int
-        Test sequences at 5 Hz, the first scenes, and frames of each; more than 5.
+        Test sequences, the first scenes, and frames of each; more than 5.
     """
 
     settings: tuple[Setting, ...]

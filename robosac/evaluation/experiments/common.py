@@ -1,24 +1,19 @@
-"""What the experiments share: scale, recorded frames, and the pieces of a report."""
+"""What the experiments share: scale, scenes, and frames of which each subset is decoded once."""
 
 from __future__ import annotations
 
-from collections.abc import Callable, Collection, Iterator, Sequence
+from collections.abc import Callable, Iterator
 from dataclasses import dataclass, field
-from functools import cached_property
 from pathlib import Path
-from typing import Any
 
 import numpy as np
 
 from robosac.attacks import PGD, Attack
 from robosac.boxes import FloatArray
-from robosac.consensus import at_least
-from robosac.detectors import Detector, EmbeddedDetector
-from robosac.detectors.embedded import ADVERSARIAL_WEIGHTS
+from robosac.detectors import Detector
 from robosac.evaluation.average_precision import AveragePrecision
-from robosac.evaluation.frames import DecodedOnce, EvaluationFrame, encode_all, evaluation_frames, under_attack
-from robosac.scenes import IntersectionScene
-from robosac.scenes.splits import TEST_SEEDS
+from robosac.evaluation.frames import DecodedOnce, Sensed, evaluation_frames, under_attack
+from robosac.scenes import Scene, SceneSource, first_scenes
 
 TEAM_SIZE = 5
 Tick = Callable[[], None]
@@ -52,38 +47,6 @@ FULL = Scale(scenes=40, frames_per_scene=5, sequences=10, sequence_frames=25, re
 QUICK = Scale(scenes=6, frames_per_scene=2, sequences=2, sequence_frames=12, repeats=4, oracle_runs=500)
 
 
-@dataclass(frozen=True)
-class Table:
-    """A table of a report; cells are strings or numbers, None is empty."""
-
-    name: str
-    caption: str
-    columns: Sequence[str]
-    rows: Sequence[Sequence[Any]]
-
-
-@dataclass(frozen=True)
-class Section:
-    """One experiment of a report: what it shows in words, its tables, and the pictures it drew (file names)."""
-
-    title: str
-    text: str
-    tables: Sequence[Table] = ()
-    pictures: Sequence[str] = ()
-
-
-class Recorded(DecodedOnce):
-    """A test frame in which each subset is decoded once, whoever asks."""
-
-    def __init__(self, detector: Detector, frame: EvaluationFrame) -> None:
-        super().__init__(detector, frame.ego, frame.received)
-        self.frame = frame
-
-    def confident(self, teammates: Collection[str] = ()) -> FloatArray:
-        """Boxes of a subset that take part in the consensus test."""
-        return at_least(self.detect(teammates), self.info.consensus_score)
-
-
 @dataclass
 class Context:
     """What an experiment works with.
@@ -94,6 +57,11 @@ class Context:
     seed : int
     out : Path
         Where pictures go.
+    detector : Detector
+    hardened : Detector or None
+        The same after adversarial training.
+    data : SceneSource
+        Of scenes with `TEAM_SIZE` teammates.
     progress : callable
         Given a label and a number of steps, returns what to call after each.
     """
@@ -101,25 +69,28 @@ class Context:
     scale: Scale
     seed: int
     out: Path
+    detector: Detector
+    hardened: Detector | None
+    data: SceneSource
     progress: Callable[[str, int], Tick]
-    _frames: dict[tuple[str, int, int], list[Recorded]] = field(default_factory=dict)
+    _frames: dict[tuple[str, int, int], list[DecodedOnce]] = field(default_factory=dict)
 
-    @cached_property
-    def detector(self) -> EmbeddedDetector:
-        """The shipped detector."""
-        return EmbeddedDetector()
+    def scenes(self, count: int, frames: int = 1) -> list[Scene]:
+        """The first test scenes.
 
-    @cached_property
-    def hardened(self) -> EmbeddedDetector:
-        """The detector after adversarial training."""
-        return EmbeddedDetector(ADVERSARIAL_WEIGHTS)
+        Raises
+        ------
+        SceneError
+            If there are not so many with so many frames and a whole team.
+        """
+        return first_scenes(self.data, "test", count, frames, TEAM_SIZE)
 
     def rng(self, *stream: int) -> np.random.Generator:
         """A generator of its own for each purpose."""
         return np.random.default_rng([self.seed, *stream])
 
-    def frames(self, attackers: int = 1, attack: Attack | None = None, scenes: int | None = None) -> list[Recorded]:
-        """Recorded test frames under an attack (PGD by default) on the shipped detector; kept for later experiments."""
+    def frames(self, attackers: int = 1, attack: Attack | None = None, scenes: int | None = None) -> list[DecodedOnce]:
+        """Test frames under an attack (PGD by default) on the detector; kept for later experiments."""
         attack = attack or PGD()
         scenes = scenes or self.scale.scenes
         key = (repr((attack.name, attack)), attackers, scenes)
@@ -127,29 +98,30 @@ class Context:
             self._frames[key] = list(self.attacked_frames(self.detector, attackers, attack, scenes))
         return self._frames[key]
 
-    def attacked_frames(self, detector: Detector, attackers: int, attack: Attack, scenes: int) -> Iterator[Recorded]:
+    def attacked_frames(self, detector: Detector, attackers: int, attack: Attack, scenes: int) -> Iterator[DecodedOnce]:
         """Test frames under an attack on a detector; the same scenes, egos and attackers for the same numbers."""
         tick = self.progress(f"{attackers} x {attack.name}", scenes * self.scale.frames_per_scene)
-        rng = self.rng(1, attackers)
-        frames = evaluation_frames(detector, TEST_SEEDS[:scenes], self.scale.frames_per_scene, attack, attackers, rng)
-        for frame in frames:
-            yield Recorded(detector, frame)
+        rng, each = self.rng(1, attackers), self.scale.frames_per_scene
+        for frame in evaluation_frames(detector, self.scenes(scenes), each, attack, attackers, rng, TEAM_SIZE):
             tick()
+            if frame is not None:
+                yield DecodedOnce.of(frame)
 
-    def sequence(self, number: int, attackers: int = 1) -> list[Recorded]:
-        """A test sequence at 5 Hz under PGD: car-1 is the ego, the attackers stay the same."""
+    def sequence(self, number: int, attackers: int = 1) -> list[DecodedOnce]:
+        """A test sequence under PGD: the first ego of the scene meets the same attackers in all frames."""
         key = ("sequence", attackers, number)
         if key not in self._frames:
-            scene = IntersectionScene(TEST_SEEDS[number])
+            scene = self.scenes(number + 1, self.scale.sequence_frames)[number]
+            ego = scene.egos[0]
             rng = self.rng(2, number)
-            teammates = sorted(set(scene.agents) - {"car-1"})
-            chosen = [teammates[i] for i in rng.choice(TEAM_SIZE, attackers, replace=False)]
+            teammates = sorted(set(scene.agents) - {ego})
+            chosen = [teammates[i] for i in rng.choice(len(teammates), attackers, replace=False)]
             tick = self.progress(f"sequence {number}, {attackers} x pgd", self.scale.sequence_frames)
             self._frames[key] = []
-            for frame in scene.frames(self.scale.sequence_frames):
-                messages = encode_all(self.detector, frame)
-                attacked = under_attack(self.detector, messages, frame.truth("car-1"), "car-1", chosen, PGD(), rng)
-                self._frames[key].append(Recorded(self.detector, attacked))
+            for index in range(self.scale.sequence_frames):
+                sensed = Sensed.of(self.detector, scene.frame(index), ego, 0.0, rng)
+                met = under_attack(self.detector, sensed, chosen, PGD(), rng)
+                self._frames[key].append(DecodedOnce.of(met))
                 tick()
         return self._frames[key]
 

@@ -13,7 +13,9 @@ from robosac.boxes import FloatArray
 from robosac.consensus import at_least, compare
 from robosac.defenses import SampleConsensus
 from robosac.evaluation.experiments import paper
-from robosac.evaluation.experiments.common import Context, Recorded, Section, Table, precision
+from robosac.evaluation.experiments.common import Context, precision
+from robosac.evaluation.frames import DecodedOnce
+from robosac.evaluation.report import Section, Table
 from robosac.figures import new_figure
 from robosac.fusion import FusionResult, fuse
 from robosac.scenes.drawing import FOUND_COLOUR, TRUE_COLOUR, draw_boxes, frame_axes
@@ -28,7 +30,7 @@ SHOWN_SCORE = 0.3
 def budgets(context: Context) -> Section:
     """Detection with different sampling budgets, between the bounds."""
     frames = context.frames()
-    prepared = [(context.detector.prepare(r.frame.ego, r.frame.benign), r.frame) for r in frames]
+    prepared = [(context.detector.prepare(frame.ego, frame.benign), frame) for frame in frames]
     subsets = [(p, f, subset) for p, f in prepared for subset in combinations(sorted(f.benign), COLLABORATORS)]
     rows: dict[str, tuple[float, ...]] = {
         "all benign": precision((p.detect(sorted(f.benign)), f.truth) for p, f in prepared),
@@ -69,10 +71,11 @@ def generalisation(context: Context) -> Section:
     rows = []
     for name, attack in attacks:
         frames = context.frames(1, attack, scenes)
-        none = (None, None)
-        paper_defended, paper_hardened = paper.GENERALISATION.get(name, (none, none))
+        hardened: tuple[float | None, ...] = (None, None)
+        paper_defended, paper_hardened = paper.GENERALISATION.get(name, (hardened, hardened))
         defended = _score(context, frames, _sampling(7))[:2]
-        hardened = _undefended(context.attacked_frames(context.hardened, 1, attack, scenes))
+        if context.hardened is not None:
+            hardened = _undefended(context.attacked_frames(context.hardened, 1, attack, scenes))
         ours = (*_rounded(_undefended(frames)), *paper_defended, *_rounded(defended))
         rows.append((name, *ours, *paper_hardened, *_rounded(hardened)))
     columns: tuple[str, ...] = (
@@ -155,15 +158,14 @@ def trade_off(context: Context) -> Section:
 
 def qualitative(context: Context) -> Section:
     """The frame in which the attack did most, as a picture."""
-    recorded = max(context.frames(), key=lambda r: len(r.detect(sorted(r.frame.received))))
-    frame = recorded.frame
+    frame = max(context.frames(), key=lambda r: len(r.detect(r.team)))
     benign = context.detector.prepare(frame.ego, frame.benign)
     defense = SampleConsensus(sampling_budget=7, collaborators=COLLABORATORS)
-    defended = fuse(recorded, defense, frame.ego, frame.received, rng=context.rng(9))
+    defended = fuse(frame, defense, frame.ego, frame.teammates, rng=context.rng(9))
     panels: tuple[tuple[str, FloatArray], ...] = (
         ("All benign (upper bound)", benign.detect(sorted(frame.benign))),
-        ("Ego only (lower bound)", recorded.detect()),
-        (f"Attacked by {', '.join(sorted(frame.attackers))}, no defence", recorded.detect(sorted(frame.received))),
+        ("Ego only (lower bound)", frame.detect()),
+        (f"Attacked by {', '.join(sorted(frame.attackers))}, no defence", frame.detect(frame.team)),
         (f"Defended: {', '.join(defended.accepted) or 'ego only'}", defended.boxes),
     )
     figure = new_figure(22, 5.9)
@@ -180,35 +182,35 @@ def _sampling(n: int, s: int = COLLABORATORS, threshold: float = 0.3) -> SampleC
     return SampleConsensus(0.2, sampling_budget=n, collaborators=s, consensus_threshold=threshold, distinct=False)
 
 
-def _score(context: Context, frames: list[Recorded], defense: SampleConsensus) -> tuple[float, float, float, float]:
+def _score(context: Context, frames: list[DecodedOnce], defense: SampleConsensus) -> tuple[float, float, float, float]:
     """AP50, AP70, mean steps and success rate of several runs on each frame; every defence gets the same luck."""
     results: list[FusionResult] = []
     truths: list[FloatArray] = []
     for index, recorded in enumerate(frames):
         for repeat in range(context.scale.repeats):
             rng = context.rng(7, index, repeat)
-            results.append(fuse(recorded, defense, recorded.frame.ego, recorded.frame.received, rng=rng))
-            truths.append(recorded.frame.truth)
+            results.append(fuse(recorded, defense, recorded.ego, recorded.teammates, rng=rng))
+            truths.append(recorded.truth)
     ap50, ap70 = precision(zip((result.boxes for result in results), truths, strict=True))
     steps = float(np.mean([result.sampling_steps for result in results]))
     return ap50, ap70, steps, float(np.mean([bool(result.accepted) for result in results]))
 
 
-def _undefended(frames: Iterable[Recorded]) -> tuple[float, float]:
-    return precision((r.detect(sorted(r.frame.received)), r.frame.truth) for r in frames)
+def _undefended(frames: Iterable[DecodedOnce]) -> tuple[float, float]:
+    return precision((r.detect(r.team), r.truth) for r in frames)
 
 
-def _alone(frames: Iterable[Recorded]) -> tuple[float, float]:
-    return precision((r.detect(), r.frame.truth) for r in frames)
+def _alone(frames: Iterable[DecodedOnce]) -> tuple[float, float]:
+    return precision((r.detect(), r.truth) for r in frames)
 
 
-def _error_rates(frames: list[Recorded], threshold: float) -> tuple[float, float]:
+def _error_rates(frames: list[DecodedOnce], threshold: float) -> tuple[float, float]:
     """False alarm and miss rate over all hypotheses of three."""
     refused, missed = [], []
     for recorded in frames:
-        for subset in combinations(sorted(recorded.frame.received), COLLABORATORS):
+        for subset in combinations(recorded.team, COLLABORATORS):
             verdict = compare(recorded.confident(), recorded.confident(subset), threshold).verdict
-            if recorded.frame.attackers.isdisjoint(subset):
+            if recorded.attackers.isdisjoint(subset):
                 refused.append(verdict is Verdict.DISSENSUS)
             else:
                 missed.append(verdict is Verdict.CONSENSUS)

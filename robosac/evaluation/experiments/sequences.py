@@ -14,7 +14,9 @@ from robosac.boxes import FloatArray
 from robosac.consensus import at_least, compare
 from robosac.defenses import Defense, Reference, SampleConsensus, StaticTeam, Undefended
 from robosac.evaluation.experiments import paper
-from robosac.evaluation.experiments.common import Context, Recorded, Section, Table, precision
+from robosac.evaluation.experiments.common import Context, precision
+from robosac.evaluation.frames import DecodedOnce
+from robosac.evaluation.report import Section, Table
 from robosac.previous import PreviousAnswer
 from robosac.session import Session
 
@@ -43,20 +45,20 @@ def _play(context: Context, defenses: dict[str, Defense]) -> dict[str, _Run]:
     for number in range(context.scale.sequences):
         sequence = context.sequence(number)
         for repeat in range(context.scale.repeats):
-            team = sorted(sequence[0].frame.received)
+            team = sequence[0].team
             sessions = {name: Session(context.detector, team, defense) for name, defense in defenses.items()}
             for index, recorded in enumerate(sequence):
                 for stream, (name, session) in enumerate(sessions.items()):
                     rng = context.rng(10, number, repeat, index, stream)
                     started = time.perf_counter()
-                    result = session.decide(index, recorded.frame.ego, recorded.frame.received, rng)
+                    result = session.decide(index, recorded.ego, recorded.teammates, rng)
                     seconds = time.perf_counter() - started
                     session.remember(result)
                     run = runs[name]
-                    run.answers.append((result.boxes, recorded.frame.truth))
+                    run.answers.append((result.boxes, recorded.truth))
                     run.steps.append(result.sampling_steps)
                     run.accepted.append(bool(result.accepted))
-                    run.infiltrated.append(not recorded.frame.attackers.isdisjoint(result.accepted))
+                    run.infiltrated.append(not recorded.attackers.isdisjoint(result.accepted))
                     run.seconds.append(seconds)
                     if index >= STEADY_FROM:
                         run.steady_seconds.append(seconds)
@@ -139,16 +141,16 @@ def _false_alarms(context: Context) -> tuple[float, float]:
     for number in range(context.scale.sequences):
         before: PreviousAnswer | None = None
         for index, recorded in enumerate(context.sequence(number)):
-            honest = sorted(set(recorded.frame.received) - recorded.frame.attackers)
+            honest = sorted(set(recorded.teammates) - recorded.attackers)
             subsets = list(combinations(honest, COLLABORATORS))
             if before is not None:
-                moved = at_least(before.expected_at(recorded.frame.ego.pose), recorded.info.consensus_score)
+                moved = at_least(before.expected_at(recorded.ego.pose), recorded.info.consensus_score)
                 by_ego += [_refused(recorded, recorded.confident(), subset) for subset in subsets]
                 by_previous += [_refused(recorded, moved, subset) for subset in subsets]
             chosen = subsets[int(context.rng(11, number, index).integers(len(subsets)))]
-            before = PreviousAnswer.of(index, recorded.frame.ego.pose, recorded.detect(chosen), before)
+            before = PreviousAnswer.of(index, recorded.ego.pose, recorded.detect(chosen), before)
     return float(np.mean(by_ego)), float(np.mean(by_previous))
 
 
-def _refused(recorded: Recorded, reference: FloatArray, subset: tuple[str, ...]) -> bool:
+def _refused(recorded: DecodedOnce, reference: FloatArray, subset: tuple[str, ...]) -> bool:
     return compare(reference, recorded.confident(subset)).verdict is Verdict.DISSENSUS

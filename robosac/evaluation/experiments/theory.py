@@ -9,8 +9,10 @@ import numpy as np
 from robosac.budget import attackers_in_team, clean_probability, eq1_collaborators, eq2_budget
 from robosac.defenses import A2CP, SampleConsensus, State
 from robosac.evaluation.experiments import paper
-from robosac.evaluation.experiments.common import TEAM_SIZE, Context, Recorded, Section, Table
+from robosac.evaluation.experiments.common import TEAM_SIZE, Context
+from robosac.evaluation.frames import DecodedOnce
 from robosac.evaluation.oracle import converse_with_oracle, simulate_sampling
+from robosac.evaluation.report import Section, Table
 from robosac.figures import new_figure
 from robosac.fusion import fuse
 from robosac.session import Session
@@ -30,11 +32,11 @@ def derivation(context: Context) -> Section:
         oracle = simulate_sampling(defense, TEAM_SIZE, attackers, context.scale.oracle_runs, context.rng(3, number))
         q = clean_probability(TEAM_SIZE, attackers, s)
         steps = _steps_until_consensus(context, defense, attackers, number)
-        agreed = steps < NEVER
-        means = (1 / q, oracle.mean(), steps[agreed].mean() if agreed.any() else None)
+        mean, never = until_consensus(steps)
+        means = (1 / q, oracle.mean(), mean)
         shares = (1 - (1 - q) ** n, (oracle <= n).mean(), (steps <= n).mean())
-        never = round(float(1 - agreed.mean()), 3)
-        steps_rows.append((eta, s, paper_steps, *(None if v is None else round(float(v), 2) for v in means), never))
+        rounded = (None if v is None else round(float(v), 2) for v in means)
+        steps_rows.append((eta, s, paper_steps, *rounded, round(never, 3)))
         success_rows.append((eta, s, n, paper_success, *(round(float(value), 3) for value in shares)))
     sources = ("paper", "exact", "oracle", "detector")
     return Section(
@@ -61,6 +63,12 @@ def derivation(context: Context) -> Section:
     )
 
 
+def until_consensus(steps: np.ndarray[Any, np.dtype[np.int64]]) -> tuple[float | None, float]:
+    """Mean of the steps (n,) of those runs that came to a consensus, and the share of those that never did."""
+    agreed = steps < NEVER
+    return float(steps[agreed].mean()) if agreed.any() else None, float(1 - agreed.mean())
+
+
 def _steps_until_consensus(
     context: Context, defense: SampleConsensus, attackers: int, number: int
 ) -> np.ndarray[Any, np.dtype[np.int64]]:
@@ -68,7 +76,7 @@ def _steps_until_consensus(
     for index, recorded in enumerate(context.frames(attackers, scenes=max(1, context.scale.scenes // 4))):
         for repeat in range(context.scale.repeats):
             rng = context.rng(4, number, index, repeat)
-            result = fuse(recorded, defense, recorded.frame.ego, recorded.frame.received, rng=rng)
+            result = fuse(recorded, defense, recorded.ego, recorded.teammates, rng=rng)
             steps.append(result.sampling_steps if result.accepted else NEVER)
     return np.array(steps, dtype=np.int64)
 
@@ -136,11 +144,11 @@ def _estimate_by_oracle(attackers: int, rng: np.random.Generator) -> tuple[int, 
     return steps, state["estimate"]
 
 
-def _estimate_by_detector(sequence: list[Recorded], rng: np.random.Generator) -> tuple[int, float]:
-    session = Session(sequence[0], sorted(sequence[0].frame.received), A2CP(), rng=rng)
+def _estimate_by_detector(sequence: list[DecodedOnce], rng: np.random.Generator) -> tuple[int, float]:
+    session = Session(sequence[0], sequence[0].team, A2CP(), rng=rng)
     steps = index = 0
     while not _settled(session.state) and index < MOST_FRAMES:
         recorded = sequence[index % len(sequence)]
-        result = session.answer(index, recorded.frame.ego, recorded.frame.received, detector=recorded)
+        result = session.answer(index, recorded.ego, recorded.teammates, detector=recorded)
         steps, index = steps + result.sampling_steps, index + 1
     return steps, session.state["estimate"]

@@ -84,7 +84,7 @@ def test_a_steady_inventor_puts_cars_on_a_grid(fused):
 def test_what_a_steady_inventor_invents_is_still_there_in_the_next_frame(detector):
     def changed(attack):
         shown = []
-        for frame in IntersectionScene(8).frames(2):
+        for frame in map(IntersectionScene(8).frame, range(2)):
             benign = encode_all(detector, frame)
             ego = benign.pop("car-1")
             surface = detector.attack_surface(ego, benign)

@@ -18,7 +18,7 @@ from robosac.attacks import (
 from robosac.attacks.alibi import Covering, Framing
 from robosac.attacks.campaign import Always, Asleep, FalsePose, Flicker, Turns
 from robosac.boxes import from_world, pose_matrix
-from robosac.evaluation.frames import under_attack
+from robosac.evaluation.frames import Sensed, under_attack
 
 PAIR = ["car-2", "rsu"]
 
@@ -57,43 +57,42 @@ def test_a_false_pose_moves_the_message_along_the_sender_axes():
 
 
 def under(campaign, messages, detector, index=0, attackers=("car-2",)):
-    return under_attack(
-        detector, messages, np.empty((0, 5)), "car-1", attackers, campaign, np.random.default_rng(0), index
-    )
+    sensed = Sensed(index, "car-1", messages, np.empty((0, 5)))
+    return under_attack(detector, sensed, attackers, campaign, np.random.default_rng(0))
 
 
 def test_asleep_all_send_what_is_honest(detector, messages):
     met = under(Campaign(PGD(steps=1), Asleep(3)), messages, detector, index=2)
     assert not met.attackers
-    assert all(met.received[name] is met.benign[name] for name in met.benign)
+    assert all(met.teammates[name] is met.benign[name] for name in met.benign)
     awake = under(Campaign(PGD(steps=1), Asleep(3)), messages, detector, index=3)
     assert awake.attackers == {"car-2"}
     plain = under(PGD(steps=1), messages, detector)
     np.testing.assert_array_equal(
-        awake.received["car-2"].tensors["features"], plain.received["car-2"].tensors["features"]
+        awake.teammates["car-2"].tensors["features"], plain.teammates["car-2"].tensors["features"]
     )
 
 
 def test_a_false_pose_needs_no_perturbation(detector, messages):
     met = under(load_campaign("honest@false-pose"), messages, detector)
     assert met.attackers == {"car-2"}
-    assert met.received["car-2"].tensors is met.benign["car-2"].tensors
-    np.testing.assert_allclose(met.received["car-2"].pose, FalsePose().claimed(met.benign["car-2"].pose))
-    honest, lied = (detector.prepare(met.ego, sent).detect(["car-2"]) for sent in (met.benign, met.received))
+    assert met.teammates["car-2"].tensors is met.benign["car-2"].tensors
+    np.testing.assert_allclose(met.teammates["car-2"].pose, FalsePose().claimed(met.benign["car-2"].pose))
+    honest, lied = (detector.prepare(met.ego, sent).detect(["car-2"]) for sent in (met.benign, met.teammates))
     assert len(honest) != len(lied) or np.abs(honest - lied).max() > 0.1
 
 
 def test_who_lies_about_nothing_is_no_attacker(detector, messages):
     met = under(load_campaign("honest"), messages, detector)
     assert not met.attackers
-    assert met.received == met.benign
+    assert met.teammates == met.benign
 
 
 def test_an_attack_under_a_false_pose_is_optimised_for_it(detector, messages):
     met = under(load_campaign("pgd@false-pose"), messages, detector)
-    assert not np.array_equal(met.received["car-2"].pose, met.benign["car-2"].pose)
-    plain = under(PGD(), messages, detector).received["car-2"]
-    assert not np.array_equal(met.received["car-2"].tensors["features"], plain.tensors["features"])
+    assert not np.array_equal(met.teammates["car-2"].pose, met.benign["car-2"].pose)
+    plain = under(PGD(), messages, detector).teammates["car-2"]
+    assert not np.array_equal(met.teammates["car-2"].tensors["features"], plain.tensors["features"])
 
 
 def test_who_covers_whom():
@@ -107,7 +106,7 @@ def test_who_covers_whom():
 
 
 def logits(detector, met, team):
-    surface = detector.attack_surface(met.ego, met.received)
+    surface = detector.attack_surface(met.ego, met.teammates)
     return surface.class_logits({name: surface.messages[name] for name in team})
 
 
@@ -153,9 +152,13 @@ def test_impossible_campaigns_are_explained(spec, complaint):
         Campaign(GaussianNoise(), alibi=Covering())
 
 
-def test_an_attacker_that_is_not_there_is_an_error(detector, messages):
+def test_an_attacker_that_is_not_there_sends_nothing(detector, messages):
+    met = under(load_campaign("honest@false-pose"), messages, detector, attackers=("nobody", "car-2"))
+    assert met.attackers == {"car-2"}
     with pytest.raises(KeyError):
-        under(load_campaign("honest@false-pose"), messages, detector, attackers=("nobody",))
+        load_campaign("honest@false-pose").messages(
+            detector, met.ego, met.benign, ["nobody"], 0, np.random.default_rng(0)
+        )
 
 
 class Showing:

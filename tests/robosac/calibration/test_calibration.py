@@ -9,13 +9,12 @@ from robosac.attacks import GaussianNoise
 from robosac.boxes import pose_matrix
 from robosac.calibration import Recipe, calibration_of
 from robosac.calibration.making import check
-from robosac.calibration.verdicts import Verdicts, complementary, validation_stretches
+from robosac.calibration.verdicts import Trial, Verdicts, complementary, validation_stretches
 from robosac.cli import app
 from robosac.defenses import GroupTesting
 from robosac.defenses.group_testing import Calibration, CalibrationError
 from robosac.detectors import DetectorInfo
 from robosac.detectors.embedded import SHIPPED_WEIGHTS, EmbeddedDetector
-from robosac.evaluation.encounters import LiveFrame
 from robosac.evaluation.frames import EvaluationFrame
 from robosac.evaluation.playing import play
 from robosac.evaluation.recordings import RecordedFrame
@@ -60,7 +59,7 @@ def test_successive_frames_show_what_comes_and_goes():
 
 def test_a_stretch_is_the_same_ego_and_attackers_in_successive_frames(detector):
     scene, rng = IntersectionScene(1000), np.random.default_rng(0)
-    stretches = list(validation_stretches(detector, [1000], 2, {"noise": GaussianNoise()}, [2], 0.0, rng))
+    stretches = list(validation_stretches(detector, [scene], Trial({"noise": GaussianNoise()}, [2], 0.0, 2), rng))
     assert [kind for kind, _ in stretches] == [None, "noise"] * 2
     for number, (_, stretch) in enumerate(stretches):
         start, ego = number // 2 * 10, f"car-{number // 2 + 1}"
@@ -127,7 +126,7 @@ def test_the_shipped_detector_is_calibrated(detector):
 
 def test_the_shipped_detector_finds_an_attacker(detector, ego_message, attacked):
     defense = GroupTesting.calibrated(calibration_of(detector.info))
-    frame = LiveFrame(detector, EvaluationFrame(ego_message, {}, attacked, frozenset({"car-2"}), np.empty((0, 5))))
+    frame = EvaluationFrame(detector, ego_message, {}, attacked, frozenset({"car-2"}), np.empty((0, 5)))
     results = [answer.result for answer in play(defense, [frame] * 3, np.random.default_rng(0))]
     assert all("car-2" not in r.accepted for r in results)
     assert results[-1].suspicion["car-2"] > 0.95
@@ -150,11 +149,12 @@ def test_reliability_compares_suspicion_with_the_truth():
         {"attackers": (0,)},
         {"pose_errors_m": (-0.1,)},
         {"scenes": 0},
-        {"scenes": 999, "check_scenes": 2},
+        {"check_scenes": -1},
+        {"attackers": (1,)},
     ],
 )
 def test_recipes_that_cannot_be(settings):
-    with pytest.raises(ValueError, match=r"must|there are"):
+    with pytest.raises(ValueError, match="must"):
         Recipe(**settings)
 
 

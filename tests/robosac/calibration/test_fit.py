@@ -22,7 +22,7 @@ def make_verdicts(honest=2 * NOVELTY_BINS + 2, complementary=3 * NOVELTY_BINS + 
     """Honest pairs lose little and bring a few boxes, PGD destroys, an eraser brings nothing. Under PGD boxes come and
     go; under an eraser they hold strangely still.
     """
-    verdicts = Verdicts()
+    verdicts = Verdicts(team=5)
     for size in range(len(SIZES)):
         verdicts.pairs[None, 0, size, honest] += 500
         for cell in range(1, 1 + CELLS):
@@ -80,8 +80,8 @@ def test_no_single_outcome_says_too_much():
 @pytest.mark.parametrize(
     ("kind", "cell", "message"),
     [
-        ("pgd", 2, "no verdicts of pgd, cell 2, sizes 2 and 1"),
-        (None, 0, "no verdicts of honest teammates, cell 0, sizes 2 and 1"),
+        ("pgd", 2, "pgd: 1 joining 2, attackers among the joined"),
+        (None, 0, "no attack: 1 joining 2"),
     ],
 )
 def test_what_was_never_seen_is_said(kind, cell, message):
@@ -119,5 +119,22 @@ def test_what_comes_and_goes_incriminates_and_what_stays_does_not():
 def test_successive_frames_that_were_never_seen_are_said():
     verdicts = make_verdicts()
     del verdicts.changes["pgd", 2, 3, 5]
-    with pytest.raises(TooFewVerdicts, match="no successive frames of pgd with 3 in the fusion"):
+    with pytest.raises(TooFewVerdicts, match="pgd: 3 in successive frames"):
         fit(verdicts, ["pgd", "erase"], 0.0)
+
+
+def test_teams_that_are_larger_than_any_observed_are_judged_like_the_largest():
+    verdicts = make_verdicts()
+    small = Verdicts(team=3)
+    for (kind, cell, size, found), count in verdicts.pairs.items():
+        if sum(SIZES[size]) <= 3:
+            small.pairs[kind, cell, size, found] += count
+    for (kind, size, crowd, change), count in verdicts.changes.items():
+        if size < 3:
+            small.changes[kind, size, crowd, change] += count
+    model = fit(small, ["pgd", "erase"], 0.0)
+    for larger, shown in (((0, 5), (0, 3)), ((1, 3), (1, 2)), ((3, 2), (2, 1))):
+        np.testing.assert_array_equal(model.pairs[:, SIZES.index(larger)], model.pairs[:, SIZES.index(shown)])
+    np.testing.assert_array_equal(model.changes[:, 4], model.changes[:, 2])
+    with pytest.raises(TooFewVerdicts, match="no attack: 1 joining 0"):
+        fit(Verdicts(), ["pgd"], 0.0)

@@ -12,7 +12,7 @@ from robosac.defenses.benign_scores import SINGLE_TEAMMATE
 from robosac.defenses.conformal import discoveries
 from robosac.evaluation.benign_scores import single_teammate_indices
 from robosac.evaluation.oracle import converse_with_oracle
-from robosac.scenes.splits import VALIDATION_SEEDS
+from robosac.scenes.intersection import Synthetic
 
 TEAM = list("abcde")
 
@@ -133,7 +133,7 @@ def test_impossible_settings_are_refused(settings):
 
 
 def test_the_default_calibration_is_what_the_command_measures(detector, tmp_path):
-    measured = single_teammate_indices(detector, VALIDATION_SEEDS[:3])
+    measured = single_teammate_indices(detector, Synthetic().scenes("validation")[:3])
     assert len(measured) == 15
     assert measured == sorted(measured)
     known = np.array(SINGLE_TEAMMATE)

@@ -4,12 +4,13 @@ import pytest
 from robosac.attacks import PGD, Erase
 from robosac.evaluation import BoundsReport, NoFrames, evaluate_bounds
 from robosac.evaluation.frames import evaluation_frames
+from robosac.scenes import IntersectionScene
 
 
 def evaluate(detector, attack, scenes, frames, attackers=1, **options) -> BoundsReport:
     rng = np.random.default_rng([0, 0])
-    met = evaluation_frames(detector, range(scenes), frames, attack, attackers, rng)
-    return evaluate_bounds(detector, met, attack, attackers=attackers, **options)
+    met = evaluation_frames(detector, list(map(IntersectionScene, range(scenes))), frames, attack, attackers, rng)
+    return evaluate_bounds(met, attack, attackers=attackers, **options)
 
 
 @pytest.fixture(scope="module")
@@ -56,7 +57,7 @@ def test_an_attack_that_passes_is_counted_as_infiltration(detector):
 
 
 def test_the_cars_take_turns_as_ego(detector):
-    frames = evaluation_frames(detector, range(2), 3, PGD(steps=1), 1, np.random.default_rng(0))
+    frames = evaluation_frames(detector, map(IntersectionScene, range(2)), 3, PGD(steps=1), 1, np.random.default_rng(0))
     everybody = {"car-1", "car-2", "car-3", "car-4", "car-5", "rsu"}
     assert [(everybody - set(frame.benign)).pop() for frame in frames] == [
         "car-1", "car-2", "car-3", "car-4", "car-5", "car-1",
@@ -65,7 +66,7 @@ def test_the_cars_take_turns_as_ego(detector):
 
 def test_the_attack_is_measured_against_the_features(detector):
     report = evaluate(detector, PGD(steps=1, epsilon=0.25), 1, 1, budgets=(1,))
-    (frame,) = evaluation_frames(detector, range(1), 1, PGD(steps=1), 1, np.random.default_rng(0))
+    (frame,) = evaluation_frames(detector, [IntersectionScene(0)], 1, PGD(steps=1), 1, np.random.default_rng(0))
     magnitudes = np.concatenate([message.tensors["features"].ravel() for message in frame.benign.values()])
     assert report.perturbation_to_feature_ratio == pytest.approx(0.25 / np.percentile(np.abs(magnitudes), 95))
 
@@ -78,8 +79,8 @@ def test_the_consensus_test_is_counted_over_all_hypotheses(report):
 
 
 def test_frames_without_enough_teammates_are_counted_apart(detector):
-    frames = list(evaluation_frames(detector, range(1), 2, PGD(steps=1), 1, np.random.default_rng(0)))
-    report = evaluate_bounds(detector, [None, frames[0], None], PGD(), budgets=(1,), repeats=1)
+    frames = list(evaluation_frames(detector, [IntersectionScene(0)], 2, PGD(steps=1), 1, np.random.default_rng(0)))
+    report = evaluate_bounds([None, frames[0], None], PGD(), budgets=(1,), repeats=1)
     assert (report.frames, report.skipped) == (1, 2)
     with pytest.raises(NoFrames):
-        evaluate_bounds(detector, [None], PGD())
+        evaluate_bounds([None], PGD())

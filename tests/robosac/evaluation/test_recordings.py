@@ -10,7 +10,9 @@ from robosac.evaluation.encounters import acts
 from robosac.evaluation.frames import EvaluationFrame, misplaced
 from robosac.evaluation.playing import FaultyDefense, play
 from robosac.evaluation.recordings import Recordings, load, record, save
+from robosac.scenes import IntersectionScene
 
+SCENE = IntersectionScene(4)
 TEAM = ("car-2", "car-3", "rsu")
 
 
@@ -19,16 +21,18 @@ def recorded(detector, ego_message, benign, attacked, scene_frame):
     truth = scene_frame.truth("car-1")
 
     def met(messages, attackers):
-        return EvaluationFrame(ego_message, benign, {n: messages[n] for n in TEAM}, frozenset(attackers), truth)
+        return EvaluationFrame(
+            detector, ego_message, benign, {n: messages[n] for n in TEAM}, frozenset(attackers), truth
+        )
 
-    honest = record(detector, met(benign, []))
-    return honest, record(detector, met(attacked, ["car-2"]), honest), met(attacked, ["car-2"])
+    honest = record(met(benign, []))
+    return honest, record(met(attacked, ["car-2"]), honest), met(attacked, ["car-2"])
 
 
 def test_every_subset_is_as_it_is_decoded(detector, recorded):
     _, frame, met = recorded
     assert len(frame.boxes) == 8
-    prepared = detector.prepare(met.ego, met.received)
+    prepared = detector.prepare(met.ego, met.teammates)
     for subset in ((), ("rsu",), ("car-2", "rsu"), TEAM):
         np.testing.assert_array_equal(frame.detect(subset), prepared.detect(subset).astype(np.float32))
 
@@ -83,7 +87,7 @@ def counting(detector):
 
 def test_a_sequence_is_as_the_ego_meets_it(detector):
     ticks = []
-    (first, last) = Recordings(detector).sequence(4, 2, "noise", ["car-3"], lambda: ticks.append(1))
+    (first, last) = Recordings(detector).sequence(SCENE, 2, "noise", ["car-3"], lambda: ticks.append(1))
     assert (first.attackers, last.attackers) == ({"car-3"}, {"car-3"})
     assert first.team == ("car-2", "car-3", "car-4", "car-5", "rsu")
     assert len(first.boxes) == 32
@@ -92,12 +96,12 @@ def test_a_sequence_is_as_the_ego_meets_it(detector):
 
 
 def test_a_kept_frame_is_not_recorded_again(counting, tmp_path):
-    once = Recordings(counting, tmp_path).sequence(4, 2, "noise", ["car-3"])
+    once = Recordings(counting, tmp_path).sequence(SCENE, 2, "noise", ["car-3"])
     assert counting.prepared == 4  # two honest ones and two under attack
-    again = Recordings(counting, tmp_path).sequence(4, 2, "noise", ["car-3"])
+    again = Recordings(counting, tmp_path).sequence(SCENE, 2, "noise", ["car-3"])
     assert counting.prepared == 4
     assert all(map(same, once, again))
-    more = Recordings(counting, tmp_path).sequence(4, 3, "noise", ["car-3"])
+    more = Recordings(counting, tmp_path).sequence(SCENE, 3, "noise", ["car-3"])
     assert counting.prepared == 6
     assert all(map(same, once, more))
     assert len(list(tmp_path.iterdir())) == 2
@@ -105,28 +109,28 @@ def test_a_kept_frame_is_not_recorded_again(counting, tmp_path):
 
 def test_a_frame_does_not_depend_on_what_else_is_recorded(detector, tmp_path):
     recordings = Recordings(detector, tmp_path)
-    recordings.sequence(4, 1)
-    recordings.sequence(4, 2, "noise", ["rsu"])
-    later = recordings.sequence(4, 2, "noise", ["car-3"])
-    assert all(map(same, Recordings(detector).sequence(4, 2, "noise", ["car-3"]), later))
+    recordings.sequence(SCENE, 1)
+    recordings.sequence(SCENE, 2, "noise", ["rsu"])
+    later = recordings.sequence(SCENE, 2, "noise", ["car-3"])
+    assert all(map(same, Recordings(detector).sequence(SCENE, 2, "noise", ["car-3"]), later))
 
 
 def test_campaigns_that_differ_in_their_schedule_share_frames(counting, tmp_path):
     recordings = Recordings(counting, tmp_path)
-    always = recordings.sequence(4, 12, "noise", ["car-3"])
-    honest = recordings.sequence(4, 12)
+    always = recordings.sequence(SCENE, 12, "noise", ["car-3"])
+    honest = recordings.sequence(SCENE, 12)
     before = counting.prepared
-    asleep = recordings.sequence(4, 12, "noise@asleep", ["car-3"])
+    asleep = recordings.sequence(SCENE, 12, "noise@asleep", ["car-3"])
     assert counting.prepared == before
     assert all(one is other for one, other in zip(asleep, [*honest[:10], *always[10:]], strict=True))
-    flicker = recordings.sequence(4, 12, "noise@flicker", ["car-3"])
+    flicker = recordings.sequence(SCENE, 12, "noise@flicker", ["car-3"])
     assert counting.prepared == before
     struck = [frame is at_all_times for frame, at_all_times in zip(flicker, always, strict=True)]
     assert 0 < sum(struck) < 12
 
 
 def test_turns_are_taken_by_one_at_a_time(detector):
-    frames = Recordings(detector).sequence(4, 6, "noise@turns", ["car-3", "car-2"])
+    frames = Recordings(detector).sequence(SCENE, 6, "noise@turns", ["car-3", "car-2"])
     assert [sorted(frame.attackers) for frame in frames] == [["car-2"]] * 5 + [["car-3"]]
 
 
@@ -144,7 +148,7 @@ def test_other_weights_seeds_and_poses_are_not_mixed_up(detector, tmp_path):
         Recordings(detector, tmp_path, seed=1),
         Recordings(detector, tmp_path, pose_error_m=0.2),
     ]
-    plain, _, seeded, misled = (recordings.sequence(4, 1, "noise", ["car-3"])[0] for recordings in others)
+    plain, _, seeded, misled = (recordings.sequence(SCENE, 1, "noise", ["car-3"])[0] for recordings in others)
     assert len(list(tmp_path.iterdir())) == 8
     assert not same(plain, seeded)
     np.testing.assert_array_equal(plain.detect(("rsu",)), seeded.detect(("rsu",)))

@@ -1,9 +1,13 @@
+import shutil
+
 import numpy as np
 import pytest
 
 from robosac.boxes import pose_matrix
 from robosac.detectors.v2xsim.anchors import anchor_boxes
-from robosac.scenes.v2xsim import SampleError, frames, read_sample
+from robosac.detectors.v2xsim.voxels import occupancy
+from robosac.scenes import SOURCES, SceneError
+from robosac.scenes.v2xsim import SampleError, V2XSim, V2XSimScene, read_sample
 
 POSES = {0: pose_matrix(1.0, 2.0, 0.0, 0.3), 2: pose_matrix(-4.0, 6.0, 0.0, -1.1), 5: pose_matrix(8.0, 0.0, 0.0, 2.0)}
 PLACES = np.array([[100, 40, 0], [7, 200, 4], [100, 40, 2]])
@@ -42,41 +46,68 @@ def root(tmp_path):
     return tmp_path
 
 
-def test_frames_come_in_order_with_those_present(root):
-    read = list(frames(root, 8))
-    assert [frame.index for frame in read] == [2, 10]
-    assert all(list(frame.samples) == ["agent0", "agent2", "agent5"] for frame in read)
+@pytest.fixture
+def scene(root):
+    (scene,) = V2XSim(root).scenes("test")
+    return scene
 
 
-def test_a_scene_that_is_not_there_is_an_error(root):
-    with pytest.raises(FileNotFoundError, match="scene 5"):
-        next(frames(root, 5))
+def test_a_scene_has_those_present_in_its_first_frame(scene):
+    assert (scene.number, scene.length) == (8, 2)
+    assert scene.agents == ("agent2", "agent5", "agent0")
+    assert scene.egos == ("agent2", "agent5")
+    assert [scene.frame(index).index for index in range(2)] == [2, 10]
+    assert all(list(scene.frame(index).views) == ["agent0", "agent2", "agent5"] for index in range(2))
 
 
-def test_voxels_are_where_the_network_looks_for_them(root):
-    grid = next(frames(root, 8)).samples["agent2"].grid
-    assert np.argwhere(grid).tolist() == [[1, 255, 2], [200, 0, 12]]
+def test_folders_for_each_purpose_are_told_apart(root, tmp_path):
+    parts = tmp_path / "parts"
+    shutil.copytree(root / "agent2", parts / "test" / "agent2")
+    shutil.copytree(root / "agent2" / "8_2", parts / "val" / "agent2" / "9_0")
+    source = SOURCES.make(f"v2x-sim:{parts}")
+    assert [scene.number for scene in source.scenes("test")] == [8]
+    assert [scene.number for scene in source.scenes("validation")] == [9]
+    assert source.name.endswith(str(parts))
+    assert V2XSim(root).scenes("validation") == V2XSim(root).scenes("test")
 
 
-def test_poses_agree_with_the_transforms(root):
-    frame = next(frames(root, 8))
-    for k in (2, 5):
-        relative = np.linalg.inv(frame.pose("agent2")) @ frame.pose(f"agent{k}")
-        np.testing.assert_allclose(relative, frame.samples["agent2"].trans_matrices[k], atol=1e-9)
-    with pytest.raises(SampleError, match="no pose of agent1"):
-        frame.pose("agent1")
+@pytest.mark.parametrize(("where", "complaint"), [("", "no folder agent"), ("nonesuch", "is no folder")])
+def test_a_folder_without_samples_is_an_error(where, complaint, tmp_path):
+    (tmp_path / "agent0").mkdir()
+    with pytest.raises(SceneError, match=complaint):
+        SOURCES.make(f"v2x-sim:{tmp_path / where}").scenes("test")
 
 
-def test_true_boxes_are_decoded_from_their_anchors(root):
-    frame = next(frames(root, 8))
-    truth = frame.truth("agent0")
+def test_points_are_where_the_network_looks_for_voxels(scene):
+    for view in scene.frame(0).views.values():
+        assert np.argwhere(occupancy(view.points)).tolist() == [[1, 255, 2], [200, 0, 12]]
+
+
+def test_poses_agree_with_the_transforms(scene):
+    views = scene.frame(0).views
+    for name, pose in POSES.items():
+        lowered = pose @ pose_matrix(0, 0, -5.0 if name == 0 else 0.0, 0)
+        relative = np.linalg.inv(views["agent2"].pose) @ views[f"agent{name}"].pose
+        np.testing.assert_allclose(relative, np.linalg.inv(POSES[2]) @ lowered, atol=1e-9)
+
+
+def test_a_present_agent_without_a_pose_is_an_error(root):
+    lost = sample(0)
+    lost["trans_matrices"][5] = 0
+    np.save(root / "agent0" / "8_2" / "0.npy", lost)
+    with pytest.raises(SampleError, match="no pose of agent5"):
+        V2XSimScene(root, 8).frame(0)
+
+
+def test_true_boxes_are_decoded_from_their_anchors(scene, root):
+    truth = scene.frame(0).truth("agent0")
     anchors = anchor_boxes(np.ravel_multi_index(PLACES.T, (256, 256, 6)))
     width, length = 2.0 * np.exp(-0.05), 4.0 * np.exp(-0.1)
     x, y = anchors[0, 0] - 0.1 * width, anchors[0, 1] + 0.2 * length
     np.testing.assert_allclose(truth[0], [-x, y, length, width, np.pi / 2], atol=1e-6)
     assert truth[1, 2:4] == pytest.approx([12.0, 3.0 * np.exp(0.1)])
     np.testing.assert_allclose(truth[2, :4], [-anchors[2, 0], anchors[2, 1], 4.0, 2.0], atol=1e-6)
-    assert frame.samples["agent0"].category.tolist() == [1, 1, 2]
+    assert read_sample(root / "agent0" / "8_2" / "0.npy").category.tolist() == [1, 1, 2]
 
 
 def test_a_sample_without_true_boxes_has_none(tmp_path):

@@ -36,7 +36,7 @@ def fakes(monkeypatch):
         gains.append(gain)
         return FakeDetector()
 
-    frame = EvaluationFrame(EGO, TEAM, TEAM, frozenset("a"), BOXES[:, :5])
+    frame = EvaluationFrame(FakeDetector(), EGO, TEAM, TEAM, frozenset("a"), BOXES[:, :5])
     monkeypatch.setattr(validation.EmbeddedDetector, "from_network", from_network)
     monkeypatch.setattr(validation, "evaluation_frames", lambda *_: iter([frame]))
     figures = lambda *_: {"ego_only_ap50": 0.6, "no_defence_ap50": harm.get(gains[-1], 0.0)}  # noqa: E731

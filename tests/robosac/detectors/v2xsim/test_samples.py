@@ -8,7 +8,7 @@ import pytest
 from typer.testing import CliRunner
 
 from robosac.cli import app
-from robosac.scenes.v2xsim import frames, scenes
+from robosac.scenes.v2xsim import V2XSim
 
 GUIDE = Path(__file__).parents[4] / "docs" / "v2x-sim.md"
 
@@ -33,10 +33,13 @@ def root(tmp_path, parity):
 
 
 def test_samples_make_the_messages_of_the_golden_data(root, v2xsim, team):
-    frame = next(frames(root, 8))
+    (scene,) = V2XSim(root).scenes("test")
+    frame = scene.frame(0)
     for agent, expected in enumerate(team):
-        message = v2xsim.encode_grid(frame.samples[f"agent{agent}"].grid, frame.pose(f"agent{agent}"))
-        np.testing.assert_allclose(message.pose, expected.pose, atol=1e-9)
+        view = frame.views[f"agent{agent}"]
+        message = v2xsim.encode(view.points, view.pose)
+        np.testing.assert_allclose(message.pose[:, :2], expected.pose[:, :2], atol=1e-9)
+        np.testing.assert_allclose(message.pose[:2, 3], expected.pose[:2, 3], atol=1e-9)
         np.testing.assert_array_equal(message.tensors["features"], expected.tensors["features"])
 
 
@@ -49,14 +52,14 @@ def test_the_guides_example_runs(root, weights, tmp_path, monkeypatch, capsys):
 
 
 def evaluate(root, weights, *options):
-    arguments = ["evaluate", "--data", root, "--weights", weights, "--attack", "noise", *options]
+    arguments = ["evaluate", "--data", f"v2x-sim:{root}", "--weights", weights, "--attack", "noise", *options]
     return CliRunner().invoke(app, [str(argument) for argument in arguments])
 
 
 def test_evaluate_runs_on_samples(root, weights, tmp_path):
     lonely = root / "agent1" / "9_5"
     shutil.copytree(root / "agent1" / "8_0", lonely)
-    assert scenes(root) == {8: [0], 9: [5]}
+    assert [(scene.number, scene.length) for scene in V2XSim(root).scenes("test")] == [(8, 1), (9, 1)]
     result = evaluate(root, weights, "--frames", 1, "--collaborators", 4, "--out", tmp_path)
     assert result.exit_code == 0, result.output
     assert "Skipped 1" in result.output
@@ -69,7 +72,7 @@ def test_evaluate_runs_on_samples(root, weights, tmp_path):
 @pytest.mark.parametrize(
     ("break_it", "complaint"),
     [
-        (shutil.rmtree, "no folder agent*/<scene>_<frame>"),
+        (shutil.rmtree, "is no folder"),
         (lambda root: [shutil.rmtree(root / f"agent{k}") for k in range(1, 6)], "no frame to evaluate"),
         (lambda root: (root / "agent3" / "8_0" / "0.npy").write_bytes(b"cos\nsystem\n"), "agent3/8_0/0.npy"),
     ],

@@ -8,7 +8,8 @@ from typer.testing import CliRunner
 
 from robosac.answers import Reason, Source
 from robosac.attacks import load_campaign
-from robosac.cli import app, compare
+from robosac.cli import app
+from robosac.cli.options import command
 from robosac.defenses import Decision, OneByOne, Rejection, SampleConsensus, Undefended
 from robosac.evaluation.comparison import (
     DEFENSES,
@@ -201,14 +202,15 @@ def test_all_settings_can_be_made_and_attackers_leave_somebody_honest():
     assert set(QUICK.settings) <= set(FULL.settings)
 
 
-def test_the_command(tmp_path, monkeypatch):
-    monkeypatch.setattr(compare, "QUICK", Extent((NOBODY,), scenes=1, frames=6))
+def test_the_command(tmp_path):
+    short = ["--setting", "honest:0", "--scenes", "1", "--frames", "6"]
     only = ["--only", "halving", "--only", "no defence"]
-    result = CliRunner().invoke(app, ["compare", "--quick", *only, "--out", str(tmp_path / "out")])
+    result = CliRunner().invoke(app, ["compare", "--quick", *only, *short, "--out", str(tmp_path / "out")])
     assert result.exit_code == 0, result.output
     text = (tmp_path / "out" / "comparison.md").read_text()
     assert "| attack | oracle | no defence | halving | ego only |" in text
-    assert "`robosac compare --out DIR --seed 0 --only halving --only 'no defence' --quick`: 1 test sequence" in text
+    given = "--seed 0 --only halving --only 'no defence' --quick --setting honest:0 --scenes 1 --frames 6"
+    assert f"`robosac compare --out DIR {given}`: 1 test sequences of 6 frames at 5 Hz, car-1 the ego" in text
     unknown = CliRunner().invoke(app, ["compare", "--only", "nonesuch", "--out", str(tmp_path)])
     assert unknown.exit_code == 2
     assert "known: no defence" in unknown.output
@@ -227,7 +229,7 @@ def test_the_command_with_all_its_options(tmp_path):
     assert f"`robosac compare --out DIR --seed 0 --only halving {repeated}`: 2 test sequences of 6 frames" in text
     assert len(list(kept.iterdir())) == 4  # honest and noise, of two scenes
     assert "+-" in text
-    assert compare.command({"--live": True, "--jobs": 2, "--detector": None}).endswith("DIR --live --jobs 2")
+    assert command("x", {"--live": True, "--jobs": 2, "--detector": None}) == "robosac x --live --jobs 2"
 
 
 @pytest.mark.parametrize(
@@ -236,7 +238,9 @@ def test_the_command_with_all_its_options(tmp_path):
         (["--setting", "nonesuch:1"], "unknown attack"),
         (["--setting", "erase@nonesuch:1"], "unknown behaviour"),
         (["--setting", "erase"], "CAMPAIGN:NUMBER"),
-        (["--setting", "erase:6"], "from 0 to 5"),
+        (["--setting", "erase:6"], "scene 0 has 5 teammates; 6 are wanted"),
+        (["--scenes", "1001"], "synthetic has 1000 test scenes; 1001 are wanted"),
+        (["--data", "nonesuch"], "no scene source 'nonesuch'"),
         (["--frames", "5"], "Invalid value for '--frames'"),
         (["--live", "--recordings", "x"], "nothing is recorded live"),
     ],
@@ -254,7 +258,7 @@ def test_settings_are_read_from_text():
 
 
 def test_every_defence_of_the_table_has_a_row_and_answers(detector, plan):
-    rows = compare_defenses(plan(built(DEFENSES, detector), Extent((Setting("pgd", 1),), scenes=1, frames=6)))
+    rows = compare_defenses(plan(built(DEFENSES, detector)[0], Extent((Setting("pgd", 1),), scenes=1, frames=6)))
     at = {row.defense: row for row in rows}
     assert set(at) == {"oracle", "ego only", *DEFENSES}
     for name in ("halving", "one_by_one", "conformal"):
