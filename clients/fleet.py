@@ -185,6 +185,7 @@ async def _run_scene(options: FleetOptions, fleet: Fleet, summary: FleetSummary,
                 detector=fleet.detector.info.name,
                 defense=options.defense,
                 latency_budget_ms=options.budget_ms,
+                frame_period_ms=fleet.scene.frame_period_s * 1e3,
             )
             if session.detector["weights_digest"] != fleet.detector.info.weights_digest:
                 raise ValueError(f"the gateway's {fleet.detector.info.name} has other weights than the fleet's")

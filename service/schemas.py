@@ -21,7 +21,9 @@ from pydantic import (
     field_validator,
 )
 
+from robosac.calibrated import calibration_digest, calibration_of
 from robosac.defenses import DefenseSettings, Kinds, shipped
+from robosac.defenses.group_testing import CalibrationError
 from robosac.detectors import DetectorInfo
 from robosac.signatures import read_public_key
 
@@ -138,6 +140,24 @@ class TensorEntry(BaseModel):
     shape: list[int]
 
 
+class CalibrationEntry(BaseModel):
+    """What a detector is calibrated for, as the defence `group_testing` needs it."""
+
+    kinds: list[str] = Field(description="attacks that it was observed under")
+    pose_errors_m: list[float] = Field(description="errors of the teammates' positions that it was observed with")
+    digest: str = Field(description="SHA-256 of the calibration file")
+
+    @classmethod
+    def of(cls, info: DetectorInfo) -> CalibrationEntry | None:
+        """The entry; None if the detector has no calibration, or one that cannot be used."""
+        try:
+            levels = calibration_of(info).levels
+        except CalibrationError:
+            return None
+        errors = [level.pose_error_m for level in levels]
+        return cls(kinds=list(levels[0].kinds), pose_errors_m=errors, digest=calibration_digest(info) or "")
+
+
 class DetectorEntry(BaseModel):
     """What a detector wants to be sent."""
 
@@ -147,6 +167,7 @@ class DetectorEntry(BaseModel):
     cell_m: float
     weights_digest: str = Field(description="SHA-256 of the weights file")
     consensus_score: float = Field(description="boxes from this score on take part in the consensus test")
+    calibration: CalibrationEntry | None
 
     @classmethod
     def of(cls, info: DetectorInfo) -> DetectorEntry:
@@ -161,6 +182,7 @@ class DetectorEntry(BaseModel):
             cell_m=info.cell_m,
             weights_digest=info.weights_digest,
             consensus_score=info.consensus_score,
+            calibration=CalibrationEntry.of(info),
         )
 
 

@@ -118,9 +118,10 @@ def calibrate(
         If the scenes do not show all that is needed.
     """
     chosen = {name: attacks.load(name) for name in recipe.attacks}
-    faults = [fault for attack in chosen.values() if (fault := attacks.lacking(attack, detector))]
+    faults = {name: fault for name, attack in chosen.items() if (fault := attacks.lacking(attack, detector))}
     if faults:
-        raise ValueError("; ".join(faults))
+        others = ", ".join(name for name in chosen if name not in faults) or "none"
+        raise ValueError(f"{'; '.join(faults.values())}. It can be calibrated with the others: {others}")
     scenes = _scenes(recipe)
     levels: list[EvidenceModel] = []
     reliability: dict[float, list[ReliabilityBin]] = {}

@@ -27,8 +27,7 @@ from robosac.cli.options import (
     progress,
 )
 from robosac.detectors import DEFAULT_DETECTOR
-from robosac.evaluation import BoundsReport, NoFrames, evaluate_bounds
-from robosac.evaluation.bounds import TEAM_SIZE
+from robosac.evaluation import BoundsReport, NoFrames, Sampling, evaluate_bounds
 from robosac.evaluation.frames import evaluation_frames
 from robosac.scenes import DEFAULT_DATA, SceneError
 
@@ -36,9 +35,9 @@ from robosac.scenes import DEFAULT_DATA, SceneError
 def run(
     scenes: Annotated[int, typer.Option(min=1, help="Test scenes, the first so many, or all that there are.")] = 40,
     frames: Annotated[int, typer.Option(min=1, help="Frames of each, 1 s apart.")] = 5,
-    attackers: Annotated[int, typer.Option(min=0, max=5, help="Attackers among the five teammates.")] = 1,
+    attackers: Annotated[int, typer.Option(min=0, help="Attackers among the teammates.")] = 1,
     attack: Annotated[str, typer.Option(help=CAMPAIGN_HELP)] = "pgd",
-    collaborators: Annotated[int, typer.Option(min=1, max=5, help="Teammates in a hypothesis.")] = 3,
+    collaborators: Annotated[int, typer.Option(min=1, help="Teammates in a hypothesis.")] = 3,
     seed: Seed = 0,
     detector: DetectorName = DEFAULT_DETECTOR,
     data: DataName = DEFAULT_DATA,
@@ -47,10 +46,6 @@ def run(
     """Average precision of Algorithm 1 between its bounds, and the error rates of the consensus test."""
     torch.set_num_threads(1)
     console = Console()
-    if attackers + collaborators > TEAM_SIZE:
-        raise typer.BadParameter(
-            f"no {collaborators} of five teammates can be free of {attackers} attackers", param_hint="--collaborators"
-        )
     if out is not None:
         make_folder(out, "--out")
     with blaming("--attack", ValueError):
@@ -60,16 +55,14 @@ def run(
     rng = np.random.default_rng([seed, 0])
     with blaming("--data", SceneError, NoFrames), progress(console) as bar:
         some = source.scenes("test")[:scenes]
+        team = max((len(scene.agents) - 1 for scene in some), default=0)
+        if attackers + collaborators > team:
+            why = f"no {collaborators} of {team} teammates can be free of {attackers} attackers"
+            raise typer.BadParameter(why, param_hint="--collaborators")
         met = evaluation_frames(chosen, some, frames, chosen_attack, attackers, rng, attackers + collaborators)
         task = bar.add_task("frames", total=len(some) * frames)
-        report = evaluate_bounds(
-            met,
-            chosen_attack,
-            attackers=attackers,
-            collaborators=collaborators,
-            seed=seed,
-            tick=lambda: bar.advance(task),
-        )
+        sampling = Sampling(attackers, team, collaborators, seed=seed)
+        report = evaluate_bounds(met, chosen_attack, sampling, lambda: bar.advance(task))
     _print(console, report, attack, attackers)
     if out is not None:
         settings = {
@@ -90,7 +83,7 @@ def run(
 
 def _print(console: Console, report: BoundsReport, attack: str, attackers: int) -> None:
     table = Table(
-        title=f"{report.frames} test frames, {attackers} {attack.upper()} attacker(s) of five teammates",
+        title=f"{report.frames} test frames, {attackers} {attack.upper()} attacker(s)",
         title_justify="left",
     )
     for heading in ("perception", "AP50", "AP70", "steps", "success", "infiltrated"):

@@ -45,6 +45,10 @@ class DefenseSettings(BaseModel):
         """With what is left open decided for frames so far apart."""
         return self
 
+    def at_calibration(self, calibration: Calibration) -> Self:  # noqa: ARG002
+        """With what is left open decided by the detector's calibration."""
+        return self
+
     def build(self, calibration: Calibration | None) -> Defense:  # noqa: ARG002
         """The defence itself; to be overridden where more is needed than its class and the settings.
 

@@ -16,6 +16,7 @@ from robosac.detectors.base import (
     Role,
     TensorSpec,
     blank,
+    calibration_beside,
 )
 from robosac.lazy import lazily
 
@@ -53,5 +54,6 @@ __all__ = [
     "WeightsError",
     "available",
     "blank",
+    "calibration_beside",
     "load",
 ]

@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable, Iterable, Mapping, Sequence
+from collections.abc import Callable, Iterable, Sequence
 from dataclasses import dataclass, replace
 from itertools import combinations
 
@@ -16,7 +16,6 @@ from robosac.evaluation.average_precision import AveragePrecision
 from robosac.evaluation.frames import DecodedOnce, EvaluationFrame
 from robosac.fusion import fuse
 
-TEAM_SIZE = 5
 ASSUMED_RATIO = 0.2
 
 
@@ -73,15 +72,44 @@ class BoundsReport:
     perturbation_to_feature_ratio: float | None
 
 
+@dataclass(frozen=True)
+class Sampling:
+    """How Algorithm 1 is run.
+
+    Attributes
+    ----------
+    attackers, team_size : int
+        Their ratio is what the defence assumes; that is `ASSUMED_RATIO` if nobody attacks.
+    collaborators : int
+        s, the size of a hypothesis.
+    budgets : tuple of int
+        One row of Algorithm 1 for each, with independent draws as in the paper; one for the first of them where no
+        subset is drawn twice in a frame; and one with the gateway's defaults, which choose the hypotheses' size too.
+    repeats : int
+        Runs of Algorithm 1 on each frame, so that the luck of its draws averages out; the fused passes are shared.
+    seed : int
+        Of the draws.
+    """
+
+    attackers: int = 1
+    team_size: int = 5
+    collaborators: int = 3
+    budgets: tuple[int, ...] = (7, 5, 3, 1)
+    repeats: int = 10
+    seed: int = 0
+
+    def defenses(self) -> dict[str, SampleConsensus]:
+        """The defences, by the names of their rows."""
+        ratio, s = self.attackers / self.team_size if self.attackers else ASSUMED_RATIO, self.collaborators
+        rows = {f"Algorithm 1, N = {n}": SampleConsensus(ratio, n, s, distinct=False) for n in self.budgets}
+        rows[f"no subset twice, N = {self.budgets[0]}"] = SampleConsensus(ratio, self.budgets[0], s)
+        return rows | {"gateway default": SampleConsensus(ratio)}
+
+
 def evaluate_bounds(
     frames: Iterable[EvaluationFrame | None],
     attack: Attack | Campaign,
-    *,
-    attackers: int = 1,
-    collaborators: int = 3,
-    budgets: Sequence[int] = (7, 5, 3, 1),
-    repeats: int = 10,
-    seed: int = 0,
+    sampling: Sampling = Sampling(),
     tick: Callable[[], None] = lambda: None,
 ) -> BoundsReport:
     """Compute the table of bounds.
@@ -91,17 +119,7 @@ def evaluate_bounds(
     frames : iterable of EvaluationFrame or None
         From `robosac.evaluation.frames`, made with this attack and number of attackers; None is skipped.
     attack : Attack or Campaign
-    attackers : int
-        Among the five teammates: the ratio that the defence assumes.
-    collaborators : int
-        s, the size of a hypothesis.
-    budgets : sequence of int
-        One row of Algorithm 1 for each, with independent draws as in the paper; one for the first of them where no
-        subset is drawn twice in a frame; and one with the gateway's defaults, which choose the hypotheses' size too.
-    repeats : int
-        Runs of Algorithm 1 on each frame, so that the luck of its draws averages out; the fused passes are shared.
-    seed : int
-        Of the draws.
+    sampling : Sampling
     tick : callable
         Called after each frame.
 
@@ -110,31 +128,22 @@ def evaluate_bounds(
     NoFrames
         If there is no frame with enough teammates.
     """
-    ratio = attackers / TEAM_SIZE if attackers else ASSUMED_RATIO
-    samplers = {
-        f"Algorithm 1, N = {n}": SampleConsensus(ratio, sampling_budget=n, collaborators=collaborators, distinct=False)
-        for n in budgets
-    }
-    samplers[f"no subset twice, N = {budgets[0]}"] = SampleConsensus(
-        ratio, sampling_budget=budgets[0], collaborators=collaborators
-    )
-    samplers["gateway default"] = SampleConsensus(ratio)
-    table = _Table(collaborators, samplers, repeats)
+    table = _Table(sampling)
     for index, frame in enumerate(frames):
-        table.add(frame, [seed, 1, index])  # each row has the same luck, whatever else is evaluated
+        table.add(frame, [sampling.seed, 1, index])  # each row has the same luck, whatever else is evaluated
         tick()
     return table.report(attack.epsilon)
 
 
 class _Table:
-    def __init__(self, collaborators: int, samplers: Mapping[str, SampleConsensus], repeats: int) -> None:
-        self._s = collaborators
-        self._samplers = samplers
-        self._repeats = repeats
+    def __init__(self, sampling: Sampling) -> None:
+        self._s = sampling.collaborators
+        self._samplers = sampling.defenses()
+        self._repeats = sampling.repeats
         self._frames = self._skipped = 0
-        names = ["all benign", f"{collaborators} benign", *samplers, "ego only", "no defence"]
+        names = ["all benign", f"{self._s} benign", *self._samplers, "ego only", "no defence"]
         self._ap = {name: AveragePrecision() for name in names}
-        self._runs: dict[str, list[tuple[int, bool, bool]]] = {name: [] for name in samplers}
+        self._runs: dict[str, list[tuple[int, bool, bool]]] = {name: [] for name in self._samplers}
         self._refused: list[bool] = []
         self._missed: list[bool] = []
         self._magnitudes: list[float] = []

@@ -10,7 +10,7 @@ import structlog
 from robosac.audit import commitment
 from robosac.audit.events import SessionOpened, now
 from robosac.budget import DomainError
-from robosac.calibration import calibration_digest
+from robosac.calibrated import calibration_digest, calibration_of
 from robosac.defenses import DefenseSettings, State
 from robosac.detectors import Detector, DetectorInfo
 from robosac.session import default_defense, defense_for
@@ -133,6 +133,8 @@ def _defense(request: SessionRequest, info: DetectorInfo) -> tuple[DefenseSettin
     """Settings of the session's defence, and its state before the first frame."""
     settings = (request.defense or default_defense(info)).at_period(request.frame_period_ms)
     try:
+        if settings.needs_calibration:
+            settings = settings.at_calibration(calibration_of(info))
         defense = defense_for(settings, info)
         defense.check_team(len(request.teammates))
     except DomainError as error:

@@ -30,6 +30,11 @@ COMPARABLE_PERIOD_MS = 250.0
 """Longest period of frames of which one is like the next, as calibrated at 200 ms."""
 
 
+def default_pose_error_m(calibration: Calibration) -> float:
+    """The pose error to expect where none is given: `DEFAULT_POSE_ERROR_M`, if the calibration goes so far."""
+    return min(DEFAULT_POSE_ERROR_M, calibration.levels[-1].pose_error_m)
+
+
 class GroupTestingSettings(DefenseSettings):
     """Bayesian group testing with memory: finds attackers of an unknown number, and names them."""
 
@@ -57,8 +62,11 @@ class GroupTestingSettings(DefenseSettings):
         DEFAULT_NAMING_BOUND, ge=0.5, lt=1, description="Probability above which an attacker is named."
     )
     consensus_threshold: float = Field(DEFAULT_THRESHOLD, gt=0, le=1, description="Jaccard index of a consensus.")
-    pose_error_m: float = Field(
-        DEFAULT_POSE_ERROR_M, ge=0, description="Standard deviation of the teammates' positions to expect, metres."
+    pose_error_m: float | None = Field(
+        None,
+        ge=0,
+        description="Standard deviation of the teammates' positions to expect, metres; by default "
+        f"{DEFAULT_POSE_ERROR_M:g}, or the largest that the detector is calibrated for, if that is less.",
     )
     compare_frames: bool | None = Field(
         None,
@@ -72,6 +80,12 @@ class GroupTestingSettings(DefenseSettings):
         if self.compare_frames is not None:
             return self
         return self.model_copy(update={"compare_frames": frame_period_ms <= COMPARABLE_PERIOD_MS})
+
+    def at_calibration(self, calibration: Calibration) -> Self:
+        """With ``pose_error_m`` decided."""
+        if self.pose_error_m is not None:
+            return self
+        return self.model_copy(update={"pose_error_m": default_pose_error_m(calibration)})
 
     def build(self, calibration: Calibration | None) -> Defense:
         if calibration is None:
@@ -155,9 +169,7 @@ class GroupTesting:
         check_threshold(self.consensus_threshold)
 
     @classmethod
-    def calibrated(
-        cls, calibration: Calibration, pose_error_m: float = DEFAULT_POSE_ERROR_M, **settings: Any
-    ) -> GroupTesting:
+    def calibrated(cls, calibration: Calibration, pose_error_m: float | None = None, **settings: Any) -> GroupTesting:
         """With the likelihoods of a calibration at the pose error to be expected, metres.
 
         Raises
@@ -165,7 +177,8 @@ class GroupTesting:
         CalibrationError
             If the calibration does not reach so far.
         """
-        return cls(calibration.at(pose_error_m), **settings)
+        expected = default_pose_error_m(calibration) if pose_error_m is None else pose_error_m
+        return cls(calibration.at(expected), **settings)
 
     def check_team(self, team_size: int) -> None:
         """Any team will do."""

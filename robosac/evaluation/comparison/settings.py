@@ -18,7 +18,7 @@ _AS_PLAYED: Mapping[str, Mapping[str, Mapping[str, Any]]] = {
     "sample_consensus": {"sample_consensus": _PAPER},
     "static_team": {"static_team": _PAPER},
     "a2cp": {"a2cp": {}},
-    "group_testing": {"group_testing": {"pose_error_m": 0.0}, "group_testing, expecting .2 m": {}},
+    "group_testing": {"group_testing": {"pose_error_m": 0.0}, "group_testing, expecting .2 m": {"pose_error_m": 0.2}},
 }
 """Columns of a kind, and its settings there; any other kind has one column, with its defaults."""
 

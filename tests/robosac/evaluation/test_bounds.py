@@ -2,15 +2,15 @@ import numpy as np
 import pytest
 
 from robosac.attacks import PGD, Erase
-from robosac.evaluation import BoundsReport, NoFrames, evaluate_bounds
+from robosac.evaluation import BoundsReport, NoFrames, Sampling, evaluate_bounds
 from robosac.evaluation.frames import evaluation_frames
 from robosac.scenes import IntersectionScene
 
 
-def evaluate(detector, attack, scenes, frames, attackers=1, **options) -> BoundsReport:
+def evaluate(detector, attack, scenes, frames, attackers=1, tick=lambda: None, **options) -> BoundsReport:
     rng = np.random.default_rng([0, 0])
     met = evaluation_frames(detector, list(map(IntersectionScene, range(scenes))), frames, attack, attackers, rng)
-    return evaluate_bounds(met, attack, attackers=attackers, **options)
+    return evaluate_bounds(met, attack, Sampling(attackers, **options), tick)
 
 
 @pytest.fixture(scope="module")
@@ -80,7 +80,7 @@ def test_the_consensus_test_is_counted_over_all_hypotheses(report):
 
 def test_frames_without_enough_teammates_are_counted_apart(detector):
     frames = list(evaluation_frames(detector, [IntersectionScene(0)], 2, PGD(steps=1), 1, np.random.default_rng(0)))
-    report = evaluate_bounds([None, frames[0], None], PGD(), budgets=(1,), repeats=1)
+    report = evaluate_bounds([None, frames[0], None], PGD(), Sampling(budgets=(1,), repeats=1))
     assert (report.frames, report.skipped) == (1, 2)
     with pytest.raises(NoFrames):
         evaluate_bounds([None], PGD())
