@@ -19,7 +19,8 @@ from rich.progress import (
     TimeRemainingColumn,
 )
 
-from robosac.detectors.embedded import ADVERSARIAL_WEIGHTS, SHIPPED_WEIGHTS, WeightsError, read_weights
+from robosac.detectors.embedded import ADVERSARIAL_WEIGHTS, SHIPPED_WEIGHTS
+from robosac.detectors.weights_file import WeightsError, read_weights
 from robosac.training.adversary import AdversaryConfig
 from robosac.training.export import export_weights, shipped_tensors
 from robosac.training.loop import TrainingConfig, train_network
