@@ -36,7 +36,7 @@ def own(tmp_path, monkeypatch):
 
 def robosac(*arguments):
     words = [sys.executable, "-c", "from robosac.cli import app; app()", *map(str, arguments)]
-    return subprocess.run(words, capture_output=True, text=True, timeout=300, env=None)
+    return subprocess.run(words, check=False, capture_output=True, text=True, timeout=300)
 
 
 def test_all_four_are_compared(own):

@@ -5,7 +5,7 @@ from __future__ import annotations
 from collections.abc import Mapping
 
 from robosac.attacks.adaptive import Erase, Invent, InventSteady, Shift
-from robosac.attacks.base import Attack, IterativeAttack, Knowledge, inverted_pseudo_truth
+from robosac.attacks.base import Attack, IterativeAttack, Knowledge
 from robosac.attacks.campaign import BEHAVIOURS, HONEST, SEPARATOR, Campaign, lacking
 from robosac.attacks.carlini_wagner import CarliniWagner
 from robosac.attacks.geometric import NoGeometry
@@ -86,7 +86,6 @@ __all__ = [
     "NoGeometry",
     "Shift",
     "ShiftStill",
-    "inverted_pseudo_truth",
     "lacking",
     "load",
     "load_campaign",

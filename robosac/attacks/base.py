@@ -40,25 +40,6 @@ class Knowledge:
     benign_logits: torch.Tensor
 
 
-def inverted_pseudo_truth(ego_logits: torch.Tensor, logits: torch.Tensor) -> torch.Tensor:
-    """How far an ego's class scores are from the inverse of what it sees alone (0 is reached at the inverse).
-
-    The pseudo ground truth of the paper: the ego-only class scores stand for the unknown truth, and the attacker wants
-    each of them inverted, objects erased and background filled.
-
-    Parameters
-    ----------
-    ego_logits, logits : tensors of one shape
-        Class logits of the ego alone and of the attacked fusion.
-
-    Returns
-    -------
-    scalar tensor
-        Mean binary cross-entropy against ``1 - sigmoid(ego_logits)``.
-    """
-    return functional.binary_cross_entropy_with_logits(logits, 1.0 - torch.sigmoid(ego_logits))
-
-
 @dataclass(frozen=True)
 class Attack(ABC):
     """An adversary in control of some teammates.
@@ -98,6 +79,7 @@ class Attack(ABC):
         attackers : collection of str
             Teammates under the adversary's control.
         rng : numpy.random.Generator
+            For all that is random about the attack.
 
         Returns
         -------
@@ -158,9 +140,9 @@ class IterativeAttack(Attack):
                     variable.copy_(self.project(variable))
         return {name: (clean[name] + self.perturbation(variables[name])).detach() for name in clean}
 
-    @abstractmethod
-    def start(self, clean: Tensors, rng: np.random.Generator) -> dict[str, torch.Tensor]:
-        """The first variables, within the bound."""
+    def start(self, clean: Tensors, rng: np.random.Generator) -> dict[str, torch.Tensor]:  # noqa: ARG002
+        """The first variables, within the bound; by default those of no perturbation."""
+        return {name: torch.zeros_like(tensor) for name, tensor in clean.items()}
 
     def aim(self, surface: AttackSurface, attackers: Collection[str]) -> Aim:  # noqa: ARG002
         """What the adversary minimises in this frame; by default `objective` of the class logits of the whole team."""
@@ -173,17 +155,22 @@ class IterativeAttack(Attack):
         return loss
 
     def objective(self, known: Knowledge, logits: torch.Tensor, delta: Tensors) -> torch.Tensor:  # noqa: ARG002
-        """What the adversary minimises; by default `inverted_pseudo_truth`.
+        """What the adversary minimises; by default the paper's loss.
+
+        There the ego-only class scores stand for the unknown truth, and the attacker wants each of them inverted:
+        objects erased and background filled. The loss is the mean binary cross-entropy against ``1 -
+        sigmoid(known.ego_logits)``.
 
         Parameters
         ----------
         known : Knowledge
+            From before the attack.
         logits : tensor
             The ego's class logits under the present perturbation.
         delta : mapping of attacker to tensor
             The present perturbation.
         """
-        return inverted_pseudo_truth(known.ego_logits, logits)
+        return functional.binary_cross_entropy_with_logits(logits, 1.0 - torch.sigmoid(known.ego_logits))
 
     def perturbation(self, variable: torch.Tensor) -> torch.Tensor:
         """The perturbation that a variable stands for; by default itself."""

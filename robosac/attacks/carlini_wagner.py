@@ -5,7 +5,6 @@ from __future__ import annotations
 from dataclasses import dataclass
 from typing import ClassVar
 
-import numpy as np
 import torch
 
 from robosac.attacks.base import IterativeAttack, Knowledge, Tensors
@@ -39,10 +38,6 @@ class CarliniWagner(IterativeAttack):
     steps: int = 30
     trade_off: float = 10.0
     confidence: float = 3.0
-
-    def start(self, clean: Tensors, rng: np.random.Generator) -> dict[str, torch.Tensor]:  # noqa: ARG002
-        """No perturbation."""
-        return {name: torch.zeros_like(tensor) for name, tensor in clean.items()}
 
     def objective(self, known: Knowledge, logits: torch.Tensor, delta: Tensors) -> torch.Tensor:
         """Squared size of the perturbation and the margins not yet lost."""

@@ -30,7 +30,3 @@ class BIM(IterativeAttack):
     """Basic iterative method (Kurakin et al., 2018): signed steps from the benign message itself."""
 
     name: ClassVar[str] = "bim"
-
-    def start(self, clean: Tensors, rng: np.random.Generator) -> dict[str, torch.Tensor]:  # noqa: ARG002
-        """No perturbation."""
-        return {name: torch.zeros_like(tensor) for name, tensor in clean.items()}

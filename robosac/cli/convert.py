@@ -10,9 +10,9 @@ from typing import Annotated
 import torch
 import typer
 
-from robosac.detectors.embedded import WeightsError
 from robosac.detectors.v2xsim import write_weights
 from robosac.detectors.v2xsim.fusions import FUSIONS
+from robosac.detectors.weights_file import WeightsError
 
 
 def run(

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from dataclasses import dataclass
+from functools import partial
 from pathlib import Path
 from typing import Annotated
 
@@ -19,11 +20,12 @@ from rich.progress import (
     TimeRemainingColumn,
 )
 
-from robosac.detectors.embedded import ADVERSARIAL_WEIGHTS, SHIPPED_WEIGHTS, WeightsError, read_weights
+from robosac.detectors.embedded import ADVERSARIAL_WEIGHTS, SHIPPED_WEIGHTS
+from robosac.detectors.weights_file import WeightsError, read_weights
 from robosac.training.adversary import AdversaryConfig
 from robosac.training.export import export_weights, shipped_tensors
 from robosac.training.loop import TrainingConfig, train_network
-from robosac.training.validation import GAINS, HARM, choose_operating_point
+from robosac.training.validation import GAINS, HARM, choose_operating_point, validation_frames
 
 _DEFAULTS = TrainingConfig()
 _ADVERSARIAL_STEPS = 900
@@ -110,7 +112,8 @@ def _train(console: Console, out: Path, plan: _Plan) -> None:
         rounded = {name: tensor.float() for name, tensor in shipped_tensors(network).items()}
         network.load_state_dict(rounded)  # what is chosen is chosen for the weights that ship
         validating = progress.add_task("validate", total=len(plan.gains), remark="choosing the operating point")
-        point = choose_operating_point(network, lambda: progress.advance(validating), plan.gains, plan.harm)
+        attacked = partial(validation_frames, network)
+        point = choose_operating_point(attacked, lambda: progress.advance(validating), plan.gains, plan.harm)
         progress.update(validating, completed=len(plan.gains), remark="")
     recipe = export_weights(network, plan.config, point, plan.command, weights)
     console.print(f"{weights}: {weights.stat().st_size / 1e6:.2f} MB")

@@ -21,9 +21,10 @@ from robosac.detectors.base import (
 from robosac.lazy import lazily
 
 if TYPE_CHECKING:
-    from robosac.detectors.embedded import EmbeddedDetector, WeightsError
+    from robosac.detectors.embedded import EmbeddedDetector
     from robosac.detectors.loading import DEFAULT_DETECTOR, available, load
     from robosac.detectors.v2xsim import V2XSimDetector
+    from robosac.detectors.weights_file import WeightsError
 else:
     __getattr__, __dir__ = lazily(
         __name__,
@@ -31,7 +32,7 @@ else:
             "DEFAULT_DETECTOR": "robosac.detectors.loading:DEFAULT_DETECTOR",
             "EmbeddedDetector": "robosac.detectors.embedded:EmbeddedDetector",
             "V2XSimDetector": "robosac.detectors.v2xsim:V2XSimDetector",
-            "WeightsError": "robosac.detectors.embedded:WeightsError",
+            "WeightsError": "robosac.detectors.weights_file:WeightsError",
             "available": "robosac.detectors.loading:available",
             "load": "robosac.detectors.loading:load",
         },

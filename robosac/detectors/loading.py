@@ -9,7 +9,8 @@ from __future__ import annotations
 from pathlib import Path
 
 from robosac.detectors.base import Detector, Preparer
-from robosac.detectors.embedded import EmbeddedDetector, WeightsError, read_weights
+from robosac.detectors.embedded import EmbeddedDetector
+from robosac.detectors.weights_file import WeightsError, read_weights
 from robosac.plugins import Kind, classes
 
 DEFAULT_DETECTOR = EmbeddedDetector.name

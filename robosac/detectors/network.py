@@ -13,7 +13,7 @@ from torch import nn
 
 from robosac.detectors.voxels import LAYERS
 
-FEATURES = 64
+CHANNELS = 64
 MAP = 32
 HEAD = 64
 BOX_CHANNELS = 6
@@ -34,13 +34,13 @@ class MeanFusionNetwork(nn.Module):
     def __init__(self) -> None:
         super().__init__()
         self.encoder = nn.Sequential(
-            nn.PixelUnshuffle(2), _block(LAYERS * 4, 48), _block(48, FEATURES, stride=2), _block(FEATURES, FEATURES)
+            nn.PixelUnshuffle(2), _block(LAYERS * 4, 48), _block(48, CHANNELS, stride=2), _block(CHANNELS, CHANNELS)
         )
         self.decoder = nn.Sequential(
-            _block(FEATURES, FEATURES),
-            _block(FEATURES, FEATURES),
-            _block(FEATURES, FEATURES),
-            nn.Conv2d(FEATURES, 4 * 40, 1, bias=False),
+            _block(CHANNELS, CHANNELS),
+            _block(CHANNELS, CHANNELS),
+            _block(CHANNELS, CHANNELS),
+            nn.Conv2d(CHANNELS, 4 * 40, 1, bias=False),
             nn.PixelShuffle(2),
             nn.BatchNorm2d(40),
             nn.ReLU(inplace=True),

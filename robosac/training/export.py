@@ -2,16 +2,15 @@
 
 from __future__ import annotations
 
-import json
 from dataclasses import asdict
 from pathlib import Path
 from typing import Any
 
 import torch
-from safetensors.torch import save_file
 
-from robosac.detectors.embedded import EmbeddedDetector, tensors_digest
+from robosac.detectors.embedded import EmbeddedDetector
 from robosac.detectors.network import MeanFusionNetwork
+from robosac.detectors.weights_file import save_weights
 from robosac.scenes.splits import TRAINING_SEEDS, VALIDATION_SEEDS
 from robosac.training.loop import TrainingConfig
 from robosac.training.validation import FRAMES_PER_SCENE, SCENES, OperatingPoint
@@ -45,7 +44,6 @@ def export_weights(
         The recipe in the file's metadata: command, seed, data, operating point, validation figures, and the SHA-256 of
         the tensors.
     """
-    tensors = shipped_tensors(network)
     recipe = {
         "detector": EmbeddedDetector.name,
         "command": command,
@@ -63,9 +61,5 @@ def export_weights(
         "score_threshold": point.score_threshold,
         "consensus_score": point.consensus_score,
         "validation": point.figures,
-        "tensors_sha256": tensors_digest(tensors),
     }
-    path.parent.mkdir(parents=True, exist_ok=True)
-    save_file(tensors, path, metadata={"robosac": json.dumps(recipe)})
-    path.chmod(0o644)  # safetensors writes for the owner alone
-    return recipe
+    return save_weights(shipped_tensors(network), recipe, path)

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 from collections.abc import Callable, Mapping, Sequence
 from dataclasses import asdict, dataclass
+from itertools import count
 from pathlib import Path
 from typing import Any
 
@@ -19,8 +20,6 @@ from robosac.training.adversary import AdversaryConfig, add_adversary
 from robosac.training.data import TrainingFrame, generate
 from robosac.training.loss import detection_loss, stack, targets
 
-CHECKPOINT_EVERY = 50
-
 Progress = Callable[[str, int, int, str], None]
 """Told the stage, the steps done, the steps in all, and a remark."""
 
@@ -35,8 +34,7 @@ class TrainingConfig:
         Of the initial weights and of every draw.
     scenes, frames_per_scene : int
         Data: that many scenes from the start of the training seeds, frames 1 s apart.
-    steps : int
-    frames_per_step, egos_per_frame : int
+    steps, frames_per_step, egos_per_frame : int
         Each step encodes all agents of some frames and decodes some of them as ego.
     learning_rate, weight_decay : float
         AdamW; one cycle with cosine decay to zero.
@@ -59,18 +57,26 @@ class TrainingConfig:
 
 
 def train_network(
-    config: TrainingConfig, checkpoint: Path, progress: Progress, initial: Mapping[str, torch.Tensor] | None = None
+    config: TrainingConfig,
+    checkpoint: Path,
+    progress: Progress,
+    initial: Mapping[str, torch.Tensor] | None = None,
+    checkpoint_every: int = 50,
 ) -> MeanFusionNetwork:
     """Train, or go on from ``checkpoint`` if it is there.
 
     Parameters
     ----------
     config : TrainingConfig
+        Must be that of the checkpoint.
     checkpoint : Path
-        Written every 50 steps and at the end; read first if it exists.
+        Read first if it exists; written at the end, too.
     progress : callable
+        Told after each step.
     initial : mapping of name to tensor, optional
         Weights to begin with; random ones by default.
+    checkpoint_every : int
+        Steps after which the checkpoint is written again.
 
     Returns
     -------
@@ -94,27 +100,17 @@ def train_network(
     parts = {"network": network, "optimiser": optimiser, "schedule": schedule}
     done = _resume(checkpoint, config, parts)
     if done < config.steps:
-        frames = _training_frames(config, progress)
+        made, wanted = count(1), config.scenes * config.frames_per_scene
+        seeds = TRAINING_SEEDS[: config.scenes]
+        frames = generate(seeds, config.frames_per_scene, lambda: progress("generate", next(made), wanted, ""))
         for step in range(done, config.steps):
             loss = _step(network, optimiser, frames, config, np.random.default_rng([config.seed, step]))
             schedule.step()
             progress("train", step + 1, config.steps, f"loss {loss:.3f}")
-            if (step + 1) % CHECKPOINT_EVERY == 0 or step + 1 == config.steps:
+            if (step + 1) % checkpoint_every == 0 or step + 1 == config.steps:
                 _save(checkpoint, config, parts, step + 1)
     network.eval()
     return network
-
-
-def _training_frames(config: TrainingConfig, progress: Progress) -> list[TrainingFrame]:
-    total = config.scenes * config.frames_per_scene
-    made = 0
-
-    def tick() -> None:
-        nonlocal made
-        made += 1
-        progress("generate", made, total, "")
-
-    return generate(TRAINING_SEEDS[: config.scenes], config.frames_per_scene, tick)
 
 
 def _step(
@@ -133,8 +129,7 @@ def _step(
         agents = len(frame.poses)
         for ego in rng.permutation(agents)[: config.egos_per_frame]:
             others = rng.permutation(np.delete(np.arange(agents), ego))
-            count = 0 if rng.random() < config.ego_only_share else int(rng.integers(1, agents))
-            selected = others[:count]
+            selected = others[: 0 if rng.random() < config.ego_only_share else int(rng.integers(1, agents))]
             moves = [sampling_matrix(frame.poses[ego], frame.poses[j], AREA_M) for j in selected]
             maps.append(_fuse(features[first : first + agents], int(ego), selected, moves))
             matrices.append(moves)

@@ -12,7 +12,7 @@ import numpy as np
 
 from robosac.attacks import PGD
 from robosac.consensus import DEFAULT_THRESHOLD, at_least, compare
-from robosac.detectors import EmbeddedDetector
+from robosac.detectors import EmbeddedDetector, Preparer
 from robosac.detectors.network import MeanFusionNetwork
 from robosac.evaluation.average_precision import AveragePrecision
 from robosac.evaluation.frames import EvaluationFrame, evaluation_frames
@@ -25,6 +25,9 @@ HARM = 0.25
 SCENES = 20
 FRAMES_PER_SCENE = 3
 HYPOTHESIS = 3
+
+Trial = tuple[Preparer, list[EvaluationFrame]]
+"""A detector, and frames in which it is attacked."""
 
 
 @dataclass(frozen=True)
@@ -50,20 +53,33 @@ class OperatingPoint:
     figures: dict[str, float]
 
 
-def choose_operating_point(
-    network: MeanFusionNetwork, tick: Callable[[], None], gains: Sequence[float] = GAINS, harm: float = HARM
-) -> OperatingPoint:
-    """Choose gain and consensus score on 60 frames of 20 validation scenes.
+def validation_frames(network: MeanFusionNetwork, gain: float) -> Trial:
+    """A detector with this gain, and 60 frames of 20 validation scenes with one PGD attacker of five."""
+    detector = EmbeddedDetector.from_network(network, gain, SCORE_THRESHOLD, SCORE_THRESHOLD)
+    scenes, rng = Synthetic().scenes("validation")[:SCENES], np.random.default_rng(0)
+    return detector, list(filter(None, evaluation_frames(detector, scenes, FRAMES_PER_SCENE, PGD(), 1, rng)))
 
-    The network is positively homogeneous where the message is taken, so a gain changes no perception, only what a
-    perturbation of a given size means. Taken is the largest gain at which one PGD attacker of five (15 steps of 0.1
-    within 0.5) brings the undefended fusion 0.25 of AP50 below the ego alone; in the paper it is 0.24. At that gain the
-    consensus score is chosen that keeps both kinds of hypotheses farthest from the consensus threshold: it maximises
-    the smaller of the distances of the benign ones' 1st and the attacked ones' 99th percentile.
+
+def choose_operating_point(
+    attacked: Callable[[float], Trial],
+    tick: Callable[[], None],
+    gains: Sequence[float] = GAINS,
+    harm: float = HARM,
+) -> OperatingPoint:
+    """Choose gain and consensus score.
+
+    The network is positively homogeneous where the message is taken. So a gain changes no perception, only what a
+    perturbation of a given size means.
+
+    1. The gain is the largest at which the attack (PGD: 15 steps of 0.1 within 0.5) brings the undefended fusion 0.25
+       of AP50 below the ego alone; in the paper it is 0.24.
+    2. At that gain, the consensus score keeps both kinds of hypotheses farthest from the consensus threshold. It
+       maximises the smaller of two distances: of the benign ones' 1st percentile, and of the attacked ones' 99th.
 
     Parameters
     ----------
-    network : MeanFusionNetwork
+    attacked : callable
+        Gives the detector with a gain, and frames in which it is attacked; see `validation_frames`.
     tick : callable
         Called after each gain tried.
     gains : sequence of float
@@ -78,10 +94,7 @@ def choose_operating_point(
     """
     figures: dict[str, float] = {}
     for gain in gains:
-        detector = EmbeddedDetector.from_network(network, gain, SCORE_THRESHOLD, SCORE_THRESHOLD)
-        rng = np.random.default_rng(0)
-        scenes = Synthetic().scenes("validation")[:SCENES]
-        frames = list(filter(None, evaluation_frames(detector, scenes, FRAMES_PER_SCENE, PGD(), 1, rng)))
+        detector, frames = attacked(gain)
         figures = _average_precision(detector, frames)
         tick()
         if figures["no_defence_ap50"] <= figures["ego_only_ap50"] - harm:
@@ -90,7 +103,7 @@ def choose_operating_point(
     raise ValueError(f"at no gain down to {gains[-1]} does the attack harm by {harm} of AP50: {figures}")
 
 
-def _average_precision(detector: EmbeddedDetector, frames: list[EvaluationFrame]) -> dict[str, float]:
+def _average_precision(detector: Preparer, frames: list[EvaluationFrame]) -> dict[str, float]:
     ap = {name: AveragePrecision() for name in ("ego_only_ap50", "all_benign_ap50", "no_defence_ap50")}
     for frame in frames:
         team = list(frame.benign)
@@ -101,7 +114,7 @@ def _average_precision(detector: EmbeddedDetector, frames: list[EvaluationFrame]
     return {name: value.at(0.5) for name, value in ap.items()}
 
 
-def _consensus_score(detector: EmbeddedDetector, frames: list[EvaluationFrame]) -> tuple[float, dict[str, float]]:
+def _consensus_score(detector: Preparer, frames: list[EvaluationFrame]) -> tuple[float, dict[str, float]]:
     benign: dict[float, list[float]] = {score: [] for score in CONSENSUS_SCORES}
     attacked: dict[float, list[float]] = {score: [] for score in CONSENSUS_SCORES}
     for frame in frames:

@@ -167,7 +167,8 @@ import sys
 import robosac
 from safetensors.torch import save_file
 from robosac import attacks, defenses, detectors
-from robosac.detectors.embedded import SHIPPED_WEIGHTS, read_weights
+from robosac.detectors.embedded import SHIPPED_WEIGHTS
+from robosac.detectors.weights_file import read_weights
 
 assert robosac.__file__.startswith(sys.argv[1]), robosac.__file__
 assert defenses.build({"kind": "halves", "consensus_threshold": 0.4}) == defenses.Halving(consensus_threshold=0.4)

@@ -127,14 +127,14 @@ def detections(
 ) -> tuple[FloatArray, IntArray]:
     """Boxes of one ego.
 
-    1. An anchor is a candidate if its softmax score exceeds the threshold t, that is if the difference of its logits
-       exceeds ``ln(t / (1 - t))``; of more than 1000 the best are kept.
+    1. An anchor is a candidate if its softmax score exceeds the threshold t, that is if its logit exceeds
+       ``ln(t / (1 - t))``; of more than 1000 the best are kept.
     2. Candidates are decoded, and by descending score each suppresses what overlaps it at an IoU above 0.01.
 
     Parameters
     ----------
-    logits : (A, 2) float32 tensor
-        Background and vehicle.
+    logits : (A,) float32 tensor
+        Difference of the logits of vehicle and background.
     codes : (A, 6) float32 tensor
     score_threshold : float
         Strictly between 0 and 1.
@@ -146,7 +146,7 @@ def detections(
     anchor : (n,) int64 ndarray
         The anchor that each comes from.
     """
-    margin = (logits[:, 1] - logits[:, 0]).numpy()
+    margin = logits.numpy()
     floor = math.log(score_threshold / (1 - score_threshold))
     index: IntArray = np.flatnonzero(margin > floor)
     if len(index) > MAX_CANDIDATES:

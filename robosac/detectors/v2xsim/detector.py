@@ -8,25 +8,23 @@ checkpoint.
 from __future__ import annotations
 
 import hashlib
-import json
-from collections.abc import Collection, Mapping
+from collections.abc import Mapping
 from pathlib import Path
 from typing import Any, ClassVar
 
 import numpy as np
 import torch
-from safetensors.torch import save_file
 
 from robosac.boxes import FloatArray
 from robosac.detectors.base import DetectorInfo, Message, TensorSpec, calibration_beside
-from robosac.detectors.embedded import WeightsError, read_weights, tensors_digest
+from robosac.detectors.map_fusion import FEATURES, Decode, Heads, MapFusionDetector, Maps
 from robosac.detectors.v2xsim.anchors import SCORE_THRESHOLD, detections, geometry
-from robosac.detectors.v2xsim.fusions import FUSIONS, Fusion
-from robosac.detectors.v2xsim.network import FEATURES, MAP, Context, V2XSimNetwork, select_published
+from robosac.detectors.v2xsim.fusions import FUSIONS
+from robosac.detectors.v2xsim.network import CHANNELS, MAP, V2XSimNetwork, select_published
 from robosac.detectors.v2xsim.voxels import AREA_M, PACKED_SHAPE, BoolArray, occupancy, pack, unpack
-from robosac.detectors.warp import sampling_matrix, warp
+from robosac.detectors.warp import sampling_matrix
+from robosac.detectors.weights_file import WeightsError, read_weights, save_weights
 
-_FEATURES = "features"
 _GRID = "grid"
 _MIRROR = np.array([[1.0, -1.0, -1.0], [-1.0, 1.0, 1.0]])
 
@@ -53,18 +51,14 @@ def write_weights(state: Mapping[str, object], fusion: str, path: Path) -> dict[
     KeyError
         If there is no such fusion.
     """
-    tensors = select_published(state)
     recipe = {
         "detector": name_of(fusion),
         "fusion": fusion,
         "command": f"robosac convert-checkpoint CHECKPOINT.pth OUT.safetensors --fusion {fusion}",
         "score_threshold": SCORE_THRESHOLD,
         "consensus_score": SCORE_THRESHOLD,
-        "tensors_sha256": tensors_digest(tensors),
     }
-    path.parent.mkdir(parents=True, exist_ok=True)
-    save_file(tensors, path, metadata={"robosac": json.dumps(recipe)})
-    return recipe
+    return save_weights(select_published(state), recipe, path)
 
 
 def name_of(fusion: str) -> str:
@@ -80,7 +74,7 @@ def mirrored_matrix(ego_pose: FloatArray, pose: FloatArray) -> FloatArray:
     return matrix
 
 
-class V2XSimDetector:
+class V2XSimDetector(MapFusionDetector):
     """Fusion of 256 x 32 x 32 feature maps at 2 m a cell over +-32 m; maps have rows along +y, columns along -x.
 
     Boxes are in the ego's LiDAR frame. The score threshold is 0.7 unless the recipe says otherwise, and all boxes take
@@ -113,12 +107,12 @@ class V2XSimDetector:
             raise WeightsError(f"{weights}: {error}") from error
         self._fusion = FUSIONS[fusion]
         self._score_threshold = float(self.recipe.get("score_threshold", SCORE_THRESHOLD))
-        features = TensorSpec("float32", (FEATURES, MAP, MAP))
-        self._info = DetectorInfo(
+        features = TensorSpec("float32", (CHANNELS, MAP, MAP))
+        self.info = DetectorInfo(
             name=name_of(fusion),
             tensors={
-                "ego": {_FEATURES: features, _GRID: TensorSpec("uint8", PACKED_SHAPE)},
-                "teammate": {_FEATURES: features},
+                "ego": {FEATURES: features, _GRID: TensorSpec("uint8", PACKED_SHAPE)},
+                "teammate": {FEATURES: features},
             },
             area_m=(-AREA_M, -AREA_M, AREA_M, AREA_M),
             cell_m=2 * AREA_M / MAP,
@@ -126,11 +120,6 @@ class V2XSimDetector:
             consensus_score=float(self.recipe.get("consensus_score", SCORE_THRESHOLD)),
             calibration=calibration_beside(weights),
         )
-
-    @property
-    def info(self) -> DetectorInfo:
-        """Name, message layout, area and digest."""
-        return self._info
 
     def encode(self, points: FloatArray, pose: FloatArray) -> Message:
         """The message for a LiDAR scan, of an ego; `robosac.detectors.base.for_role` makes a teammate's of it.
@@ -148,118 +137,31 @@ class V2XSimDetector:
         """The message for an occupancy grid (256, 256, 13); see `robosac.detectors.v2xsim.voxels`."""
         with torch.inference_mode():
             features = self._network.levels(_as_maps(grid))[-1][0].contiguous()
-        return Message(np.asarray(pose, dtype=np.float64), {_FEATURES: features.numpy(), _GRID: pack(grid)})
+        return Message(np.asarray(pose, dtype=np.float64), {FEATURES: features.numpy(), _GRID: pack(grid)})
 
-    def prepare(self, ego: Message, teammates: Mapping[str, Message]) -> PreparedV2XSim:
-        """Compute the ego's own part of the decoder and warp every teammate into the ego's frame, once."""
-        with torch.inference_mode():
-            own, context = self._own(ego)
-            warped: Mapping[str, torch.Tensor] = {}
-            if teammates:
-                features = torch.stack([_features(message) for message in teammates.values()])
-                matrices = torch.stack([_matrix(ego, message) for message in teammates.values()])
-                warped = dict(zip(teammates, warp(features, matrices), strict=True))
-        return PreparedV2XSim(self._network, self._fusion, context, own, warped, self._score_threshold)
+    def decoder(self, ego: Message, own: torch.Tensor) -> Decode:
+        """Logits (393216,) and codes (393216, 6) of all anchors; the decoder's part that is the ego's own, once."""
+        context = self._network.context(_as_maps(unpack(ego.tensors[_GRID])), own[None])
 
-    def attack_surface(self, ego: Message, teammates: Mapping[str, Message]) -> V2XSimAttackSurface:
-        """The frame as a white-box attacker sees it. Perturbations act on the message, before the warp, as in the paper
-        (the published code adds them after it).
-        """
-        with torch.no_grad():
-            own, context = self._own(ego)
-        messages = {name: _features(message) for name, message in teammates.items()}
-        matrices = {name: _matrix(ego, message) for name, message in teammates.items()}
-        return V2XSimAttackSurface(self._network, self._fusion, context, own, messages, matrices)
+        def decode(maps: Maps) -> Heads:
+            logits, codes = self._network.decode(self._fusion(maps)[None], context)
+            return logits[:, 1] - logits[:, 0], codes
 
-    def perturbed(self, message: Message, tensor: torch.Tensor) -> Message:
-        """The message with its features replaced by ``tensor`` (256, 32, 32)."""
-        return Message(message.pose, {**message.tensors, _FEATURES: tensor.detach().contiguous().numpy()})
+        return decode
 
-    def _own(self, ego: Message) -> tuple[torch.Tensor, Context]:
-        """The ego's features (256, 32, 32) and its part of the decoder."""
-        own = _features(ego)
-        return own, self._network.context(_as_maps(unpack(ego.tensors[_GRID])), own[None])
+    def boxes(self, logits: torch.Tensor, codes: torch.Tensor) -> FloatArray:
+        """As `detections` makes them."""
+        return detections(logits, codes, self._score_threshold)[0]
 
+    def places(self, codes: torch.Tensor) -> torch.Tensor:
+        """Boxes (393216, 6) of all anchors."""
+        return geometry(codes)
 
-class PreparedV2XSim:
-    """A frame of the V2X-Sim detector; see `robosac.detectors.base.PreparedFrame`."""
-
-    def __init__(
-        self,
-        network: V2XSimNetwork,
-        fusion: Fusion,
-        context: Context,
-        own: torch.Tensor,
-        warped: Mapping[str, torch.Tensor],
-        score_threshold: float,
-    ) -> None:
-        self._network = network
-        self._fusion = fusion
-        self._context = context
-        self._own = own
-        self._warped = warped
-        self._score_threshold = score_threshold
-
-    def detect(self, teammates: Collection[str] = ()) -> FloatArray:
-        """Boxes (n, 6) of the ego fused with these teammates; with none, of the ego alone."""
-        with torch.inference_mode():
-            fused = self._fusion([self._own, *(self._warped[name] for name in teammates)])
-            boxes, _ = detections(*self._network.decode(fused[None], self._context), self._score_threshold)
-        return boxes
-
-
-class V2XSimAttackSurface:
-    """A frame of the V2X-Sim detector for an attacker; see `robosac.detectors.base.GeometricSurface`."""
-
-    def __init__(
-        self,
-        network: V2XSimNetwork,
-        fusion: Fusion,
-        context: Context,
-        own: torch.Tensor,
-        messages: Mapping[str, torch.Tensor],
-        matrices: Mapping[str, torch.Tensor],
-    ) -> None:
-        self._network = network
-        self._fusion = fusion
-        self._context = context
-        self._own = own
-        self.messages = messages
-        self._matrices = matrices
-        self._benign = {name: self._warp(name, tensor) for name, tensor in messages.items()}
-
-    def _warp(self, name: str, tensor: torch.Tensor) -> torch.Tensor:
-        return warp(tensor[None], self._matrices[name][None])[0]
-
-    def class_logits(self, messages: Mapping[str, torch.Tensor]) -> torch.Tensor:
-        """Logits (393216,) of every anchor's score, of the ego fused with these messages; benign ones are not warped
-        again.
-        """
-        logits, _ = self._heads(messages)
-        return logits[:, 1] - logits[:, 0]
-
-    def perceive(self, messages: Mapping[str, torch.Tensor]) -> tuple[torch.Tensor, torch.Tensor]:
-        """Class logits (393216,) and the boxes (393216, 6) of all anchors."""
-        logits, codes = self._heads(messages)
-        return logits[:, 1] - logits[:, 0], geometry(codes)
-
-    def _heads(self, messages: Mapping[str, torch.Tensor]) -> tuple[torch.Tensor, torch.Tensor]:
-        warped = [
-            self._benign[name] if tensor is self.messages[name] else self._warp(name, tensor)
-            for name, tensor in messages.items()
-        ]
-        return self._network.decode(self._fusion([self._own, *warped])[None], self._context)
-
-
-def _features(message: Message) -> torch.Tensor:
-    """A message's feature map (256, 32, 32), copied: the array may be read-only."""
-    return torch.from_numpy(np.array(message.tensors[_FEATURES], dtype=np.float32))
+    def sampling_matrix(self, ego_pose: FloatArray, pose: FloatArray) -> FloatArray:
+        """As `mirrored_matrix` makes it."""
+        return mirrored_matrix(ego_pose, pose)
 
 
 def _as_maps(grid: BoolArray) -> torch.Tensor:
     """A grid (256, 256, 13) as the network takes it (1, 13, 256, 256)."""
     return torch.from_numpy(grid.transpose(2, 0, 1)[None].astype(np.float32))
-
-
-def _matrix(ego: Message, teammate: Message) -> torch.Tensor:
-    return torch.from_numpy(mirrored_matrix(ego.pose, teammate.pose)).float()

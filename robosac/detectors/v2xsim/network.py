@@ -18,11 +18,11 @@ from dataclasses import dataclass
 import torch
 from torch.nn import functional
 
-from robosac.detectors.embedded import WeightsError
+from robosac.detectors.weights_file import WeightsError
 
 LAYERS = 13
 GRID = 256
-FEATURES = 256
+CHANNELS = 256
 MAP = 32
 ANCHORS = 6
 """A cell of the heads."""
@@ -72,9 +72,9 @@ _ENCODER = (
     ),
     (*_pair("u_encoder", "1", 32, 64, stride=2), _pointwise(1, 64)),
     (*_pair("u_encoder", "2", 64, 128, stride=2), _pointwise(2, 128)),
-    _pair("u_encoder", "3", 128, FEATURES, stride=2),
+    _pair("u_encoder", "3", 128, CHANNELS, stride=2),
 )
-_DEEPEST = _pair("u_encoder", "4", FEATURES, 512, stride=2)
+_DEEPEST = _pair("u_encoder", "4", CHANNELS, 512, stride=2)
 _BELOW = (512, 256, 128, 64)
 """Channels that come up from below into each join; they stand before those of the skip connection."""
 _DECODER = (

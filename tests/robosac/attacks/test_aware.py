@@ -133,12 +133,17 @@ def test_an_inventor_chooses_places_apart_from_all_that_is_seen():
     assert int((logits[~seen] > 0).sum()) == 6
 
 
-def test_places_less_than_five_metres_from_one_another_are_not_both_chosen(monkeypatch):
-    surface = Linear((1, 8))
+def test_places_less_than_five_metres_from_one_another_are_not_both_chosen():
+    class Dense(Linear):
+        """Cells are 2.5 m apart."""
+
+        def perceive(self, messages):
+            logits, boxes = super().perceive(messages)
+            return logits, boxes / 4
+
+    surface = Dense((1, 8))
     surface.ego = torch.full((1, 8), -5.0)
     surface.messages = {"a": torch.zeros(1, 8)}
-    near = surface.perceive({})[1] / 4  # cells 2.5 m apart
-    monkeypatch.setattr(surface, "perceive", lambda messages: (surface.class_logits(messages), near))
     sent = Invent(epsilon=20.0, steps=150, step_size=0.2).run(surface, ["a"], np.random.default_rng(0))
     assert int((surface.class_logits(sent) > 0).sum()) == 4
 

@@ -4,8 +4,8 @@ from typer.testing import CliRunner
 
 from robosac.cli import app
 from robosac.detectors import load
-from robosac.detectors.embedded import read_weights
 from robosac.detectors.v2xsim.network import published_shapes
+from robosac.detectors.weights_file import read_weights
 
 runner = CliRunner()
 

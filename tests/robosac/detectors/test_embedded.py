@@ -7,8 +7,9 @@ from safetensors.torch import load_file, save_file
 
 from robosac.boxes import pairwise_iou, pose_matrix
 from robosac.detectors import EmbeddedDetector, Message, WeightsError, available, load
-from robosac.detectors.embedded import SHIPPED_WEIGHTS, read_weights
+from robosac.detectors.embedded import SHIPPED_WEIGHTS
 from robosac.detectors.network import MeanFusionNetwork
+from robosac.detectors.weights_file import read_weights
 from robosac.scenes.splits import TRAINING_SEEDS, VALIDATION_SEEDS
 
 

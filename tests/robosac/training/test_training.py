@@ -9,8 +9,10 @@ from safetensors import safe_open
 from robosac.detectors import EmbeddedDetector
 from robosac.detectors.decoding import cell_centres
 from robosac.detectors.network import MeanFusionNetwork
+from robosac.scenes import IntersectionScene
+from robosac.training.data import TrainingFrame
 from robosac.training.export import export_weights
-from robosac.training.loop import TrainingConfig, train_network
+from robosac.training.loop import TrainingConfig, _step, train_network
 from robosac.training.loss import detection_loss, stack, targets
 from robosac.training.validation import OperatingPoint
 
@@ -25,7 +27,7 @@ class Stop(Exception):
     pass
 
 
-def test_training_learns_and_resumes_where_it_stopped(tmp_path, monkeypatch):
+def test_training_learns_and_resumes_where_it_stopped(tmp_path):
     losses = []
 
     def note(stage, done, total, remark):
@@ -39,9 +41,8 @@ def test_training_learns_and_resumes_where_it_stopped(tmp_path, monkeypatch):
         if stage == "train" and done == 29:
             raise Stop
 
-    monkeypatch.setattr("robosac.training.loop.CHECKPOINT_EVERY", 8)
     with pytest.raises(Stop):
-        train_network(TINY, tmp_path / "parts.pt", interrupt)
+        train_network(TINY, tmp_path / "parts.pt", interrupt, checkpoint_every=8)
     resumed = train_network(TINY, tmp_path / "parts.pt", silent)
     for name, tensor in whole.state_dict().items():
         torch.testing.assert_close(resumed.state_dict()[name], tensor)
@@ -89,19 +90,24 @@ def test_a_doubtful_neighbour_does_not_hide_what_was_seen():
         assert (heat[seen], weight[seen]) == (1.0, 1.0)
 
 
-def test_what_only_others_saw_is_background(monkeypatch):
-    from robosac.scenes import IntersectionScene
-    from robosac.training import loop
-    from robosac.training.data import TrainingFrame
-
+@pytest.mark.parametrize(("share", "others_count"), [(1.0, False), (0.0, True)])
+def test_what_only_others_saw_is_background_to_an_ego_that_is_decoded_alone(share, others_count):
     frame = TrainingFrame.from_scene(IntersectionScene(0).frame(0))
-    seen = []
-    monkeypatch.setattr(loop, "targets", lambda near, hits: seen.append(hits) or targets(near, hits))
+    alone, unseen = [hits.copy() for hits in frame.hits], [hits.copy() for hits in frame.hits]
+    for ego, (kept, lost) in enumerate(zip(alone, unseen, strict=True)):
+        kept[np.arange(len(kept)) != ego] = 0
+        lost[ego] = 0
+    everything, own, others = (loss_of_a_step(replace(frame, hits=hits), share) for hits in (frame.hits, alone, unseen))
+    assert (own != everything) == others_count
+    assert others != everything
+
+
+def loss_of_a_step(frame, ego_only_share):
+    torch.manual_seed(0)
     network = MeanFusionNetwork()
-    config = replace(TINY, frames_per_step=1, egos_per_frame=6, ego_only_share=1.0)
-    loop._step(network, torch.optim.SGD(network.parameters(), lr=0.0), [frame], config, np.random.default_rng(0))
-    own = {tuple(frame.hits[ego][ego]) for ego in range(6)}
-    assert {tuple(hits) for hits in seen} == own
+    optimiser = torch.optim.SGD(network.parameters(), lr=0.0)
+    config = replace(TINY, frames_per_step=1, egos_per_frame=6, ego_only_share=ego_only_share)
+    return _step(network, optimiser, [frame], config, np.random.default_rng(0))
 
 
 def test_the_loss_is_least_at_the_truth():

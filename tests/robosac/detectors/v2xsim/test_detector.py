@@ -10,11 +10,12 @@ from robosac.attacks import PGD
 from robosac.boxes import from_world, pairwise_iou, pose_matrix
 from robosac.detectors import EmbeddedDetector, Message, V2XSimDetector, WeightsError, available, load
 from robosac.detectors.base import for_role
-from robosac.detectors.embedded import SHIPPED_WEIGHTS, read_weights, tensors_digest
+from robosac.detectors.embedded import SHIPPED_WEIGHTS
 from robosac.detectors.v2xsim import write_weights
 from robosac.detectors.v2xsim.detector import mirrored_matrix
 from robosac.detectors.v2xsim.fusions import FUSIONS
 from robosac.detectors.warp import warp
+from robosac.detectors.weights_file import read_weights, tensors_digest
 from robosac.wire import WireError, check_message, pack_message, read_message
 
 

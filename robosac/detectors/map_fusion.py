@@ -1,0 +1,139 @@
+"""What detectors have in common whose messages hold one feature map.
+
+Every teammate's map is laid over the ego's. The maps of a subset are fused into one, and that is decoded. Such a
+detector is a subclass of `MapFusionDetector`, which says how its maps are fused and decoded.
+"""
+
+from __future__ import annotations
+
+from abc import ABC, abstractmethod
+from collections.abc import Callable, Collection, Mapping, Sequence
+from dataclasses import dataclass
+
+import numpy as np
+import torch
+
+from robosac.boxes import FloatArray
+from robosac.detectors.base import DetectorInfo, Message
+from robosac.detectors.warp import sampling_matrix, warp
+
+FEATURES = "features"
+"""The tensor of a message that holds its map."""
+Maps = Sequence[torch.Tensor]
+Heads = tuple[torch.Tensor, torch.Tensor]
+"""The class logit of each place where there might be a vehicle, and the codes of all boxes."""
+Decode = Callable[[Maps], Heads]
+"""From maps to fuse, the ego's first and all in its frame."""
+
+
+class MapFusionDetector(ABC):
+    """A detector (`robosac.detectors.base.Detector`) but for its network and `encode`.
+
+    Maps (C, H, W) have rows along +y. What an attacker perturbs is the map in the message, before it is warped.
+    """
+
+    info: DetectorInfo
+
+    @abstractmethod
+    def decoder(self, ego: Message, own: torch.Tensor) -> Decode:
+        """Do once what all fusions of a frame share.
+
+        Parameters
+        ----------
+        ego : Message
+        own : (C, H, W) tensor
+            The ego's map.
+
+        Returns
+        -------
+        Decode
+        """
+
+    @abstractmethod
+    def boxes(self, logits: torch.Tensor, codes: torch.Tensor) -> FloatArray:
+        """The boxes that `robosac.detectors.base.PreparedFrame.detect` returns."""
+
+    @abstractmethod
+    def places(self, codes: torch.Tensor) -> torch.Tensor:
+        """The box of each place, as `robosac.detectors.base.GeometricSurface.perceive` returns it."""
+
+    def unscaled(self, sent: torch.Tensor) -> torch.Tensor:
+        """What is fused of maps as they are sent; by default all of it."""
+        return sent
+
+    def sampling_matrix(self, ego_pose: FloatArray, pose: FloatArray) -> FloatArray:
+        """`robosac.detectors.warp.sampling_matrix` (2, 3) for maps whose columns run along +x."""
+        return sampling_matrix(ego_pose, pose, self.info.area_m[2])
+
+    def matrices(self, ego: Message, teammates: Collection[Message]) -> torch.Tensor:
+        """Where in each teammate's map to look for the places of the ego's: (n, 2, 3), as `warp` takes them."""
+        return torch.from_numpy(np.stack([self.sampling_matrix(ego.pose, each.pose) for each in teammates])).float()
+
+    def prepare(self, ego: Message, teammates: Mapping[str, Message]) -> PreparedMaps:
+        """Warp every teammate's map into the ego's frame, once."""
+        with torch.inference_mode():
+            maps = self.unscaled(_sent([ego, *teammates.values()]))
+            warped = warp(maps[1:], self.matrices(ego, teammates.values())) if teammates else ()
+            return PreparedMaps(self, self.decoder(ego, maps[0]), maps[0], dict(zip(teammates, warped, strict=True)))
+
+    def attack_surface(self, ego: Message, teammates: Mapping[str, Message]) -> MapSurface:
+        """Show a frame to an attacker."""
+        return MapSurface(self, ego, teammates)
+
+    def perturbed(self, message: Message, tensor: torch.Tensor) -> Message:
+        """Put a map (C, H, W) into a teammate's message, rounded to the type of its maps."""
+        dtype = self.info.tensors["teammate"][FEATURES].dtype
+        return Message(message.pose, {**message.tensors, FEATURES: tensor.detach().contiguous().numpy().astype(dtype)})
+
+
+def _sent(messages: Sequence[Message]) -> torch.Tensor:
+    """Maps (n, C, H, W) as float32; torch widens half floats several times faster than numpy."""
+    return torch.from_numpy(np.stack([message.tensors[FEATURES] for message in messages])).float()
+
+
+@dataclass(frozen=True)
+class PreparedMaps:
+    """A frame to be decoded for many subsets; see `robosac.detectors.base.PreparedFrame`."""
+
+    detector: MapFusionDetector
+    decode: Decode
+    own: torch.Tensor
+    warped: Mapping[str, torch.Tensor]
+
+    def detect(self, teammates: Collection[str] = ()) -> FloatArray:
+        """Boxes (n, 6) of the ego fused with these teammates; with none, of the ego alone."""
+        with torch.inference_mode():
+            return self.detector.boxes(*self.decode([self.own, *(self.warped[name] for name in teammates)]))
+
+
+class MapSurface:
+    """A frame for an attacker; see `robosac.detectors.base.GeometricSurface`. Benign maps are warped only once."""
+
+    def __init__(self, detector: MapFusionDetector, ego: Message, teammates: Mapping[str, Message]) -> None:
+        own, *others = _sent([ego, *teammates.values()])
+        self.messages = dict(zip(teammates, others, strict=True))
+        self._detector = detector
+        with torch.no_grad():
+            self._own = detector.unscaled(own)
+            self._decode = detector.decoder(ego, self._own)
+        self._matrices = {name: detector.matrices(ego, [message]) for name, message in teammates.items()}
+        self._benign = {name: self._warp(name, tensor) for name, tensor in self.messages.items()}
+
+    def class_logits(self, messages: Mapping[str, torch.Tensor]) -> torch.Tensor:
+        """Class logits of the ego fused with these messages."""
+        return self._heads(messages)[0]
+
+    def perceive(self, messages: Mapping[str, torch.Tensor]) -> Heads:
+        """Class logits, and the box of each."""
+        logits, codes = self._heads(messages)
+        return logits, self._detector.places(codes)
+
+    def _heads(self, messages: Mapping[str, torch.Tensor]) -> Heads:
+        warped = [
+            self._benign[name] if tensor is self.messages[name] else self._warp(name, tensor)
+            for name, tensor in messages.items()
+        ]
+        return self._decode([self._own, *warped])
+
+    def _warp(self, name: str, tensor: torch.Tensor) -> torch.Tensor:
+        return warp(self._detector.unscaled(tensor[None]), self._matrices[name])[0]
