@@ -20,7 +20,7 @@ ROOT = Path(__file__).parents[1]
 
 
 def test_every_setting_is_documented_with_its_default():
-    text = (ROOT / "docs" / "running.md").read_text()
+    text = (ROOT / "docs" / "settings.md").read_text()
     rows = dict(re.findall(r"^\| `ROBOSAC_(\w+)` \| `?([^|`]+?)`? \|", text, re.MULTILINE))
     assert {name.lower() for name in rows} == set(Settings.model_fields)
     for name, shown in rows.items():
