@@ -36,6 +36,12 @@ async def test_the_session_of_the_api_page_can_be_opened():
         assert response.status_code == 201, response.text
 
 
+def test_links_between_pages_lead_somewhere():
+    for page in [ROOT / "README.md", *(ROOT / "docs").glob("*.md")]:
+        for target in re.findall(r"\]\(([^)#]+)\)", page.read_text()):
+            assert (page.parent / target).exists(), f"{page.name}: {target}"
+
+
 def test_every_problem_and_reason_is_documented():
     text = (ROOT / "docs" / "api.md").read_text()
     sources = [*(ROOT / "service").rglob("*.py"), ROOT / "robosac" / "wire.py"]
