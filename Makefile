@@ -5,7 +5,7 @@ OUT ?= out
 HOST ?= 127.0.0.1
 PORT ?= 8000
 
-.PHONY: help demo serve test fuzz lint format bench clean
+.PHONY: help demo serve test fuzz lint format docs bench clean
 
 help:
 	@echo "make demo    start the gateway, drive a hostile fleet through it, show what came of it"
@@ -13,6 +13,7 @@ help:
 	@echo "make test    run the tests"
 	@echo "make fuzz    24,000 fuzz cases against codec and gateway, some minutes"
 	@echo "make lint    check style and types"
+	@echo "make docs    build the documentation as a site, in build/site"
 	@echo "make bench   measure frames per second and latency, briefly"
 
 demo: $(VENV)/.installed
@@ -37,6 +38,9 @@ format: $(VENV)/.installed-dev
 	$(BIN)/ruff check --fix .
 	$(BIN)/ruff format .
 
+docs: $(VENV)/.installed-docs
+	NO_MKDOCS_2_WARNING=1 $(BIN)/mkdocs build --strict
+
 bench: $(VENV)/.installed
 	$(BIN)/robosac load-test --seconds 4 --out $(OUT)/bench
 
@@ -51,6 +55,10 @@ $(VENV)/.installed: $(VENV)/.created pyproject.toml constraints.txt
 
 $(VENV)/.installed-dev: $(VENV)/.installed
 	$(BIN)/pip install --quiet --constraint constraints.txt --editable '.[dev]'
+	touch $@
+
+$(VENV)/.installed-docs: $(VENV)/.installed
+	$(BIN)/pip install --quiet --constraint constraints.txt --editable '.[docs]'
 	touch $@
 
 clean:

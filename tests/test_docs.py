@@ -19,7 +19,7 @@ ROOT = Path(__file__).parents[1]
 
 
 def test_every_setting_is_documented_with_its_default():
-    text = (ROOT / "docs" / "running.md").read_text()
+    text = (ROOT / "docs" / "settings.md").read_text()
     rows = dict(re.findall(r"^\| `ROBOSAC_(\w+)` \| `?([^|`]+?)`? \|", text, re.MULTILINE))
     assert {name.lower() for name in rows} == set(Settings.model_fields)
     for name, shown in rows.items():
@@ -80,6 +80,28 @@ def test_the_examples_of_the_pages_can_be_evaluated():
     for option in (["--detector", "my_detector:build"], ["--attack", "my_attack:Suppress"]):
         result = CliRunner().invoke(app, [*common, *option])
         assert result.exit_code == 0, result.output
+
+
+def test_the_first_half_hour_goes_as_told(tmp_path, monkeypatch, capsys):
+    session, attack, swapped = re.findall(
+        r"```python\n(.*?)```", (ROOT / "docs" / "tutorial.md").read_text(), re.DOTALL
+    )
+    (tmp_path / "one_step.py").write_text(attack)
+    monkeypatch.syspath_prepend(tmp_path)
+    honest, _, pgd = session.rpartition("play(range(3, 6), robosac.PGD())")
+    assert pgd == "\n"
+    for attacked in ("play(range(3, 6), robosac.PGD())", swapped):
+        seeded = honest.replace("Session(detector, team)", "Session(detector, team, rng=np.random.default_rng(0))")
+        assert seeded != honest
+        exec(seeded + attacked, {"__name__": "first_session"})
+        lines = capsys.readouterr().out.splitlines()
+        assert len(lines) == 6
+        assert all(line.endswith("named ()") for line in lines[:3])
+        assert lines[-1].endswith("accepted ('car-3', 'car-4', 'car-5', 'rsu') named ('car-2',)")
+    options = ["evaluate", "--attack", "one_step:OneStep", "--scenes", "1", "--frames", "1", "--out", str(tmp_path)]
+    result = CliRunner().invoke(app, options)
+    assert result.exit_code == 0, result.output
+    assert json.loads((tmp_path / "bounds.json").read_text())["miss_rate"] == 0.0
 
 
 @pytest.mark.usefixtures("examples")
