@@ -6,11 +6,11 @@ import json
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
 from types import TracebackType
-from typing import Any
+from typing import Any, TypedDict, TypeVar, Unpack
 
 import httpx
 from cryptography.hazmat.primitives.asymmetric.ed25519 import Ed25519PrivateKey
-from pydantic import ValidationError
+from pydantic import TypeAdapter, ValidationError
 
 from clients.errors import GatewayError, GatewayUnreachable, ProtocolError, refusal
 from robosac import wire
@@ -24,6 +24,23 @@ API_KEY_VARIABLE = "ROBOSAC_API_KEY"
 """Where the command lines look for an API key: better than an option, which every process of the machine can read."""
 
 
+T = TypeVar("T")
+
+
+class SessionOptions(TypedDict, total=False):
+    """What a session may ask for; what is left out, or None, is left to the gateway.
+
+    ``public_keys`` are those of the vehicles that sign (`robosac.signatures.show_public_key`).
+    """
+
+    detector: str | None
+    defense: Mapping[str, Any] | None
+    latency_budget_ms: float | None
+    gather_ms: float | None
+    frame_period_ms: float | None
+    public_keys: Mapping[str, str] | None
+
+
 @dataclass(frozen=True)
 class OpenedSession:
     """A new session and the tokens of its vehicles."""
@@ -34,6 +51,16 @@ class OpenedSession:
     tokens_expire_at: str
     detector: Mapping[str, Any]
     defense: Mapping[str, Any]
+
+
+@dataclass(frozen=True)
+class _Detectors:
+    detectors: list[Mapping[str, Any]]
+
+
+@dataclass(frozen=True)
+class _ChangedTeam:
+    teammate_tokens: dict[str, str]
 
 
 @dataclass(frozen=True)
@@ -102,49 +129,15 @@ class GatewayClient:
 
     async def detectors(self) -> list[Mapping[str, Any]]:
         """The gateway's detectors and their message layouts."""
-        entries = _json(await self._request("GET", "/v1/detectors")).get("detectors")
-        if not isinstance(entries, list):
-            raise ProtocolError("not a list of detectors")
-        return entries
+        return _told(await self._request("GET", "/v1/detectors"), _Detectors).detectors
 
     async def open_session(
-        self,
-        ego_id: str,
-        teammates: Sequence[str],
-        *,
-        detector: str | None = None,
-        defense: Mapping[str, Any] | None = None,
-        latency_budget_ms: float | None = None,
-        gather_ms: float | None = None,
-        frame_period_ms: float | None = None,
-        public_keys: Mapping[str, str] | None = None,
+        self, ego_id: str, teammates: Sequence[str], **options: Unpack[SessionOptions]
     ) -> OpenedSession:
-        """Open a session; what is None is left to the gateway.
-
-        ``public_keys`` are those of the vehicles that sign (`robosac.signatures.show_public_key`).
-        """
-        options = {
-            "frame_period_ms": frame_period_ms,
-            "public_keys": None if public_keys is None else dict(public_keys),
-            "detector": detector,
-            "defense": defense,
-            "latency_budget_ms": latency_budget_ms,
-            "gather_ms": gather_ms,
-        }
-        body: dict[str, Any] = {"ego_id": ego_id, "teammates": list(teammates)}
-        body |= {name: value for name, value in options.items() if value is not None}
-        fields = _json(await self._request("POST", "/v1/sessions", json=body, headers=self._opener))
-        try:
-            return OpenedSession(
-                fields["session_id"],
-                fields["ego_token"],
-                fields["teammate_tokens"],
-                fields["tokens_expire_at"],
-                fields["detector"],
-                fields["defense"],
-            )
-        except KeyError as error:
-            raise ProtocolError(f"not a new session: {error!r} is missing") from error
+        """Open a session."""
+        asked = {name: value for name, value in options.items() if value is not None}
+        body = {"ego_id": ego_id, "teammates": list(teammates), **asked}
+        return _told(await self._request("POST", "/v1/sessions", json=body, headers=self._opener), OpenedSession)
 
     def vehicle(
         self, session_id: str, vehicle_id: str, token: str, key: Ed25519PrivateKey | None = None
@@ -190,20 +183,18 @@ class VehicleClient:
         self.vehicle_id = vehicle_id
         self._request = request
         self._path = f"/v1/sessions/{session_id}"
-        self._speak_with(token)
+        self.token = token
 
-    def _speak_with(self, token: str) -> None:
-        self.bearer = _bearer(token)
-        self._tensors = {**self.bearer, "Content-Type": MSGPACK, "Accept": MSGPACK}
+    @property
+    def bearer(self) -> dict[str, str]:
+        """The header that says who speaks."""
+        return _bearer(self.token)
 
     async def renew(self) -> RenewedToken:
         """Take a fresh token and speak with it from now on; the one before is worth nothing any more."""
-        fields = _json(await self._request("POST", f"{self._path}/token", headers=self.bearer))
-        try:
-            renewed = RenewedToken(fields["token"], fields["expires_at"])
-        except KeyError as error:
-            raise ProtocolError(f"not a fresh token: {error!r} is missing") from error
-        self._speak_with(renewed.token)
+        response = await self._request("POST", f"{self._path}/token", headers=self.bearer)
+        renewed = _told(response, RenewedToken)
+        self.token = renewed.token
         return renewed
 
     def signature(self, frame: int, message: Message) -> bytes | None:
@@ -218,12 +209,12 @@ class VehicleClient:
 
     async def send_body(self, body: bytes) -> None:
         """As `send`, with a body that is packed already."""
-        await self._request("POST", f"{self._path}/messages", content=body, headers=self._tensors)
+        await self._post("messages", body)
 
     async def ask(self, frame: int, message: Message) -> FrameAnswer:
         """As the ego: post the own message and get the frame's answer, once the teammates' messages are in."""
         body = wire.pack_message(frame, self.vehicle_id, message, self.signature(frame, message))
-        return _answer(await self._request("POST", f"{self._path}/messages", content=body, headers=self._tensors))
+        return _answer(await self._post("messages", body))
 
     async def post_frame(
         self,
@@ -238,11 +229,11 @@ class VehicleClient:
 
     async def post_frame_body(self, body: bytes) -> FrameAnswer:
         """As `post_frame`, with a body that is packed already."""
-        return _answer(await self._request("POST", f"{self._path}/frames", content=body, headers=self._tensors))
+        return _answer(await self._post("frames", body))
 
     async def state(self) -> Mapping[str, Any]:
         """As the ego: the session's state."""
-        return _json(await self._request("GET", self._path, headers=self.bearer))
+        return _told(await self._request("GET", self._path, headers=self.bearer), dict[str, Any])
 
     async def audit(self, after: int = 0) -> list[Mapping[str, Any]]:
         """As the ego: audit records with a number above ``after``."""
@@ -266,11 +257,8 @@ class VehicleClient:
     async def enrol(self, teammates: Sequence[str], public_keys: Mapping[str, str] | None = None) -> Mapping[str, str]:
         """As the ego: let teammates join; their tokens."""
         body = {"teammates": list(teammates), "public_keys": dict(public_keys or {})}
-        fields = _json(await self._request("POST", f"{self._path}/teammates", json=body, headers=self.bearer))
-        try:
-            return dict(fields["teammate_tokens"])
-        except (KeyError, TypeError, ValueError) as error:
-            raise ProtocolError(f"not a change of the team: {error!r}") from error
+        response = await self._request("POST", f"{self._path}/teammates", json=body, headers=self.bearer)
+        return _told(response, _ChangedTeam).teammate_tokens
 
     async def dismiss(self, teammate: str) -> None:
         """As the ego: let a teammate leave."""
@@ -280,6 +268,11 @@ class VehicleClient:
         """As the ego: end the session; the head of its audit log, to verify it against later."""
         response = await self._request("DELETE", self._path, headers=self.bearer)
         return str(response.headers.get("audit-head", ""))
+
+    async def _post(self, what: str, body: bytes) -> httpx.Response:
+        headers = {**self.bearer, "Content-Type": MSGPACK, "Accept": MSGPACK}
+        response: httpx.Response = await self._request("POST", f"{self._path}/{what}", content=body, headers=headers)
+        return response
 
 
 def _bearer(credential: str) -> dict[str, str]:
@@ -293,11 +286,11 @@ def _answer(response: httpx.Response) -> FrameAnswer:
         raise ProtocolError(f"not a frame result: {error}") from error
 
 
-def _json(response: httpx.Response) -> Mapping[str, Any]:
+def _told(response: httpx.Response, kind: type[T]) -> T:
+    """What a response says, as a type."""
     try:
-        fields = response.json()
-    except ValueError as error:
-        raise ProtocolError(f"not JSON: {error}") from error
-    if not isinstance(fields, dict):
-        raise ProtocolError("not a JSON object")
-    return fields
+        return TypeAdapter(kind).validate_json(response.content)
+    except ValidationError as error:
+        first = error.errors(include_url=False, include_input=False)[0]
+        where = ".".join(map(str, first["loc"]))
+        raise ProtocolError(f"not what {response.request.url.path} answers: {where}: {first['msg']}") from None

@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import asyncio
 import sys
 from pathlib import Path
 from typing import Annotated
@@ -11,12 +10,10 @@ import torch
 import typer
 from rich.console import Console
 
-from clients.errors import GatewayError
+from clients import trial
 from clients.fleet import FleetOptions, close_run, run_fleet
 from clients.local_gateway import local_gateway
-from clients.simulation import make_picture_folder
 from clients.summary import FleetSummary
-from robosac.detectors import DEFAULT_DETECTOR
 
 CLEAN_SHARE = 0.95
 
@@ -32,15 +29,8 @@ def main(
     """
     torch.set_num_threads(1)
     console = Console()
-    make_picture_folder(report, "--report")
-    try:
-        options, summary = asyncio.run(_run(report, scenes, frames, console))
-    except (GatewayError, OSError) as error:
-        console.print(f"[red]The demo failed:[/red] {error}")
-        sys.exit(1)
-    except asyncio.CancelledError:
-        console.print("[red]The demo was ended.[/red]")
-        sys.exit(143)
+    trial.make_folder(report, "--report", for_pictures=True)
+    options, summary = trial.run(_run(report, scenes, frames, console), console, "The demo")
     close_run(options, summary, console)
     if summary.clean_share < CLEAN_SHARE:
         console.print(f"[red]The demo failed:[/red] expected no attacker in at least {CLEAN_SHARE:.0%} of the answers.")
@@ -53,21 +43,8 @@ async def _run(report: Path, scenes: int, frames: int, console: Console) -> tupl
         console.print(
             f"It is ready at {url}. Six vehicles, one of them a PGD attacker, post at 5 Hz of simulated time."
         )
-        options = FleetOptions(
-            url=url,
-            scenes=scenes,
-            frames=frames,
-            first_scene=0,
-            egos=1,
-            attackers=1,
-            attack="pgd",
-            detector=DEFAULT_DETECTOR,
-            defense={"kind": "group_testing", "pose_error_m": 0.0},
-            seed=0,
-            budget_ms=None,
-            real_time=False,
-            report=report,
-        )
+        defense = {"kind": "group_testing", "pose_error_m": 0.0}
+        options = FleetOptions(url=url, scenes=scenes, frames=frames, defense=defense, report=report)
         return options, await run_fleet(options, console)
 
 

@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 import asyncio
-import sys
 import time
 from collections import deque
 from dataclasses import dataclass, field
@@ -17,9 +16,10 @@ from rich.live import Live
 from rich.progress import BarColumn, MofNCompleteColumn, Progress, TextColumn, TimeRemainingColumn
 from rich.table import Table
 
-from clients.client import API_KEY_VARIABLE, GatewayClient, OpenedSession
-from clients.errors import FrameConflict, GatewayError
-from clients.simulation import EgoFrame, Fleet, make_picture_folder
+from clients import trial
+from clients.client import GatewayClient, OpenedSession, VehicleClient
+from clients.errors import FrameConflict
+from clients.simulation import EgoFrame, Fleet
 from clients.summary import FleetSummary
 from robosac import attacks, defenses, detectors
 from robosac.answers import FrameAnswer, Reason
@@ -61,16 +61,16 @@ class FleetOptions:
     url: str
     scenes: int
     frames: int
-    first_scene: int
-    egos: int
-    attackers: int
-    attack: str
-    detector: str
-    defense: dict[str, Any] | None
-    seed: int
-    budget_ms: float | None
-    real_time: bool
-    report: Path | None
+    first_scene: int = 0
+    egos: int = 1
+    attackers: int = 1
+    attack: str = "pgd"
+    detector: str = DEFAULT_DETECTOR
+    defense: dict[str, Any] | None = None
+    seed: int = 0
+    budget_ms: float | None = None
+    real_time: bool = False
+    report: Path | None = None
     api_key: str | None = field(default=None, repr=False)
     data: str = DEFAULT_DATA
 
@@ -113,43 +113,39 @@ class _Screen:
     def _render(self) -> Group:
         table = Table()
         for heading in ("scene", "frame", "ego", "source", "accepted", "in dissensus", "steps", "best J", "ms"):
-            table.add_column(
-                heading, justify="right" if heading in ("scene", "frame", "steps", "best J", "ms") else "left"
-            )
+            is_number = heading in ("scene", "frame", "steps", "best J", "ms")
+            table.add_column(heading, justify="right" if is_number else "left")
         for row in self._rows:
             table.add_row(*row)
         return Group(table, self._progress)
 
 
 class _Vehicle:
-    """One vehicle: its own connection to the gateway, and its tokens in the egos' sessions."""
+    """One vehicle: its own connection to the gateway, and its place in each ego's session."""
 
-    def __init__(self, vehicle_id: str, url: str, api_key: str | None) -> None:
+    def __init__(self, vehicle_id: str, gateway: GatewayClient) -> None:
         self.vehicle_id = vehicle_id
-        self.gateway = GatewayClient(url, api_key)
-        self._tokens: dict[str, tuple[str, str]] = {}
+        self.gateway = gateway
+        self._at: dict[str, VehicleClient] = {}
 
     def enrol(self, ego_id: str, session: OpenedSession) -> None:
         token = session.ego_token if ego_id == self.vehicle_id else session.teammate_tokens[self.vehicle_id]
-        self._tokens[ego_id] = (session.session_id, token)
+        self._at[ego_id] = self.gateway.vehicle(session.session_id, self.vehicle_id, token)
 
     async def leave(self) -> None:
-        session_id, token = self._tokens[self.vehicle_id]
-        await self.gateway.vehicle(session_id, self.vehicle_id, token).close()
+        await self._at[self.vehicle_id].close()
 
     async def send(self, frame: EgoFrame, index: int) -> None:
         """Send to an ego; if it did not wait so long, its answer tells who is missing."""
-        session_id, token = self._tokens[frame.ego_id]
         try:
-            await self.gateway.vehicle(session_id, self.vehicle_id, token).send(index, frame.sent[self.vehicle_id])
+            await self._at[frame.ego_id].send(index, frame.sent[self.vehicle_id])
         except FrameConflict as conflict:
             if not conflict.type.endswith("stale-frame"):
                 raise
 
     async def ask(self, frame: EgoFrame, index: int) -> tuple[FrameAnswer, float]:
-        session_id, token = self._tokens[frame.ego_id]
         started = time.perf_counter()
-        answer = await self.gateway.vehicle(session_id, self.vehicle_id, token).ask(index, frame.message)
+        answer = await self._at[frame.ego_id].ask(index, frame.message)
         return answer, (time.perf_counter() - started) * 1e3
 
 
@@ -176,7 +172,7 @@ async def run_fleet(options: FleetOptions, console: Console) -> FleetSummary:
 
 
 async def _run_scene(options: FleetOptions, fleet: Fleet, summary: FleetSummary, screen: _Screen) -> None:
-    vehicles = {agent: _Vehicle(agent, options.url, options.api_key) for agent in fleet.scene.agents}
+    vehicles = {name: _Vehicle(name, GatewayClient(options.url, options.api_key)) for name in fleet.scene.agents}
     try:
         for ego_id in fleet.egos:
             session = await vehicles[ego_id].gateway.open_session(
@@ -213,7 +209,7 @@ async def _exchange(vehicles: dict[str, _Vehicle], frame: EgoFrame, index: int) 
     return answered
 
 
-def main(
+def main(  # the options of a command line
     url: Annotated[str, typer.Option(help="The gateway.")] = "http://127.0.0.1:8000",
     scenes: Annotated[int, typer.Option(min=1, help="Sequences, each a session of its own.")] = 4,
     frames: Annotated[int, typer.Option(min=1, help="Frames of a sequence.")] = 25,
@@ -236,15 +232,12 @@ def main(
     real_time: Annotated[bool, typer.Option(help="Hold frames to the clock.")] = False,
     report: Annotated[Path | None, typer.Option(help="Folder for summary.json and example.png.")] = None,
     data: Annotated[str, typer.Option(help=DATA_HELP)] = DEFAULT_DATA,
-    api_key: Annotated[
-        str | None, typer.Option(envvar=API_KEY_VARIABLE, help="Opens sessions, where the gateway asks for one.")
-    ] = None,
+    api_key: trial.ApiKey = None,
 ) -> None:
     """Drive a simulated fleet, some of it hostile, through a running gateway."""
     torch.set_num_threads(1)
     console = Console()
-    if report is not None:
-        make_picture_folder(report, "--report")
+    trial.make_folder(report, "--report", for_pictures=True)
     for option, load, value in (
         ("--attack", attacks.load_campaign, attack),
         ("--detector", detectors.load, detector),
@@ -273,12 +266,7 @@ def main(
         api_key=api_key,
         data=data,
     )
-    try:
-        summary = asyncio.run(run_fleet(options, console))
-    except (GatewayError, ValueError) as error:
-        console.print(f"[red]The fleet stopped:[/red] {error}")
-        sys.exit(1)
-    close_run(options, summary, console)
+    close_run(options, trial.run(run_fleet(options, console), console, "The fleet", ValueError), console)
 
 
 def _asked(defense: str | None, given: dict[str, Any]) -> dict[str, Any] | None:

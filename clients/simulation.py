@@ -2,20 +2,15 @@
 
 from __future__ import annotations
 
-import sys
 from collections.abc import Mapping
 from dataclasses import dataclass
-from pathlib import Path
 
 import numpy as np
-import typer
 
 from robosac.attacks import Attack, Campaign
 from robosac.boxes import FloatArray
 from robosac.detectors import Detector, Message
 from robosac.evaluation.frames import Sensed, encode_all, under_attack
-from robosac.extras import MissingExtra
-from robosac.figures import need_figures
 from robosac.scenes import Frame, Scene
 
 
@@ -49,23 +44,6 @@ class EgoFrame:
     message: Message
     truth: FloatArray
     points: FloatArray
-
-
-def make_folder(path: Path, option: str) -> None:
-    """Make an output folder before any work is done; a bad one is the option's fault."""
-    try:
-        path.mkdir(parents=True, exist_ok=True)
-    except OSError as error:
-        raise typer.BadParameter(str(error), param_hint=option) from error
-
-
-def make_picture_folder(path: Path, option: str) -> None:
-    """The same for what will hold pictures; ends the program where none can be drawn."""
-    try:
-        need_figures()
-    except MissingExtra as missing:
-        sys.exit(f"Error: {missing}")
-    make_folder(path, option)
 
 
 class Fleet:
@@ -129,13 +107,5 @@ class Fleet:
     def _for_ego(self, ego_id: str, frame: Frame, messages: Mapping[str, Message]) -> EgoFrame:
         sensed = Sensed(frame.index, ego_id, messages, frame.truth(ego_id))
         met = under_attack(self.detector, sensed, self.attackers, self._attack, self._rng)
-        return EgoFrame(
-            self.scene.number,
-            ego_id,
-            met.attackers,
-            met.benign,
-            met.teammates,
-            met.ego,
-            met.truth,
-            frame.views[ego_id].points,
-        )
+        number, points = self.scene.number, frame.views[ego_id].points
+        return EgoFrame(number, ego_id, met.attackers, met.benign, met.teammates, met.ego, met.truth, points)

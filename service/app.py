@@ -8,6 +8,7 @@ tune_process()  # before anything imports torch
 
 import asyncio  # noqa: E402
 import contextlib  # noqa: E402
+import time  # noqa: E402
 from collections.abc import AsyncIterator, Callable  # noqa: E402
 from importlib.metadata import version  # noqa: E402
 from typing import TYPE_CHECKING  # noqa: E402
@@ -17,16 +18,17 @@ from fastapi import FastAPI  # noqa: E402
 
 from robosac.extras import MissingExtra  # noqa: E402
 from service import problems  # noqa: E402
+from service.arriving.doors import Door, capacity_check, check_head, check_local  # noqa: E402
 from service.arriving.frames import Frames  # noqa: E402
-from service.arriving.limits import BodyLimit, HeadLimit  # noqa: E402
-from service.deciding.admission import Admission, Gate  # noqa: E402
+from service.arriving.limits import BodyLimit  # noqa: E402
+from service.deciding.admission import Admission  # noqa: E402
 from service.deciding.answering import Deciding  # noqa: E402
 from service.engine import Engine  # noqa: E402
 from service.gateway import Gateway  # noqa: E402
-from service.keeping.sql_store import SqlStore  # noqa: E402
-from service.keeping.store import new_seed  # noqa: E402
+from service.keeping.record import new_seed  # noqa: E402
+from service.keeping.store import Store  # noqa: E402
 from service.routes import operations, v1  # noqa: E402
-from service.sessions.identity import ApiKeys, LoopbackOnly, Tokens  # noqa: E402
+from service.sessions.identity import ApiKeys, Tokens  # noqa: E402
 from service.sessions.opening import Opening  # noqa: E402
 from service.sessions.sessions import Sessions  # noqa: E402
 from service.sessions.teams import Teams  # noqa: E402
@@ -45,6 +47,7 @@ def create_app(
     settings: Settings | None = None,
     seeds: Callable[[], str] = new_seed,
     spans: TracerProvider | None = None,
+    clock: Callable[[], float] = time.time,
 ) -> FastAPI:
     """A gateway.
 
@@ -57,47 +60,23 @@ def create_app(
         knows the seed knows which subsets will be sampled.
     spans : TracerProvider, optional
         Takes the traces; by default what the environment says, see `service.watching.tracing`.
+    clock : callable
+        Unix time, seconds, by which tokens expire.
     """
     settings = settings or Settings()
-    engine = Engine(settings.torch_threads, settings.extra_detectors)
-    metrics = Metrics()
-    store = SqlStore(settings.database_url)
     keys = ApiKeys.read(settings)
-    api_keys, tokens = ApiKeys(keys), Tokens.configured(settings)
-    sessions = Sessions(settings, store, engine, metrics, tokens, seeds)
-    teams = Teams(settings, sessions, store, tokens)
-    admission = Admission()
+    tokens = Tokens.configured(settings, clock)
     tracing = Tracing(provider_from_environment() if spans is None else spans)
-    deciding = Deciding(sessions, engine, metrics, admission, tracing)
-    frames = Frames(sessions, deciding, metrics, admission)
-    opening = Opening(settings, store, engine, metrics, tokens, sessions)
-    gateway = Gateway(admission, engine, metrics, opening, sessions, teams, frames, api_keys)
+    gateway = _built(settings, ApiKeys(keys), tokens, seeds, tracing)
+    secrets = [*keys, *(secret.get_secret_value() for secret in settings.token_secrets)]
 
     @contextlib.asynccontextmanager
     async def lifespan(_: FastAPI) -> AsyncIterator[None]:
-        secrets = [*keys, *(secret.get_secret_value() for secret in settings.token_secrets)]
         with logging_to_stderr(settings, secrets):
-            if not api_keys:
+            if not keys:
                 logger.warning("no API key is set (ROBOSAC_API_KEYS): only requests from this machine are served")
-            try:
-                await asyncio.gather(store.start(), engine.start())
-                await tokens.start(store)
-                metrics.sessions.set(await store.count())
-                if settings.detector not in engine.detectors:
-                    raise ValueError(
-                        f"ROBOSAC_DETECTOR: unknown detector {settings.detector!r}; known: {list(engine.detectors)}"
-                    )
-                sweeper = asyncio.create_task(sessions.expire_idle())
-                logger.info("gateway ready", version=version("robosac"), detectors=list(engine.detectors))
-                try:
-                    yield
-                finally:
-                    sweeper.cancel()
-            finally:
-                engine.stop()
-                await store.close()
-                tracing.close()
-                logger.info("gateway stopped")
+            async with _running(gateway, settings, tokens, tracing):
+                yield
 
     app = FastAPI(
         title="Defense gateway for collaborative perception",
@@ -109,14 +88,58 @@ def create_app(
     app.state.gateway = gateway
     problems.install(app)
     app.add_middleware(BodyLimit, limit=settings.max_body_bytes, timeout_s=settings.body_timeout_s)
-    app.add_middleware(Gate, admission=admission, budget_s=sessions.budget_s)
-    if not api_keys:
-        app.add_middleware(LoopbackOnly)
+    app.add_middleware(Door, check=capacity_check(gateway.admission, gateway.sessions.budget_s))
+    if not keys:
+        app.add_middleware(Door, check=check_local)
     app.add_middleware(Traced, tracing=tracing)
-    app.add_middleware(HeadLimit)
+    app.add_middleware(Door, check=check_head)
     app.include_router(v1)
     app.include_router(operations)
     return app
+
+
+def _built(
+    settings: Settings, api_keys: ApiKeys, tokens: Tokens, seeds: Callable[[], str], tracing: Tracing
+) -> Gateway:
+    engine, metrics, admission = Engine(settings.torch_threads, settings.extra_detectors), Metrics(), Admission()
+    store = Store(settings.database_url)
+    sessions = Sessions(settings, store, engine, metrics, tokens, seeds)
+    deciding = Deciding(sessions, engine, metrics, admission, tracing)
+    return Gateway(
+        admission=admission,
+        engine=engine,
+        metrics=metrics,
+        store=store,
+        opening=Opening(settings, store, engine, metrics, tokens, sessions),
+        sessions=sessions,
+        teams=Teams(settings, sessions, store, tokens),
+        frames=Frames(sessions, deciding, metrics, admission),
+        api_keys=api_keys,
+    )
+
+
+@contextlib.asynccontextmanager
+async def _running(gateway: Gateway, settings: Settings, tokens: Tokens, tracing: Tracing) -> AsyncIterator[None]:
+    """Start what a gateway needs, and stop it after the block or when the start fails."""
+    store, engine = gateway.store, gateway.engine
+    try:
+        await asyncio.gather(store.start(), engine.start())
+        await tokens.start(store)
+        gateway.metrics.sessions.set(await store.count())
+        if settings.detector not in engine.detectors:
+            known = list(engine.detectors)
+            raise ValueError(f"ROBOSAC_DETECTOR: unknown detector {settings.detector!r}; known: {known}")
+        sweeper = asyncio.create_task(gateway.sessions.expire_idle())
+        logger.info("gateway ready", version=version("robosac"), detectors=list(engine.detectors))
+        try:
+            yield
+        finally:
+            sweeper.cancel()
+    finally:
+        engine.stop()
+        await store.close()
+        tracing.close()
+        logger.info("gateway stopped")
 
 
 try:

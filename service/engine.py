@@ -17,6 +17,7 @@ from robosac.deadline import Deadline
 from robosac.detectors import Detector, Message, available, blank, load
 from robosac.fusion import FusionResult
 from robosac.session import Session
+from service.errors import Kind, Refused
 
 T = TypeVar("T")
 
@@ -60,6 +61,11 @@ class Engine:
         for detector in self._detectors.values():
             await self._submit(partial(_warm_up, detector))
         self.ready = True
+
+    def check_ready(self) -> None:
+        """Refuse as long as not every detector is loaded and warm, or once the engine is stopped."""
+        if not self.ready:
+            raise Refused(Kind.NOT_READY, "the gateway is still warming up")
 
     async def decide(
         self,

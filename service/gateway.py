@@ -7,6 +7,7 @@ from dataclasses import dataclass
 from service.arriving.frames import Frames
 from service.deciding.admission import Admission
 from service.engine import Engine
+from service.keeping.store import Store
 from service.sessions.identity import ApiKeys
 from service.sessions.opening import Opening
 from service.sessions.sessions import Sessions
@@ -21,6 +22,7 @@ class Gateway:
     admission: Admission
     engine: Engine
     metrics: Metrics
+    store: Store
     opening: Opening
     sessions: Sessions
     teams: Teams

@@ -1,4 +1,4 @@
-"""Errors as RFC 9457 problem details.
+"""Errors as RFC 9457 problem details: the one place that knows how a refusal is answered over HTTP.
 
 Every refusal is ``application/problem+json`` with a stable ``type``, and where a part of the request is to blame, its
 path in ``field``.
@@ -18,12 +18,54 @@ from starlette.exceptions import HTTPException
 
 from robosac.defenses import shipped
 from robosac.wire import WireError
-from service.keeping.store import StoreUnavailable
+from service.errors import Kind, Refused
 
 logger = structlog.stdlib.get_logger(__name__)
 
 MEDIA_TYPE = "application/problem+json"
 TYPE_PREFIX = "urn:robosac:problem:"
+_CHALLENGE = {"WWW-Authenticate": "Bearer"}
+_CLOSE = {"Connection": "close"}  # as the rest of the body may still come, or never
+ANSWERS: Mapping[Kind, tuple[int, Mapping[str, str]]] = {
+    Kind.MALFORMED_JSON: (400, {}),
+    Kind.INCOMPLETE_BODY: (400, {}),
+    Kind.UNAUTHENTICATED: (401, _CHALLENGE),
+    Kind.TOKEN_EXPIRED: (401, _CHALLENGE),
+    Kind.BAD_SIGNATURE: (401, {}),
+    Kind.NOT_ENROLLED: (403, {}),
+    Kind.LOOPBACK_ONLY: (403, _CLOSE),
+    Kind.EGO_ONLY: (403, {}),
+    Kind.WRONG_VEHICLE: (403, {}),
+    Kind.UNKNOWN_SESSION: (404, {}),
+    Kind.UNKNOWN_TEAMMATE: (404, {}),
+    Kind.MESSAGES_NOT_KEPT: (404, {}),
+    Kind.SLOW_BODY: (408, _CLOSE),
+    Kind.ALREADY_ENROLLED: (409, {}),
+    Kind.STALE_FRAME: (409, {}),
+    Kind.DUPLICATE_MESSAGE: (409, {}),
+    Kind.EQUIVOCATION: (409, {}),
+    Kind.SESSION_CHANGED: (409, {}),
+    Kind.TOO_FAR_AHEAD: (409, {}),
+    Kind.TOO_LARGE: (413, {}),
+    Kind.URI_TOO_LONG: (414, _CLOSE),
+    Kind.HEADERS_TOO_LARGE: (431, _CLOSE),
+    Kind.UNSUPPORTED_MEDIA_TYPE: (415, {}),
+    Kind.UNSUPPORTED_ENCODING: (415, {}),
+    Kind.IMPLAUSIBLE_POSE: (422, {}),
+    Kind.INVALID_REQUEST: (422, {}),
+    Kind.IMPOSSIBLE_DEFENSE: (422, {}),
+    Kind.UNKNOWN_DETECTOR: (422, {}),
+    Kind.TOO_MANY_TEAMMATES: (422, {}),
+    Kind.TOO_MANY_RENEWALS: (429, {"Retry-After": "1"}),
+    Kind.INTERNAL_ERROR: (500, {}),
+    Kind.NOT_READY: (503, {"Retry-After": "5"}),
+    Kind.TOO_MANY_SESSIONS: (503, {"Retry-After": "30"}),
+    Kind.OVERLOADED: (503, {"Retry-After": "1"}),
+    Kind.DETECTOR_UNAVAILABLE: (503, {}),
+    Kind.DEFENSE_UNAVAILABLE: (503, {}),
+    Kind.STORE_UNAVAILABLE: (503, {"Retry-After": "1"}),
+}
+"""Status and headers of each refusal."""
 
 
 def documented(*statuses: int) -> dict[int | str, dict[str, Any]]:
@@ -45,83 +87,55 @@ def documented(*statuses: int) -> dict[int | str, dict[str, Any]]:
     }
 
 
-class Problem(Exception):
-    """A request that is refused.
-
-    Parameters
-    ----------
-    status : int
-    slug : str
-        The last part of the problem's ``type``.
-    detail : str
-        What was wrong, for a human.
-    field : str, optional
-        Path of the offending part of the request.
-    headers : mapping, optional
-    """
-
-    def __init__(
-        self,
-        status: int,
-        slug: str,
-        detail: str,
-        field: str | None = None,
-        headers: Mapping[str, str] | None = None,
-    ) -> None:
-        super().__init__(detail)
-        self.status = status
-        self.slug = slug
-        self.detail = detail
-        self.field = field
-        self.headers = headers
-
-    @classmethod
-    def from_wire(cls, error: WireError) -> Problem:
-        """400 for a body that is no msgpack, 422 for one that says the wrong thing."""
-        status = 400 if error.code == "malformed-msgpack" else 422
-        return cls(status, error.code, error.detail, error.field or None)
-
-    def response(self) -> JSONResponse:
-        """The problem as a response."""
-        body: dict[str, Any] = {
-            "type": TYPE_PREFIX + self.slug,
-            "title": self.slug.replace("-", " ").capitalize(),
-            "status": self.status,
-            "detail": self.detail,
-        }
-        if self.field is not None:
-            body["field"] = self.field
-        return JSONResponse(body, self.status, dict(self.headers or {}), media_type=MEDIA_TYPE)
+def response(refused: Refused) -> JSONResponse:
+    """A refusal as a response."""
+    status, headers = ANSWERS[refused.kind]
+    if refused.retry_after_s is not None:
+        headers = {**headers, "Retry-After": str(refused.retry_after_s)}
+    return _problem(status, refused.kind.value, refused.detail, refused.field, headers)
 
 
 def install(app: FastAPI) -> None:
     """Answer every error of an app as a problem."""
 
-    @app.exception_handler(Problem)
-    async def _problem(_: Request, error: Problem) -> JSONResponse:
-        return error.response()
+    @app.exception_handler(Refused)
+    async def _refused(_: Request, refused: Refused) -> JSONResponse:
+        return response(refused)
 
-    @app.exception_handler(StoreUnavailable)
-    async def _unavailable(_: Request, __: StoreUnavailable) -> JSONResponse:
-        detail = "the database failed; nothing is acknowledged, try again"
-        return Problem(503, "store-unavailable", detail, headers={"Retry-After": "1"}).response()
+    @app.exception_handler(WireError)
+    async def _no_message(_: Request, error: WireError) -> JSONResponse:
+        status = 400 if error.code == "malformed-msgpack" else 422  # no msgpack at all, or it says the wrong thing
+        return _problem(status, error.code, error.detail, error.field or None)
 
     @app.exception_handler(RequestValidationError)
     async def _invalid(_: Request, error: RequestValidationError) -> JSONResponse:
         first = error.errors()[0]
         if first["type"] == "json_invalid":
-            return Problem(
-                400, "malformed-json", f"not JSON: {first.get('ctx', {}).get('error', first['msg'])}"
-            ).response()
+            detail = f"not JSON: {first.get('ctx', {}).get('error', first['msg'])}"
+            return response(Refused(Kind.MALFORMED_JSON, detail))
         where = [str(part) for part in first["loc"] if part not in ("body", "query", "path", *shipped())]
-        return Problem(422, "invalid-request", str(first["msg"]), ".".join(where) or "body").response()
+        return response(Refused(Kind.INVALID_REQUEST, str(first["msg"]), ".".join(where) or "body"))
 
     @app.exception_handler(HTTPException)
     async def _http(_: Request, error: HTTPException) -> JSONResponse:
         slug = HTTPStatus(error.status_code).phrase.lower().replace(" ", "-")  # of 404 and 405, where no route fits
-        return Problem(error.status_code, slug, str(error.detail), headers=error.headers).response()
+        return _problem(error.status_code, slug, str(error.detail), headers=error.headers)
 
     @app.exception_handler(Exception)
     async def _internal(request: Request, error: Exception) -> JSONResponse:
         logger.error("unhandled error", method=request.method, path=request.url.path, exc_info=error)
-        return Problem(500, "internal-error", "the gateway failed to handle this request").response()
+        return response(Refused(Kind.INTERNAL_ERROR, "the gateway failed to handle this request"))
+
+
+def _problem(
+    status: int, slug: str, detail: str, field: str | None = None, headers: Mapping[str, str] | None = None
+) -> JSONResponse:
+    body: dict[str, Any] = {
+        "type": TYPE_PREFIX + slug,
+        "title": slug.replace("-", " ").capitalize(),
+        "status": status,
+        "detail": detail,
+    }
+    if field is not None:
+        body["field"] = field
+    return JSONResponse(body, status, dict(headers or {}), media_type=MEDIA_TYPE)

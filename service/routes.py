@@ -13,8 +13,9 @@ from robosac import wire
 from robosac.answers import FrameAnswer
 from service.arriving.bodies import MSGPACK, MSGPACK_TYPES, check_type, described, read_json
 from service.arriving.limits import read_bounded
+from service.errors import Refused
 from service.gateway import Gateway
-from service.problems import Problem, documented
+from service.problems import documented
 from service.schemas import (
     ChangedTeam,
     DetectorEntry,
@@ -203,8 +204,7 @@ async def healthz() -> dict[str, str]:
 @operations.get("/readyz")
 async def readyz(gateway: GatewayDep) -> dict[str, str]:
     """Whether the gateway is warm and able to serve."""
-    if not gateway.engine.ready:
-        raise Problem(503, "not-ready", "the gateway is still warming up", headers={"Retry-After": "5"})
+    gateway.engine.check_ready()
     return {"status": "ready"}
 
 
@@ -219,8 +219,8 @@ async def _read_body(request: Request, caller: Caller, gateway: Gateway, *, whol
     try:
         check_type(request, *MSGPACK_TYPES)
         return await read_bounded(request, gateway.frames.body_limit(caller, whole_frame=whole_frame))
-    except Problem as problem:
-        await gateway.frames.note_unread(caller, problem)
+    except Refused as refused:
+        await gateway.frames.refuse(caller, refused)
         raise
 
 

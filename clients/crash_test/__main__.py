@@ -2,8 +2,6 @@
 
 from __future__ import annotations
 
-import asyncio
-import json
 import sys
 import tempfile
 from collections.abc import Sequence
@@ -14,15 +12,12 @@ from typing import Annotated
 import numpy as np
 import torch
 import typer
-from rich.box import SIMPLE_HEAD
 from rich.console import Console
 from rich.progress import track
-from rich.table import Table
 
+from clients import trial
 from clients.crash_test.rounds import Incident, Kill, Rounds, possible
-from clients.errors import GatewayError
 from clients.load_test import prepare
-from clients.simulation import make_folder
 
 PREPARED_FRAMES = 4
 
@@ -30,9 +25,7 @@ PREPARED_FRAMES = 4
 def show(console: Console, sessions: int, kills: Sequence[Kill]) -> None:
     """Print what came of it."""
     restarts = np.percentile([kill.restart_s for kill in kills], [50, 95, 100])
-    table = Table(title=f"{len(kills)} kills, {sessions} sessions", title_justify="left", box=SIMPLE_HEAD)
-    table.add_column("")
-    table.add_column("", justify="right")
+    table = trial.a_table(f"{len(kills)} kills, {sessions} sessions", ["", ""])
     for incident in Incident:
         table.add_row(f"rounds: {incident.value}", str(sum(kill.incident is incident for kill in kills)))
     table.add_row("frames acknowledged", str(sum(kill.acknowledged for kill in kills)))
@@ -54,7 +47,7 @@ def main(
         list[Incident] | None, typer.Option("--incident", help="What happens in the rounds; by default all in turn.")
     ] = None,
     database_url: Annotated[str | None, typer.Option(help="By default SQLite in a temporary folder.")] = None,
-    out: Annotated[Path | None, typer.Option(help="Folder for crash_test.json and the gateways' log.")] = None,
+    out: trial.Out = None,
 ) -> None:
     """Kill gateways under load again and again, and check that nothing acknowledged is lost.
 
@@ -62,24 +55,17 @@ def main(
     """
     torch.set_num_threads(1)
     console = Console()
-    if out is not None:
-        make_folder(out, "--out")
+    trial.make_folder(out, "--out")
     with tempfile.TemporaryDirectory(prefix="robosac-") as folder:
         url = database_url or f"sqlite:///{folder}/robosac.db"
         if not set(incidents or ()) <= set(possible(url)):
             raise typer.BadParameter("only a SQLite file is backed up", param_hint="--incident")
         bodies = prepare(True, 3, console, PREPARED_FRAMES)
         rounds = Rounds(url, (out or Path(folder)) / "gateway.log", bodies, np.random.default_rng(seed))
-        try:
-            done = asyncio.run(_run(rounds, incidents or possible(url), kills, sessions, console))
-        except (GatewayError, OSError) as error:
-            console.print(f"[red]The crash test stopped:[/red] {error}")
-            sys.exit(1)
+        done = trial.run(_run(rounds, incidents or possible(url), kills, sessions, console), console, "The crash test")
     show(console, sessions, done)
-    if out is not None:
-        report = {"seed": seed, "sessions": sessions, "kills": [asdict(kill) for kill in done]}
-        (out / "crash_test.json").write_text(json.dumps(report, indent=2) + "\n")
-        console.print(f"Written: {out / 'crash_test.json'}")
+    report = {"seed": seed, "sessions": sessions, "kills": [asdict(kill) for kill in done]}
+    trial.write(report, out, "crash_test.json", console)
     if any(kill.wrong for kill in done):
         sys.exit(1)
 

@@ -9,12 +9,9 @@ from typing import Any
 
 from clients.client import GatewayClient, OpenedSession, VehicleClient
 from clients.errors import AccessDenied, GatewayError
-from clients.load_test import Bodies
+from clients.load_test import EGO, Bodies
 from robosac.answers import FrameAnswer
 from robosac.audit import GENESIS, commitment, digest, seal
-from robosac.scenes import IntersectionScene
-
-EGO, *TEAM = IntersectionScene(0).agents
 
 
 @dataclass

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import asyncio
 import time
-from collections.abc import Mapping
+from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, field
 from enum import StrEnum
 from pathlib import Path
@@ -15,18 +15,19 @@ import numpy as np
 
 from clients.client import GatewayClient
 from clients.crash_test import sqlite
-from clients.crash_test.driven import EGO, TEAM, Driven
+from clients.crash_test.driven import Driven
 from clients.errors import GatewayError, GatewayUnavailable, GatewayUnreachable
-from clients.load_test import REFUSED_WAIT_S, Bodies
+from clients.load_test import DEFENSE, EGO, REFUSED_WAIT_S, TEAM, Bodies
 from clients.local_gateway import STOP_TIMEOUT_S, start_gateway, until_ready
 
-DEFENSES: Mapping[str, Mapping[str, Any]] = {
-    "sample_consensus": {"kind": "sample_consensus", "attacker_ratio": 0.2, "sampling_budget": 7, "collaborators": 3},
-    "static_team": {"kind": "static_team", "attacker_ratio": 0.2, "sampling_budget": 7, "collaborators": 3},
-    "a2cp": {"kind": "a2cp"},
-    "group_testing": {"kind": "group_testing"},
-    "none": {"kind": "none"},
-}
+DEFENSES: Sequence[Mapping[str, Any]] = (
+    DEFENSE,
+    DEFENSE | {"kind": "static_team"},
+    {"kind": "a2cp"},
+    {"kind": "group_testing"},
+    {"kind": "none"},
+)
+"""Of the sessions, one after another."""
 LOADED_S = (0.05, 1.2)
 """How long the gateways are loaded before what happens next, at random."""
 BUDGET_MS = 5000.0
@@ -115,11 +116,10 @@ class Rounds:
         """Start the first gateway and open sessions, with one defence after another."""
         await self._start()
         for number in range(sessions):
-            kind = list(DEFENSES)[number % len(DEFENSES)]
-            opened = await self._up[0].client.open_session(
-                EGO, TEAM, defense=DEFENSES[kind], latency_budget_ms=BUDGET_MS
-            )
-            self.sessions.append(Driven(kind, opened))
+            defense = DEFENSES[number % len(DEFENSES)]
+            client = self._up[0].client
+            opened = await client.open_session(EGO, TEAM, defense=defense, latency_budget_ms=BUDGET_MS)
+            self.sessions.append(Driven(defense["kind"], opened))
 
     async def play(self, incident: Incident) -> Kill:
         """Load the gateways through an incident, kill them, start one and check every session."""

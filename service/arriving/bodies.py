@@ -14,7 +14,7 @@ from fastapi.exceptions import RequestValidationError
 from pydantic import BaseModel, ValidationError
 
 from service.arriving.limits import read_bounded
-from service.problems import Problem
+from service.errors import Kind, Refused
 
 JSON = "application/json"
 JSON_BYTES = 256 * 1024
@@ -28,19 +28,13 @@ Model = TypeVar("Model", bound=BaseModel)
 
 
 def check_type(request: Request, *types: str) -> None:
-    """Refuse a body of another type than the first, or its other names.
-
-    Raises
-    ------
-    Problem
-        415.
-    """
+    """Refuse a body of another type than the first of these, which the others are names of, or a compressed one."""
     media_type = request.headers.get("content-type", "").split(";")[0].strip().lower()
     if media_type not in types:
         detail = f"send {types[0]}, not {media_type[:64] or 'an untyped body'}"
-        raise Problem(415, "unsupported-media-type", detail, "content-type")
+        raise Refused(Kind.UNSUPPORTED_MEDIA_TYPE, detail, "content-type")
     if "content-encoding" in request.headers:
-        raise Problem(415, "unsupported-encoding", "bodies must not be compressed", "content-encoding")
+        raise Refused(Kind.UNSUPPORTED_ENCODING, "bodies must not be compressed", "content-encoding")
 
 
 async def read_json(request: Request, model: type[Model], context: Any = None) -> Model:
@@ -48,8 +42,8 @@ async def read_json(request: Request, model: type[Model], context: Any = None) -
 
     Raises
     ------
-    Problem
-        413, 415, or as `service.arriving.limits.read_bounded`.
+    Refused
+        As `check_type` and `service.arriving.limits.read_bounded`.
     RequestValidationError
         If it is not JSON, or not what the model says.
     """

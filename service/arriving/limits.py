@@ -1,4 +1,4 @@
-"""Bounds on requests: on the head, before anything looks at it, and on the body, in bytes and in time."""
+"""Bounds on the bodies of requests, in bytes and in time."""
 
 from __future__ import annotations
 
@@ -10,18 +10,16 @@ from starlette.datastructures import Headers
 from starlette.requests import ClientDisconnect
 from starlette.types import ASGIApp, Message, Receive, Scope, Send
 
-from service.problems import Problem
+from service import problems
+from service.errors import Kind, Refused
 
-TARGET_BYTES = 2048
-HEADERS = 128
-HEADER_BYTES = 32 * 1024
 UNREAD_BYTES = 2**21
 """If more of a body is left when its request is answered, the connection is closed: to take the rest costs time."""
 
 
-def too_large(limit: int) -> Problem:
+def too_large(limit: int) -> Refused:
     """The refusal of a body of more than ``limit`` bytes."""
-    return Problem(413, "too-large", f"a body may have at most {limit} bytes here")
+    return Refused(Kind.TOO_LARGE, f"a body may have at most {limit} bytes here")
 
 
 def announced_bytes(headers: Headers) -> int:
@@ -35,8 +33,8 @@ async def read_bounded(request: Request, limit: int) -> bytes:
 
     Raises
     ------
-    Problem
-        413 for a larger body, 400 if the client goes away before its end.
+    Refused
+        If the body is larger (``too-large``), or the client goes away before its end (``incomplete-body``).
     """
     if announced_bytes(request.headers) > limit:
         raise too_large(limit)
@@ -47,37 +45,13 @@ async def read_bounded(request: Request, limit: int) -> bytes:
             if len(body) > limit:
                 raise too_large(limit)
     except ClientDisconnect as error:
-        raise Problem(400, "incomplete-body", "the body ended before its announced length") from error
+        raise Refused(Kind.INCOMPLETE_BODY, "the body ended before its announced length") from error
     return bytes(body)
 
 
-class HeadLimit:
-    """Refuses a request whose path, query or headers are absurdly long, since all that looks at them costs time."""
-
-    def __init__(self, app: ASGIApp) -> None:
-        self._app = app
-
-    async def __call__(self, scope: Scope, receive: Receive, send: Send) -> None:
-        problem = _absurd_head(scope) if scope["type"] == "http" else None
-        if problem is None:
-            await self._app(scope, receive, send)
-        else:
-            await problem.response()(scope, receive, send)
-
-
-def _absurd_head(scope: Scope) -> Problem | None:
-    headers, close = scope["headers"], {"Connection": "close"}
-    if len(scope["path"]) + len(scope["query_string"]) > TARGET_BYTES:
-        return Problem(414, "uri-too-long", f"a path and its query may have {TARGET_BYTES} bytes", headers=close)
-    if len(headers) > HEADERS or sum(len(name) + len(value) for name, value in headers) > HEADER_BYTES:
-        detail = f"at most {HEADERS} headers of {HEADER_BYTES} bytes together are read"
-        return Problem(431, "headers-too-large", detail, headers=close)
-    return None
-
-
 class BodyLimit:
-    """Bounds every body, whatever route reads it: 413 by its announced length, else when it outgrows the limit; 408 if
-    it is not there in time. Hangs up where much of a body was not wanted.
+    """Bounds every body, whatever route reads it: one that is too large is refused by its announced length, else when
+    it outgrows the limit; one that is too slow, when its time is over. Hangs up where much of a body was not wanted.
 
     Parameters
     ----------
@@ -113,10 +87,7 @@ class BodyLimit:
                 async with asyncio.timeout_at(end):
                     message = await receive()
             except TimeoutError as error:
-                # connection: close, as the rest of the body may still come, or never
-                raise Problem(
-                    408, "slow-body", "the body did not come in time", headers={"Connection": "close"}
-                ) from error
+                raise Refused(Kind.SLOW_BODY, "the body did not come in time") from error
             complete = not message.get("more_body", False)
             taken += len(message.get("body", b""))
             if taken > self._limit:
@@ -131,6 +102,6 @@ class BodyLimit:
             await send(message)
 
         if announced > self._limit:
-            await too_large(self._limit).response()(scope, receive, hanging_up)
+            await problems.response(too_large(self._limit))(scope, receive, hanging_up)
         else:
             await self._app(scope, bounded, hanging_up)

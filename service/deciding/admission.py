@@ -3,14 +3,11 @@
 from __future__ import annotations
 
 import math
-import re
-from collections.abc import Callable, Iterator
+from collections.abc import Iterator
 from contextlib import contextmanager
 
-from starlette.types import ASGIApp, Receive, Scope, Send
-
 from robosac.deadline import Deadline
-from service.problems import Problem
+from service.errors import Kind, Refused
 
 SHARE = 0.5
 """Part of a frame's budget that the frames before it may take."""
@@ -18,7 +15,6 @@ SESSION_FRAMES = 3
 """Frames of one session in hand or waiting at a time, so that no ego takes the others' share."""
 FIRST_GUESS_S = 0.02
 SMOOTHING = 0.1
-_FRAMES_PATH = re.compile(r"/v1/sessions/([^/]+)/frames")
 
 
 class Admission:
@@ -42,8 +38,8 @@ class Admission:
 
         Raises
         ------
-        Problem
-            503 with Retry-After.
+        Refused
+            With the kind ``overloaded``.
         """
         busy_s = self._frames * self._cost_s
         if self._frames and busy_s + self._cost_s > SHARE * budget_s:
@@ -84,33 +80,5 @@ class Admission:
         self._store_s += SMOOTHING * (store_s - self._store_s)
 
 
-class Gate:
-    """Refuses whole frames beyond capacity before anything of them is read, authenticated or looked up.
-
-    Parameters
-    ----------
-    app : ASGI app
-    admission : Admission
-    budget_s : callable
-        Latency budget of a session that is in use, by its id; None if it is not.
-    """
-
-    def __init__(self, app: ASGIApp, admission: Admission, budget_s: Callable[[str], float | None]) -> None:
-        self._app = app
-        self._admission = admission
-        self._budget_s = budget_s
-
-    async def __call__(self, scope: Scope, receive: Receive, send: Send) -> None:
-        if scope["type"] == "http" and scope["method"] == "POST" and (found := _FRAMES_PATH.fullmatch(scope["path"])):
-            budget_s = self._budget_s(found[1])
-            if budget_s is not None:
-                try:
-                    self._admission.check(found[1], budget_s)
-                except Problem as problem:
-                    await problem.response()(scope, receive, send)
-                    return
-        await self._app(scope, receive, send)
-
-
-def _overloaded(detail: str, busy_s: float) -> Problem:
-    return Problem(503, "overloaded", detail, headers={"Retry-After": str(max(1, math.ceil(busy_s)))})
+def _overloaded(detail: str, busy_s: float) -> Refused:
+    return Refused(Kind.OVERLOADED, detail, retry_after_s=max(1, math.ceil(busy_s)))

@@ -18,8 +18,8 @@ from robosac.defenses import Rejection
 from robosac.fusion import FusionResult
 from service.deciding.admission import Admission
 from service.engine import Engine
-from service.keeping.store import SessionChanged, SessionRecord
-from service.problems import Problem
+from service.errors import SessionChanged
+from service.keeping.record import SessionRecord
 from service.sessions.gathering import Received
 from service.sessions.live import Caller
 from service.sessions.sessions import Sessions
@@ -69,26 +69,15 @@ class Asked:
         self.timings[stage] = (time.perf_counter() - since) * 1e3
 
 
+@dataclass(frozen=True)
 class Deciding:
-    """Answers frames.
+    """Answers frames."""
 
-    Parameters
-    ----------
-    sessions : Sessions
-    engine : Engine
-    metrics : Metrics
-    admission : Admission
-    tracing : Tracing
-    """
-
-    def __init__(
-        self, sessions: Sessions, engine: Engine, metrics: Metrics, admission: Admission, tracing: Tracing
-    ) -> None:
-        self._sessions = sessions
-        self._engine = engine
-        self._metrics = metrics
-        self._admission = admission
-        self._tracing = tracing
+    sessions: Sessions
+    engine: Engine
+    metrics: Metrics
+    admission: Admission
+    tracing: Tracing
 
     async def answer(self, asked: Asked) -> FrameAnswer:
         """Decide a frame and keep the decision. The session's lock is held.
@@ -97,17 +86,19 @@ class Deciding:
 
         Raises
         ------
-        Problem
-            409 if the session keeps being changed; as `Sessions.decide`.
+        SessionChanged
+            If the session keeps being changed.
+        FrameDecided, SessionOver
+            As `Sessions.decide`.
         """
         for _ in range(ATTEMPTS):
             with contextlib.suppress(SessionChanged):
                 return await self._decide(asked)
-        raise Problem(409, "session-changed", "the session keeps being changed elsewhere; try again")
+        raise SessionChanged("the session keeps being changed elsewhere; try again")
 
     async def _decide(self, asked: Asked) -> FrameAnswer:
         """As `answer`, from the session as this process knows it."""
-        record = await self._sessions.current(asked.caller)
+        record = await self.sessions.current(asked.caller)
         present, left_out = self._who_takes_part(asked, record)
         result = await self._fuse(asked, record, present)
         answer = result.answer(asked.frame, left_out, asked.timings)
@@ -132,15 +123,15 @@ class Deciding:
                 present[name] = received
             else:
                 left_out[name] = Rejection(Reason.MALFORMED, {"field": "pose", "detail": doubt})
-                self._metrics.refused(Reason.MALFORMED.value)
+                self.metrics.refused(Reason.MALFORMED.value)
         live.gathering.close(asked.frame)
         return present, left_out
 
     async def _fuse(self, asked: Asked, record: SessionRecord, present: Mapping[str, Received]) -> FusionResult:
         live = asked.caller.live
         messages = {name: received.message for name, received in present.items()}
-        deadline = self._admission.deadline(asked.arrived, record.latency_budget_ms / 1e3)
-        result, asked.timings["queue"] = await self._engine.decide(
+        deadline = self.admission.deadline(asked.arrived, record.latency_budget_ms / 1e3)
+        result, asked.timings["queue"] = await self.engine.decide(
             live.session, asked.frame, asked.ego.message, messages, int(record.seed, 16), deadline
         )
         asked.timings.update(result.timings_ms)
@@ -157,7 +148,7 @@ class Deciding:
     ) -> None:
         """Put the decision on record, with all that it takes to make it again."""
         live, decided = asked.caller.live, time.perf_counter()
-        next_seed = self._sessions.draw_seed()
+        next_seed = self.sessions.draw_seed()
         with live.unlogged() as unlogged:
             event = FrameAnswered(
                 **dict(answer),
@@ -171,11 +162,11 @@ class Deciding:
                 unlogged_refusals=unlogged,
                 next_seed_commitment=commitment(next_seed),
             )
-            body = _whole_frame(asked, present) if self._sessions.keeps_messages else None
-            await self._sessions.decide(record, event, next_seed, body)
+            body = _whole_frame(asked, present) if self.sessions.keeps_messages else None
+            await self.sessions.decide(record, event, next_seed, body)
         asked.spent("store", decided)
         could_begin = asked.arrived + asked.timings.get("gather", 0.0) / 1e3
-        self._admission.learn(could_begin, time.perf_counter(), asked.timings["store"] / 1e3)
+        self.admission.learn(could_begin, time.perf_counter(), asked.timings["store"] / 1e3)
 
     def _remember(self, asked: Asked, present: Mapping[str, Received], result: FusionResult) -> None:
         """What the next frame is judged by."""
@@ -187,8 +178,8 @@ class Deciding:
 
     def _tell(self, asked: Asked, answer: FrameAnswer, fault: str | None) -> None:
         session_id = asked.caller.record.session_id
-        self._metrics.frame(answer, asked.timings)
-        self._tracing.frame(session_id, answer, asked.timings)
+        self.metrics.frame(answer, asked.timings)
+        self.tracing.frame(session_id, answer, asked.timings)
         logger.log(
             logging.DEBUG if answer.degraded_by is None and answer.deadline_met else logging.WARNING,
             "frame answered",

@@ -28,7 +28,7 @@ from sqlalchemy.pool import QueuePool
 
 from robosac.extras import need
 from robosac.faults import describe
-from service.keeping.store import StoreUnavailable
+from service.errors import StoreUnavailable
 
 logger = logging.getLogger(__name__)
 
@@ -36,7 +36,7 @@ T = TypeVar("T")
 Work = Callable[[Connection], T]
 
 BUSY_TIMEOUT_S = 5.0
-"""How long SQLite waits for another process that writes."""
+"""How long SQLite waits for another process that writes, where the URL names no ``timeout``."""
 BUSY_PAUSE_S = 0.01
 """Between two attempts of what SQLite does not wait for by itself."""
 COMMAND_TIMEOUT_S = 10.0
@@ -193,12 +193,12 @@ class _SqliteThreads:
 
     def __init__(self, url: URL, number: int) -> None:
         self.engine: Engine = create_engine(
-            url,
+            url.update_query_dict({"timeout": str(BUSY_TIMEOUT_S), **url.query}),
             poolclass=QueuePool,
             pool_size=number,
             max_overflow=0,
             hide_parameters=True,
-            connect_args={"timeout": BUSY_TIMEOUT_S, "check_same_thread": False},
+            connect_args={"check_same_thread": False},
         )
         event.listen(self.engine, "do_connect", _create_for_us_alone)
         event.listen(self.engine, "connect", _prepare)
@@ -285,4 +285,4 @@ def _unavailable(*failures: type[Exception]) -> Iterator[None]:
     except expected as error:
         cause = getattr(error, "orig", None) or error
         logger.error("the database failed: %s", describe(cause))
-        raise StoreUnavailable(type(error).__name__) from error
+        raise StoreUnavailable from error

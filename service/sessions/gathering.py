@@ -5,12 +5,14 @@ from __future__ import annotations
 import asyncio
 import time
 from collections.abc import Sequence
+from contextlib import suppress
 from dataclasses import dataclass
 
 from robosac.answers import Distrust, Reason
 from robosac.audit.events import Proof
 from robosac.defenses import Rejection
 from robosac.detectors import Message
+from service.errors import Kind, Refused, Unusable
 
 REMEMBERED_FRAMES = 8
 """Answered frames for which a message that comes again is told from one that says something else."""
@@ -43,26 +45,13 @@ class Received:
         return Proof(digest=self.digest, signature=self.signature)
 
 
-class Refused(Exception):
-    """A message that is well-formed but cannot be kept."""
-
-    def __init__(self, reason: Reason, detail: str) -> None:
-        super().__init__(detail)
-        self.reason = reason
-        self.detail = detail
-
-
-class Equivocation(Exception):
-    """A vehicle said two different things about one frame.
-
-    Attributes
-    ----------
-    first : Proof
-        Of what it said before.
-    """
+class Contradiction(Refused):
+    """A vehicle said two different things about one frame; ``first`` proves what it said before."""
 
     def __init__(self, first: Proof) -> None:
-        super().__init__("another message with other content came for this frame; neither is used")
+        super().__init__(
+            Kind.EQUIVOCATION, "another message with other content came for this frame; neither is used", "frame"
+        )
         self.first = first
 
 
@@ -117,30 +106,30 @@ class Gathering:
 
         Raises
         ------
-        Refused
+        Unusable
             If the sender's message for the frame is in (``replayed``), the frame is answered already (``late`` for the
             latest, ``stale`` for an earlier one), it is farther ahead than all that are kept (``malformed``), or the
             sender has left meanwhile (``unauthenticated``).
-        Equivocation
+        Contradiction
             If the sender said something else about the frame before.
         """
         mine = self._pending.get(sender)
         if mine is None:
-            raise Refused(Reason.UNAUTHENTICATED, f"{sender} has left the session")
+            raise Unusable(Kind.NOT_ENROLLED, Reason.UNAUTHENTICATED, f"{sender} has left the session")
         said = self._said[sender].get(frame)
         if said is not None:
             if said.digest == received.digest:
                 detail = f"this message of {sender} for frame {frame} is in already"
                 if frame <= self._closed:
                     self.refuse(sender, frame, Reason.REPLAYED, detail)
-                raise Refused(Reason.REPLAYED, detail)
+                raise Unusable(Kind.DUPLICATE_MESSAGE, Reason.REPLAYED, detail)
             self._put(mine, frame, None)
-            raise Equivocation(said)
+            raise Contradiction(said)
         if frame <= self._closed:
             reason = Reason.LATE if frame == self._closed else Reason.STALE
             detail = f"frame {frame} is answered; the latest answered is {self._closed}"
             self.refuse(sender, frame, reason, detail)
-            raise Refused(reason, detail)
+            raise Unusable(Kind.STALE_FRAME, reason, detail)
         self._put(mine, frame, received)
         self._said[sender][frame] = received.proof
         if len(mine) > self._max_ahead + 1:
@@ -148,7 +137,8 @@ class Gathering:
             self._drop(sender, farthest)
             del self._said[sender][farthest]
             if frame == farthest:
-                raise Refused(Reason.MALFORMED, f"frame {frame} is too far ahead; {self._max_ahead} are kept")
+                detail = f"frame {frame} is too far ahead; {self._max_ahead} are kept"
+                raise Unusable(Kind.TOO_FAR_AHEAD, Reason.MALFORMED, detail)
         self._arrival.set()
 
     def refuse(self, sender: str, frame: int | None, reason: Reason, detail: str) -> None:
@@ -163,15 +153,11 @@ class Gathering:
         dict of teammate to Received
             Those that are in, and count.
         """
-        while any(frame not in mine for mine in self._pending.values()):
-            self._arrival.clear()
-            remaining = until - time.perf_counter()
-            if remaining <= 0:
-                break
-            try:
-                await asyncio.wait_for(self._arrival.wait(), remaining)
-            except TimeoutError:
-                break
+        with suppress(TimeoutError):
+            async with asyncio.timeout(until - time.perf_counter()):
+                while any(frame not in mine for mine in self._pending.values()):
+                    self._arrival.clear()
+                    await self._arrival.wait()
         waiting = {name: mine.get(frame) for name, mine in self._pending.items()}
         return {name: received for name, received in waiting.items() if received is not None}
 

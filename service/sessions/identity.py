@@ -1,4 +1,4 @@
-"""Who may call: API keys that open sessions, tokens of the vehicles in them, and loopback only where there are no keys.
+"""Who may call: API keys that open sessions, and tokens of the vehicles in them.
 
 A token is a signed JWT (RFC 7519, HS256) that binds a vehicle to a session and a role. The session's record holds the
 id of the one token of each vehicle that counts, so that a token can be revoked before it expires.
@@ -7,22 +7,20 @@ id of the one token of each vehicle that counts, so that a token can be revoked 
 from __future__ import annotations
 
 import hmac
-import ipaddress
 import re
 import secrets
 import time
-from collections.abc import Mapping, Sequence
+from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass, field
 from datetime import UTC, datetime
 from hashlib import sha256
 from typing import Any
 
 import jwt
-from starlette.datastructures import Headers
-from starlette.types import ASGIApp, Receive, Scope, Send
 
-from service.keeping.store import SessionRecord, Store
-from service.problems import Problem
+from service.errors import Kind, Refused, TokenRefused
+from service.keeping.record import SessionRecord
+from service.keeping.store import Store
 from service.settings import Settings
 
 API_KEY_LENGTH = 16
@@ -33,24 +31,13 @@ LEEWAY_S = 5.0
 """How far the clocks of two gateways may be apart."""
 ISSUER = AUDIENCE = "robosac-gateway"
 ALGORITHM = "HS256"
+RENEWED = "the token was renewed, or its vehicle has left"
 CLAIMS = ("iss", "aud", "sub", "sid", "role", "jti", "iat", "exp")
-OPEN_PATHS = ("/healthz",)
 _BEARER_TOKEN = re.compile(r"[A-Za-z0-9._~+/-]+=*")  # RFC 6750, section 2.1
-_CHALLENGE = {"WWW-Authenticate": "Bearer"}
-
-
-def unauthenticated(detail: str) -> Problem:
-    """The refusal of a caller without a credential that counts."""
-    return Problem(401, "unauthenticated", detail, headers=_CHALLENGE)
 
 
 class ApiKeys:
-    """The keys of those who may open sessions; without any, everybody may.
-
-    Parameters
-    ----------
-    keys : sequence of str
-    """
+    """The keys of those who may open sessions; without any, everybody may."""
 
     def __init__(self, keys: Sequence[str]) -> None:
         self._digests = [sha256(key.encode()).digest() for key in keys]
@@ -90,45 +77,15 @@ class ApiKeys:
 
         Raises
         ------
-        Problem
-            401.
+        Refused
+            With the kind ``unauthenticated``.
         """
         if not self:
             return
         given = sha256((key or "").encode()).digest()
         matches = [hmac.compare_digest(given, digest) for digest in self._digests]
         if not any(matches):
-            raise unauthenticated("an API key is needed as a bearer token")
-
-
-class LoopbackOnly:
-    """Serves this machine only, but for `OPEN_PATHS`: for a gateway whose sessions anybody can open."""
-
-    def __init__(self, app: ASGIApp) -> None:
-        self._app = app
-
-    async def __call__(self, scope: Scope, receive: Receive, send: Send) -> None:
-        if scope["type"] != "http" or scope["path"] in OPEN_PATHS or is_local(scope):
-            await self._app(scope, receive, send)
-            return
-        detail = "without an API key the gateway serves its own machine only; set ROBOSAC_API_KEYS"
-        refusal = Problem(403, "loopback-only", detail, headers={"Connection": "close"})  # and takes no body
-        await refusal.response()(scope, receive, send)
-
-
-def is_local(scope: Scope) -> bool:
-    """Whether a request comes from this machine: over loopback or a unix socket, and no proxy has forwarded it."""
-    headers = Headers(scope=scope)
-    if "x-forwarded-for" in headers or "forwarded" in headers:
-        return False
-    client, server = scope.get("client"), scope.get("server")
-    if client is None:  # a unix socket has a path and no port; a peer on the network may be gone already
-        return server is not None and server[1] is None
-    try:
-        address = ipaddress.ip_address(client[0])
-    except ValueError:
-        return False
-    return (getattr(address, "ipv4_mapped", None) or address).is_loopback
+            raise Refused(Kind.UNAUTHENTICATED, "an API key is needed as a bearer token")
 
 
 @dataclass(frozen=True)
@@ -150,23 +107,6 @@ class Token:
     expires_at: str
 
 
-class TokenRefused(Exception):
-    """A token that does not count.
-
-    Attributes
-    ----------
-    problem : Problem
-        401.
-    vehicle_id : str or None
-        Whose token it is or was; None unless this gateway signed it for the session.
-    """
-
-    def __init__(self, problem: Problem, vehicle_id: str | None = None) -> None:
-        super().__init__(problem.detail)
-        self.problem = problem
-        self.vehicle_id = vehicle_id
-
-
 class Tokens:
     """Signs and reads the tokens of vehicles.
 
@@ -176,14 +116,17 @@ class Tokens:
         The first signs, all verify. With none, `start` takes the one that the store keeps.
     ttl_s : float
         How long a token lives.
+    clock : callable
+        Unix time, seconds.
     """
 
-    def __init__(self, signing_secrets: Sequence[str], ttl_s: float) -> None:
+    def __init__(self, signing_secrets: Sequence[str], ttl_s: float, clock: Callable[[], float] = time.time) -> None:
+        self._clock = clock
         self._secrets = tuple(signing_secrets)
         self._ttl_s = ttl_s
 
     @classmethod
-    def configured(cls, settings: Settings) -> Tokens:
+    def configured(cls, settings: Settings, clock: Callable[[], float] = time.time) -> Tokens:
         """Those of the settings.
 
         Raises
@@ -195,7 +138,7 @@ class Tokens:
         for number, secret in enumerate(own, 1):
             if len(secret) < SECRET_LENGTH:
                 raise ValueError(f"ROBOSAC_TOKEN_SECRETS: secret {number} has fewer than {SECRET_LENGTH} characters")
-        return cls(own, settings.token_ttl_s)
+        return cls(own, settings.token_ttl_s, clock)
 
     async def start(self, store: Store) -> None:
         """Make sure that there is a secret, the same after a restart."""
@@ -204,7 +147,7 @@ class Tokens:
 
     def issue(self, session_id: str, vehicle_id: str, *, is_ego: bool) -> Token:
         """A token of a vehicle for a session."""
-        now = int(time.time())
+        now = int(self._clock())
         expires = now + int(self._ttl_s)
         token_id = secrets.token_hex(16)
         claims = {
@@ -230,13 +173,13 @@ class Tokens:
         """
         claims = self._claims(text)
         if claims is None or claims["sid"] != record.session_id:
-            raise TokenRefused(unauthenticated("a bearer token of a vehicle of this session is needed"))
+            raise TokenRefused("a bearer token of a vehicle of this session is needed")
         vehicle: str = claims["sub"]
         is_latest = record.token_ids.get(vehicle) == claims["jti"]
         if not is_latest or claims["role"] != _role(vehicle == record.ego_id):
-            raise TokenRefused(unauthenticated("the token was renewed, or its vehicle has left"), vehicle)
-        if claims["exp"] <= time.time() - LEEWAY_S:
-            raise TokenRefused(Problem(401, "token-expired", "the token has expired", headers=_CHALLENGE), vehicle)
+            raise TokenRefused(RENEWED, vehicle)
+        if claims["exp"] <= self._clock() - LEEWAY_S:
+            raise TokenRefused("the token has expired", vehicle, Kind.TOKEN_EXPIRED)
         return vehicle
 
     def _claims(self, text: str | None) -> Mapping[str, Any] | None:

@@ -5,32 +5,27 @@ one vehicle, and of all strangers together, only so many records are kept betwee
 from __future__ import annotations
 
 import contextlib
+from dataclasses import dataclass
 
 import structlog
 
 from robosac.answers import Reason
 from robosac.audit.events import AccessRefused, Equivocation, Event, MessageRefused, Proof
-from service.keeping.store import SessionOver, Store
+from service.errors import SessionOver, TokenRefused
+from service.keeping.store import Store
 from service.sessions.gathering import Received
-from service.sessions.identity import TokenRefused
 from service.sessions.live import REFUSALS_LOGGED, STRANGERS, Caller, LiveSession
 from service.watching.metrics import Metrics
 
 logger = structlog.stdlib.get_logger(__name__)
 
 
+@dataclass(frozen=True)
 class Journal:
-    """Appends to the logs of sessions.
+    """Appends to the logs of sessions."""
 
-    Parameters
-    ----------
-    store : Store
-    metrics : Metrics
-    """
-
-    def __init__(self, store: Store, metrics: Metrics) -> None:
-        self._store = store
-        self._metrics = metrics
+    store: Store
+    metrics: Metrics
 
     async def refusal(self, caller: Caller, reason: Reason, detail: str, frame: int | None, field: str) -> None:
         """A vehicle's message, or call, was refused."""
@@ -58,16 +53,16 @@ class Journal:
     async def stranger(self, session_id: str, live: LiveSession | None, refused: TokenRefused) -> None:
         """Somebody came without a token that counts; ``live`` is None for a session not served."""
         if live is None:
-            self._metrics.refused(Reason.UNAUTHENTICATED.value)
+            self.metrics.refused(Reason.UNAUTHENTICATED.value)
         elif self._counted(live, STRANGERS, Reason.UNAUTHENTICATED):
-            await self._append(session_id, AccessRefused(vehicle_id=refused.vehicle_id, detail=refused.problem.detail))
+            await self._append(session_id, AccessRefused(vehicle_id=refused.vehicle_id, detail=refused.detail))
 
     def _counted(self, live: LiveSession, who: str, reason: Reason) -> bool:
         """Count a refusal; whether it gets a record."""
-        self._metrics.refused(reason.value)
+        self.metrics.refused(reason.value)
         live.refusals[who] += 1
         return live.refusals[who] <= REFUSALS_LOGGED
 
     async def _append(self, session_id: str, event: Event) -> None:
         with contextlib.suppress(SessionOver):
-            await self._store.log(session_id, event.as_json())
+            await self.store.log(session_id, event)

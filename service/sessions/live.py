@@ -11,7 +11,7 @@ from dataclasses import dataclass, field
 
 from robosac.detectors import Detector, Role
 from robosac.session import Session
-from service.keeping.store import SessionRecord
+from service.keeping.record import SessionRecord
 from service.sessions.gathering import Gathering
 from service.sessions.motion import Motion
 

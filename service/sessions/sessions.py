@@ -5,7 +5,7 @@ from __future__ import annotations
 import asyncio
 import contextlib
 import time
-from collections.abc import Callable, Sequence
+from collections.abc import Callable
 
 import structlog
 
@@ -16,20 +16,12 @@ from robosac.budget import DomainError
 from robosac.defenses import known, read_settings, suspicion_in
 from robosac.session import Session, defense_for
 from service.engine import Engine
-from service.keeping.store import (
-    FrameDecided,
-    SessionOver,
-    SessionRecord,
-    Store,
-    StoreUnavailable,
-    new_seed,
-)
-from service.problems import Problem
-from service.schemas import (
-    SessionState,
-)
+from service.errors import Kind, Refused, SessionOver, StoreUnavailable, TokenRefused
+from service.keeping.record import SessionRecord, new_seed
+from service.keeping.store import Store
+from service.schemas import SessionState
 from service.sessions.gathering import Backlog, Gathering
-from service.sessions.identity import TokenRefused, Tokens
+from service.sessions.identity import Tokens
 from service.sessions.journal import Journal
 from service.sessions.live import Caller, LiveSession
 from service.sessions.motion import Motion
@@ -44,15 +36,8 @@ SWEEP_EVERY_S = 30.0
 class Sessions:
     """All sessions of this gateway.
 
-    Parameters
-    ----------
-    settings : Settings
-    store : Store
-    engine : Engine
-    metrics : Metrics
-    tokens : Tokens
-    seeds : callable
-        Seed of a frame's draws, hexadecimal; from the operating system by default, so that nobody can foresee them.
+    ``seeds`` gives the seed of a frame's draws, hexadecimal; by default from the operating system, so that nobody can
+    foresee them.
     """
 
     def __init__(
@@ -64,7 +49,7 @@ class Sessions:
         tokens: Tokens,
         seeds: Callable[[], str] = new_seed,
     ) -> None:
-        self._seeds = seeds
+        self.draw_seed = seeds
         self._settings = settings
         self._store = store
         self._engine = engine
@@ -84,14 +69,14 @@ class Sessions:
 
         Raises
         ------
-        Problem
-            404 for an unknown or ended session, 401 without a token of it, 503 if its detector or its defence is not
-            served any more.
+        Refused
+            If the session is unknown or ended, the token is none of it, or its detector or its defence is not served
+            any more.
         """
         record = await self._store.get(session_id)
         if record is None or record.ended_at is not None:
             self._forget(session_id)
-            raise Problem(404, "unknown-session", "there is no such session; it may have ended or expired")
+            raise SessionOver("there is no such session; it may have ended or expired")
         vehicle = await self._holder(record, token)
         live = self._live_session(record)
         live.follow(record)
@@ -99,12 +84,12 @@ class Sessions:
         return Caller(record, live, vehicle)
 
     async def authenticate_ego(self, session_id: str, token: str | None) -> Caller:
-        """As `authenticate`, but 403 for anybody but the ego."""
+        """As `authenticate`, but nobody but the ego is let in."""
         caller = await self.authenticate(session_id, token)
         if not caller.is_ego:
-            problem = _ego_only(caller.vehicle_id)
-            await self.journal.refusal(caller, Reason.UNAUTHENTICATED, problem.detail, None, "")
-            raise problem
+            refused = _ego_only(caller.vehicle_id)
+            await self.journal.refusal(caller, Reason.UNAUTHENTICATED, refused.detail, None, "")
+            raise refused
         return caller
 
     def budget_s(self, session_id: str) -> float | None:
@@ -116,7 +101,7 @@ class Sessions:
         """Lines of the log with a number above ``after``, for the ego; of a session no longer served, too."""
         record = await self._store.get(session_id)
         if record is None:
-            raise Problem(404, "unknown-session", "there is no such session; its log may have been purged")
+            raise SessionOver("there is no such session; its log may have been purged")
         if record.ended_at is None and self._is_served(record):
             await self.authenticate_ego(session_id, token)
         elif (vehicle := await self._holder(record, token)) != record.ego_id:
@@ -126,24 +111,13 @@ class Sessions:
     async def describe(self, caller: Caller) -> SessionState:
         """The session's state."""
         record = await self.current(caller)
-        return SessionState(
-            session_id=record.session_id,
-            ego_id=record.ego_id,
-            teammates=list(record.teammates),
-            detector=record.detector,
-            defense=read_settings(record.defense, self.defenses),
-            latency_budget_ms=record.latency_budget_ms,
-            gather_ms=record.gather_ms,
-            frame_period_ms=record.frame_period_ms,
-            created_at=record.created_at,
-            last_frame=record.last_frame,
-            frames_answered=record.frames_answered,
-            state=dict(record.state),
-            suspicion=suspicion_in(record.state),
-            audit_seq=record.audit_seq,
-            audit_head=record.audit_head,
-            next_seed_commitment=commitment(record.seed),
-        )
+        shown = {
+            **vars(record),  # of which only what `SessionState` declares is shown: no seed, no token's id
+            "defense": read_settings(record.defense, self.defenses),
+            "suspicion": suspicion_in(record.state),
+            "next_seed_commitment": commitment(record.seed),
+        }
+        return SessionState.model_validate(shown)
 
     async def close(self, caller: Caller) -> str:
         """End a session, after the frame in hand; the head of its log, which is complete by then."""
@@ -151,7 +125,7 @@ class Sessions:
             await self._end(caller.record.session_id, "closed")
         record = await self._store.get(caller.record.session_id)
         if record is None:
-            raise over()
+            raise SessionOver
         return record.audit_head
 
     async def expire_idle(self) -> None:
@@ -178,7 +152,7 @@ class Sessions:
         session_id = caller.record.session_id
         record = self._store.seen(session_id) or await self._store.get(session_id)
         if record is None or record.ended_at is not None:
-            raise over()
+            raise SessionOver
         caller.live.follow(record)
         return record
 
@@ -186,10 +160,6 @@ class Sessions:
     def keeps_messages(self) -> bool:
         """Whether the messages of frames are kept, to replay decisions."""
         return self._settings.keep_frames > 0
-
-    def draw_seed(self) -> str:
-        """The seed of a frame to come, hexadecimal."""
-        return self._seeds()
 
     async def decide(
         self, record: SessionRecord, event: FrameAnswered, next_seed: str, messages: bytes | None = None
@@ -200,19 +170,13 @@ class Sessions:
         ------
         SessionChanged
             If the session is another by now: the decision is void, and has to be worked out again.
+        FrameDecided, SessionOver
+            As `service.keeping.store.Store.decide`.
         """
-        frame = event.frame
-        try:
-            await self._store.decide(
-                record.session_id, record.revision, frame, event.state, next_seed, event.as_json(), messages
-            )
-        except SessionOver as error:
-            raise over() from error
-        except FrameDecided as error:
-            raise Problem(409, "stale-frame", f"frame {frame} or a later one is answered already", "frame") from error
+        await self._store.decide(record, event, next_seed, messages)
         if messages is not None:
             with contextlib.suppress(StoreUnavailable):  # the decision is kept; the next one forgets these as well
-                await self._store.forget_messages(record.session_id, frame - self._settings.keep_frames + 1)
+                await self._store.forget_messages(record.session_id, event.frame - self._settings.keep_frames + 1)
 
     async def messages(self, caller: Caller, frame: int) -> bytes | None:
         """The messages kept of a decided frame."""
@@ -223,23 +187,24 @@ class Sessions:
 
         Raises
         ------
-        Problem
-            503 if the detector or the defence that it was opened with is not served any more, or the detector lacks
-            what the defence needs.
+        Refused
+            If the detector or the defence that it was opened with is not served any more, or the detector lacks what
+            the defence needs.
         """
         closed = -1 if record.last_frame is None else record.last_frame
         settings, detector = self._settings, self._engine.detectors.get(record.detector)
         if detector is None:
-            raise Problem(503, "detector-unavailable", f"the session's detector {record.detector} is not served now")
+            detail = f"the session's detector {record.detector} is not served now"
+            raise Refused(Kind.DETECTOR_UNAVAILABLE, detail)
         if record.defense["kind"] not in self.defenses:
             detail = f"the session's defence {record.defense['kind']} is not served now"
-            raise Problem(503, "defense-unavailable", detail)
+            raise Refused(Kind.DEFENSE_UNAVAILABLE, detail)
         try:
             kept = read_settings(record.defense, self.defenses).at_period(record.frame_period_ms)
             defense = defense_for(kept, detector.info)
         except DomainError as error:
             detail = f"the session's detector {record.detector} no longer serves its defence: {error}"
-            raise Problem(503, "detector-unavailable", detail) from error
+            raise Refused(Kind.DETECTOR_UNAVAILABLE, detail) from error
         return LiveSession(
             Session(detector, record.teammates, defense, {"state": record.state}),
             detector,
@@ -265,13 +230,13 @@ class Sessions:
         with contextlib.suppress(SessionOver):
             event = SessionEnded(why=why)
             logger.info("session ended", session_id=session_id, why=why)
-            await self._store.end(session_id, event.time, event.as_json())
+            await self._store.end(session_id, event)
         self._metrics.sessions.set(await self._store.count())
 
     def _is_served(self, record: SessionRecord) -> bool:
         try:
             self._live_session(record)
-        except Problem:
+        except Refused:
             return False
         return True
 
@@ -288,19 +253,8 @@ class Sessions:
         except TokenRefused as refused:
             live = self._live_session(record) if record.ended_at is None and self._is_served(record) else None
             await self.journal.stranger(record.session_id, live, refused)
-            raise refused.problem from refused
+            raise
 
 
-def _ego_only(vehicle_id: str) -> Problem:
-    return Problem(403, "ego-only", f"only the ego of the session may do this, not {vehicle_id}")
-
-
-def over() -> Problem:
-    """The refusal of a call to a session that has ended meanwhile."""
-    return Problem(404, "unknown-session", "the session has ended")
-
-
-def check_size(team: Sequence[str], most: int) -> None:
-    """Refuse a team of more than so many."""
-    if len(team) > most:
-        raise Problem(422, "too-many-teammates", f"at most {most} teammates are allowed", "teammates")
+def _ego_only(vehicle_id: str) -> Refused:
+    return Refused(Kind.EGO_ONLY, f"only the ego of the session may do this, not {vehicle_id}")

@@ -3,46 +3,40 @@
 from __future__ import annotations
 
 from collections.abc import Mapping, Sequence
+from dataclasses import dataclass
 
 from robosac.audit.events import TeamChanged, TokenRenewed
 from robosac.budget import DomainError
-from service.keeping.store import SessionChanged, SessionOver, SessionRecord, Store
-from service.problems import Problem
+from service.errors import Kind, Refused
+from service.keeping.record import SessionRecord
+from service.keeping.store import Store
 from service.schemas import ChangedTeam, RenewedToken
-from service.sessions.identity import Tokens, unauthenticated
+from service.sessions.identity import RENEWED, Tokens
 from service.sessions.live import Caller
-from service.sessions.sessions import Sessions, check_size, over
+from service.sessions.sessions import Sessions
 from service.settings import Settings
 
 MAX_RENEWALS = 16
 """Tokens that a vehicle may take between two frames: each leaves a record."""
 
 
+@dataclass(frozen=True)
 class Teams:
-    """Changes the teams of sessions.
+    """Changes the teams of sessions."""
 
-    Parameters
-    ----------
-    settings : Settings
-    sessions : Sessions
-    store : Store
-    tokens : Tokens
-    """
-
-    def __init__(self, settings: Settings, sessions: Sessions, store: Store, tokens: Tokens) -> None:
-        self._settings = settings
-        self._sessions = sessions
-        self._store = store
-        self._tokens = tokens
+    settings: Settings
+    sessions: Sessions
+    store: Store
+    tokens: Tokens
 
     async def enrol(self, caller: Caller, newcomers: Sequence[str], public_keys: Mapping[str, str]) -> ChangedTeam:
         """Let teammates join, from the next frame on; the answer is the only place where their tokens are shown."""
         async with caller.live.lock:
-            record = await self._sessions.current(caller)
+            record = await self.sessions.current(caller)
             for name in newcomers:
                 if name == record.ego_id or name in record.teammates:
-                    raise Problem(409, "already-enrolled", f"{name} is in the session already", "teammates")
-            tokens = {name: self._tokens.issue(record.session_id, name, is_ego=False) for name in newcomers}
+                    raise Refused(Kind.ALREADY_ENROLLED, f"{name} is in the session already", "teammates")
+            tokens = {name: self.tokens.issue(record.session_id, name, is_ego=False) for name in newcomers}
             token_ids = {**record.token_ids, **{name: token.token_id for name, token in tokens.items()}}
             keys = {**record.public_keys, **public_keys}
             await self._change_team(caller, record, (*record.teammates, *newcomers), token_ids, keys)
@@ -55,9 +49,9 @@ class Teams:
     async def dismiss(self, caller: Caller, leaver: str) -> None:
         """Let a teammate leave, from the next frame on; its token is worth nothing any more."""
         async with caller.live.lock:
-            record = await self._sessions.current(caller)
+            record = await self.sessions.current(caller)
             if leaver not in record.teammates:
-                raise Problem(404, "unknown-teammate", "there is no such teammate in the session")
+                raise Refused(Kind.UNKNOWN_TEAMMATE, "there is no such teammate in the session")
             token_ids = {name: token_id for name, token_id in record.token_ids.items() if name != leaver}
             keys = {name: key for name, key in record.public_keys.items() if name != leaver}
             team = tuple(name for name in record.teammates if name != leaver)
@@ -67,19 +61,16 @@ class Teams:
         """A fresh token of the caller; the one it came with is worth nothing any more."""
         vehicle = caller.vehicle_id
         async with caller.live.lock:  # else a team that changes meanwhile would bring the old token back
-            record = await self._sessions.current(caller)
+            record = await self.sessions.current(caller)
             if record.token_ids.get(vehicle) != caller.record.token_ids[vehicle]:
-                raise unauthenticated("the token was renewed, or its vehicle has left")
+                raise Refused(Kind.UNAUTHENTICATED, RENEWED)
             if caller.live.renewals[vehicle] >= MAX_RENEWALS:
                 detail = f"a vehicle may have {MAX_RENEWALS} tokens between two frames"
-                raise Problem(429, "too-many-renewals", detail, headers={"Retry-After": "1"})
+                raise Refused(Kind.TOO_MANY_RENEWALS, detail)
             caller.live.renewals[vehicle] += 1
-            token = self._tokens.issue(record.session_id, vehicle, is_ego=caller.is_ego)
+            token = self.tokens.issue(record.session_id, vehicle, is_ego=caller.is_ego)
             event = TokenRenewed(vehicle_id=vehicle, expires_at=token.expires_at)
-            try:
-                await self._store.renew_token(record.session_id, vehicle, token.token_id, event.as_json())
-            except SessionOver as error:
-                raise over() from error
+            await self.store.renew_token(record.session_id, token.token_id, event)
             return RenewedToken(token=token.text, expires_at=token.expires_at)
 
     async def _change_team(
@@ -91,11 +82,11 @@ class Teams:
         keys: Mapping[str, str],
     ) -> None:
         """Keep a new team of the session ``record``. The session's lock is held."""
-        check_size(team, self._settings.max_teammates)
+        check_size(team, self.settings.max_teammates)
         try:
             state = caller.live.session.defense.change_team(record.state, team)
         except DomainError as error:
-            raise Problem(422, "impossible-defense", str(error), "teammates") from error
+            raise Refused(Kind.IMPOSSIBLE_DEFENSE, str(error), "teammates") from error
         event = TeamChanged(
             joined=tuple(name for name in team if name not in record.teammates),
             left=tuple(name for name in record.teammates if name not in team),
@@ -103,12 +94,11 @@ class Teams:
             public_keys=dict(keys),
             state=dict(state),
         )
-        try:
-            await self._store.change_team(
-                record.session_id, record.revision, tuple(team), token_ids, keys, state, event.as_json()
-            )
-        except SessionChanged as error:
-            raise Problem(409, "session-changed", "the session was changed at the same time; try again") from error
-        except SessionOver as error:
-            raise over() from error
-        caller.live.follow(await self._sessions.current(caller))
+        await self.store.change_team(record, event, token_ids)
+        caller.live.follow(await self.sessions.current(caller))
+
+
+def check_size(team: Sequence[str], most: int) -> None:
+    """Refuse a team of more than so many."""
+    if len(team) > most:
+        raise Refused(Kind.TOO_MANY_TEAMMATES, f"at most {most} teammates are allowed", "teammates")

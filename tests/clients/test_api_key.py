@@ -1,34 +1,59 @@
+import threading
+from http.server import BaseHTTPRequestHandler, HTTPServer
+
 import httpx
 import pytest
 import typer
 from typer.testing import CliRunner
 
-from clients import fleet, load_test
-from clients.client import GatewayClient
-from clients.errors import GatewayUnreachable, ProtocolError
+from clients import fleet, flood, load_test
+from clients.client import API_KEY_VARIABLE, GatewayClient
+from clients.errors import ProtocolError
 
 
-@pytest.mark.parametrize("module", [fleet, load_test])
-@pytest.mark.parametrize("by_option", [True, False])
-def test_the_command_lines_take_a_key_from_the_option_or_the_environment(module, by_option, monkeypatch):
+@pytest.fixture
+def credentials():
+    """Where a server listens that refuses everything, and what it was shown."""
+
+    class Refusing(BaseHTTPRequestHandler):
+        def do_POST(self):
+            seen.append((self.path, self.headers["Authorization"]))
+            self.send_error(401)
+
+        def log_message(self, *_):
+            pass
+
     seen = []
+    with HTTPServer(("127.0.0.1", 0), Refusing) as server:
+        thread = threading.Thread(target=server.serve_forever)
+        thread.start()
+        yield f"http://127.0.0.1:{server.server_port}", seen
+        server.shutdown()
+        thread.join()
 
-    class Recorder:
-        def __init__(self, url, api_key):
-            seen.append(api_key)
-            raise GatewayUnreachable(url)
 
-    monkeypatch.setattr(module, "GatewayClient", Recorder)
-    monkeypatch.setattr(load_test, "prepare", lambda *_: None)
+def command(function):
+    app = typer.Typer()
+    app.command()(function)
+    return app
+
+
+@pytest.mark.parametrize("by_option", [True, False])
+def test_a_command_line_takes_a_key_from_the_option_or_the_environment(by_option, credentials, monkeypatch):
+    url, seen = credentials
     if not by_option:
         monkeypatch.setenv("ROBOSAC_API_KEY", "a-key-of-the-fleet")
-    app = typer.Typer()
-    app.command()(module.main)
-    arguments = ["--url", "http://gateway", *(["--api-key", "a-key-of-the-fleet"] if by_option else [])]
-    result = CliRunner().invoke(app, arguments)
+    arguments = ["--url", url, *(["--api-key", "a-key-of-the-fleet"] if by_option else [])]
+    result = CliRunner().invoke(command(fleet.main), arguments)
     assert result.exit_code == 1
-    assert seen == ["a-key-of-the-fleet"]
+    assert seen == [("/v1/sessions", "Bearer a-key-of-the-fleet")]
     assert "a-key-of-the-fleet" not in result.output
+
+
+@pytest.mark.parametrize("module", [fleet, flood, load_test])
+def test_every_command_that_opens_sessions_elsewhere_takes_a_key(module):
+    (option,) = [one for one in typer.main.get_command(command(module.main)).params if one.name == "api_key"]
+    assert option.envvar == API_KEY_VARIABLE
 
 
 async def test_the_key_opens_sessions_and_goes_nowhere_else():

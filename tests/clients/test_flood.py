@@ -33,6 +33,6 @@ def test_what_is_no_refusal_is_told():
 
 def test_bodies_are_announced_as_large_as_a_gateway_reads():
     assert Settings().max_body_bytes == BODY_BYTES
-    heads = requests_of("host", "s", "c")
+    heads = requests_of("http://host", "s", "c")
     assert len(heads) == 10
     assert all(f"Content-Length: {BODY_BYTES}".encode() in head for head in heads)

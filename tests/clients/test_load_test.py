@@ -44,14 +44,14 @@ def test_a_short_run_measures_every_load(tmp_path):
 
 
 def test_refused_frames_count_as_not_answered_in_time():
-    figures = Figures(Load("closed", 1, attacked=False), seconds=2.0)
+    figures = Figures(Load("closed", 1, attacked=False), budget_ms=200.0, seconds=2.0)
     answer = type(
         "Answer",
         (),
         {"sampling_steps": 1, "deadline_met": True, "degraded_by": "deadline", "timings_ms": {"total": 3.0}},
     )()
-    figures.add(answer, 10.0, budget_ms=200.0)
-    figures.add(answer, 300.0, budget_ms=200.0)
+    figures.add(answer, 10.0)
+    figures.add(answer, 300.0)
     figures.errors["GatewayUnavailable"] += 2
     values = figures.as_dict()
     assert values["fps"] == 1.0

@@ -1,3 +1,4 @@
+import time
 from collections.abc import AsyncIterator, Callable, Iterable
 from contextlib import asynccontextmanager
 from dataclasses import dataclass
@@ -9,6 +10,7 @@ from opentelemetry.sdk.trace import TracerProvider
 
 from clients.client import GatewayClient, OpenedSession, VehicleClient
 from robosac import wire
+from robosac.detectors import EmbeddedDetector
 from service.app import create_app
 from service.gateway import Gateway
 from service.settings import Settings
@@ -16,6 +18,27 @@ from service.settings import Settings
 EGO = "car-1"
 TEAM = ("car-2", "car-3", "car-4", "car-5", "rsu")
 MSGPACK = {"Content-Type": "application/vnd.msgpack"}
+
+
+class Hooked(EmbeddedDetector):
+    """The shipped detector in its own place, which calls a test first where the test wants it to."""
+
+    before_info: Callable[[], object] | None = None
+    before_prepare: Callable[..., object] | None = None
+
+    @property
+    def info(self):
+        if self.before_info is not None:
+            self.before_info()
+        return super().info
+
+    def prepare(self, ego, teammates):
+        if self.before_prepare is not None:
+            self.before_prepare(ego, teammates)
+        return super().prepare(ego, teammates)
+
+
+HOOKED = "tests.service.conftest:Hooked"
 
 
 @dataclass
@@ -30,6 +53,10 @@ class Served:
         options.setdefault("gather_ms", 2000)
         options.setdefault("latency_budget_ms", 20_000)
         return await self.client.open_session(EGO, TEAM, **options)
+
+    @property
+    def detector(self) -> Any:
+        return self.gateway.engine.detectors["intersection-mean"]
 
     def ego(self, session: OpenedSession) -> VehicleClient:
         return self.client.vehicle(session.session_id, EGO, session.ego_token)
@@ -50,13 +77,14 @@ async def serve(
     *,
     spans: TracerProvider | None = None,
     api_key: str | None = None,
+    clock: Callable[[], float] = time.time,
     **settings: Any,
 ) -> AsyncIterator[Served]:
     """A gateway, by default on a database in memory; ``seeds`` are those of its frames, one after another, if it is to
     be foreseen.
     """
     settings.setdefault("database_url", "sqlite://")
-    options: dict[str, Any] = {"spans": spans}
+    options: dict[str, Any] = {"spans": spans, "clock": clock}
     if seeds is not None:
         numbers = iter(seeds)
         options["seeds"] = lambda: f"{next(numbers):064x}"
@@ -73,6 +101,12 @@ async def serve(
 @pytest.fixture
 async def served() -> AsyncIterator[Served]:
     async with serve() as served:
+        yield served
+
+
+@pytest.fixture
+async def hooked() -> AsyncIterator[Served]:
+    async with serve(extra_detectors=HOOKED) as served:
         yield served
 
 

@@ -66,15 +66,18 @@ async def test_a_teammate_cannot_pose_as_the_ego(served, session, messages, beni
     await still_serves(served, session, messages, benign, 0)
 
 
-async def test_an_expired_token_is_worth_nothing(served, session, messages, benign, monkeypatch):
-    await still_serves(served, session, messages, benign, 0)
-    token, later = session.teammate_tokens["rsu"], time.time() + 2 * 86_400
-    with monkeypatch.context() as patch:
-        patch.setattr("service.sessions.identity.time.time", lambda: later)
+async def test_an_expired_token_is_worth_nothing(messages, benign):
+    late = [0.0]
+    async with serve(clock=lambda: time.time() + late[0]) as served:
+        session = await served.open(defense=NONE)
+        await still_serves(served, session, messages, benign, 0)
+        late[0] = 2 * 86_400
         body = wire.pack_message(1, "rsu", messages["rsu"])
-        problem(await served.post(session, "messages", body, token), 401, "token-expired")
+        refused = await served.post(session, "messages", body, session.teammate_tokens["rsu"])
+        problem(refused, 401, "token-expired")
         problem(await served.post(session, "frames", wire.pack_frame(1, messages[EGO], benign)), 401, "token-expired")
-    refused = [r for r in await served.ego(session).audit() if r["event"] == "access_refused"]
+        late[0] = 0.0
+        refused = [r for r in await served.ego(session).audit() if r["event"] == "access_refused"]
     assert [(r["vehicle_id"], r["detail"]) for r in refused] == [(v, "the token has expired") for v in ("rsu", EGO)]
 
 

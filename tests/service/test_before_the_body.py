@@ -7,12 +7,14 @@ import threading
 
 import pytest
 from cryptography.hazmat.primitives.asymmetric.ed25519 import Ed25519PrivateKey
+from pydantic import BaseModel, field_validator
+from starlette.requests import Request
 
 from robosac.signatures import show_public_key
-from service import schemas
 from service.app import create_app
 from service.arriving import bodies
-from service.arriving.limits import HEADER_BYTES, HEADERS, TARGET_BYTES, UNREAD_BYTES
+from service.arriving.doors import HEADER_BYTES, HEADERS, TARGET_BYTES
+from service.arriving.limits import UNREAD_BYTES
 from service.settings import Settings
 from tests.service.conftest import problem, serve
 from tests.service.test_identity import ANYBODY, EGO_ONLY, KEY, KEY_HOLDER, OTHER_KEY, RULES, bearer
@@ -133,20 +135,25 @@ async def test_the_largest_honest_requests_are_taken_and_larger_ones_not_read():
             problem(refused, 413, "too-large")
 
 
-@pytest.mark.parametrize(("number", "on_the_loop"), [(2, True), (200, False)])
-async def test_large_json_is_parsed_off_the_event_loop(number, on_the_loop, monkeypatch):
-    threads = set()
+class Noting(BaseModel):
+    """Notes the thread in which it is read."""
 
-    def noting(key, check=schemas.read_public_key):
-        threads.add(threading.current_thread())
-        return check(key)
+    text: str
 
-    monkeypatch.setattr("service.schemas.read_public_key", noting)
-    async with serve(max_teammates=1024) as served:
-        response = await served.http.post("/v1/sessions", json={"ego_id": "a", **enrolment(number)})
-        assert response.status_code == 201
-    assert (threading.current_thread() in threads) is on_the_loop
-    assert len(threads) == 1
+    @field_validator("text")
+    @classmethod
+    def _note(cls, text: str) -> str:
+        return threading.current_thread().name
+
+
+@pytest.mark.parametrize(("length", "on_the_loop"), [(100, True), (bodies.SMALL_BYTES + 1, False)])
+async def test_large_json_is_parsed_off_the_event_loop(length, on_the_loop):
+    async def receive():
+        return {"type": "http.request", "body": json.dumps({"text": "x" * length}).encode()}
+
+    request = Request({"type": "http", "headers": [(b"content-type", b"application/json")]}, receive)
+    parsed = await bodies.read_json(request, Noting)
+    assert (parsed.text == threading.current_thread().name) is on_the_loop
 
 
 @pytest.mark.parametrize("path", ["/v1/sessions", "/v1/sessions/{sid}/teammates"])

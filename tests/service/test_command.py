@@ -1,18 +1,29 @@
-import typer
-import uvicorn
-from typer.testing import CliRunner
+import os
+import re
+import signal
+import subprocess
+import sys
+import time
 
-from service.command import main
+import httpx
 
 
-def test_serve_runs_the_gateway_where_it_is_told(monkeypatch):
-    runs = []
-    monkeypatch.setattr(uvicorn, "run", lambda *given, **options: runs.append((given, options)))
-    command = typer.Typer()
-    command.command()(main)
-    result = CliRunner().invoke(command, ["--host", "0.0.0.0", "--port", "9000"])
-    assert result.exit_code == 0, result.output
-    (((place,), options),) = runs
-    assert place == "service.app:app"
-    assert (options["host"], options["port"]) == ("0.0.0.0", 9000)
-    assert options["timeout_graceful_shutdown"] == 5
+def test_serve_runs_the_gateway_where_it_is_told_until_it_is_terminated(tmp_path):
+    program = "import typer; from service.command import main; typer.run(main)"
+    command = [sys.executable, "-c", program, "--host", "127.0.0.2", "--port", "0"]
+    environment = os.environ | {"ROBOSAC_DATABASE_URL": f"sqlite:///{tmp_path}/robosac.db"}
+    with (tmp_path / "log").open("wb") as log:
+        process = subprocess.Popen(command, env=environment, stdout=log, stderr=log)
+    try:
+        end, found = time.monotonic() + 60, None
+        while found is None:
+            text = (tmp_path / "log").read_text()
+            found = re.search(r"http://127\.0\.0\.2:\d+", text)
+            assert process.poll() is None, text
+            assert time.monotonic() < end, text
+            time.sleep(0.1)
+        assert httpx.get(f"{found[0]}/readyz", trust_env=False).json() == {"status": "ready"}
+    finally:
+        process.send_signal(signal.SIGTERM)
+        assert process.wait(30) in (0, -signal.SIGTERM)
+    assert "gateway stopped" in (tmp_path / "log").read_text()

@@ -1,5 +1,6 @@
 import asyncio
 import json
+import time
 
 import msgpack
 import numpy as np
@@ -176,20 +177,14 @@ async def test_a_refused_message_counts_for_its_own_frame(served, messages):
     assert (await ego.ask(3, messages[EGO])).rejected["rsu"].reason == "missing"
 
 
-async def test_a_message_for_a_session_that_has_ended_is_not_accepted(served, messages, monkeypatch):
-    from service import routes
-
+async def test_a_message_for_a_session_that_ends_meanwhile_is_not_accepted(served, messages):
     session = await served.open()
-    reading = routes.read_bounded
 
-    async def ends_meanwhile(request, limit):
-        if request.url.path.endswith("/messages"):
-            await served.ego(session).close()
-        return await reading(request, limit)
+    async def body():
+        await served.ego(session).close()
+        yield wire.pack_message(0, "rsu", messages["rsu"])
 
-    monkeypatch.setattr(routes, "read_bounded", ends_meanwhile)
-    body = wire.pack_message(0, "rsu", messages["rsu"])
-    problem(await served.post(session, "messages", body, session.teammate_tokens["rsu"]), 404, "unknown-session")
+    problem(await served.post(session, "messages", body(), session.teammate_tokens["rsu"]), 404, "unknown-session")
 
 
 async def test_late_stale_and_second_messages_are_refused_and_named(served, messages):
@@ -242,28 +237,20 @@ async def test_the_budget_counts_from_the_last_byte_not_from_the_fusion(served, 
     assert (result["degraded_by"], result["deadline_met"]) == ("deadline", False)
 
 
-async def test_waiting_for_teammates_costs_nothing(served, messages, monkeypatch):
-    waits = []
-    wait_for = asyncio.wait_for
-
-    async def counted(*arguments):
-        waits.append(1)
-        return await wait_for(*arguments)
-
-    monkeypatch.setattr("service.sessions.gathering.asyncio.wait_for", counted)
+async def test_waiting_for_teammates_costs_nothing(served, messages):
     session = await served.open(gather_ms=5000)
+    await served.teammate(session, "rsu").send(0, messages["rsu"])
     asking = asyncio.create_task(served.ego(session).ask(0, messages[EGO]))
     await asyncio.sleep(0.1)
-    for name in TEAM:
+    before = time.process_time()
+    await asyncio.sleep(0.5)
+    assert time.process_time() - before < 0.25
+    for name in TEAM[:-1]:
         await served.teammate(session, name).send(0, messages[name])
-    answer = await asking
-    assert answer.timings_ms["gather"] < 3000
-    assert len(waits) <= len(TEAM) + 1
+    assert (await asking).timings_ms["gather"] < 3000
 
 
 async def test_the_wait_for_the_detectors_thread_is_measured(served, good_frame):
-    import time
-
     session = await served.open()
     busy = served.gateway.engine._executor.submit(time.sleep, 0.2)
     result = (await served.post(session, "frames", good_frame(0))).json()
@@ -300,19 +287,20 @@ async def test_when_time_is_short_the_ego_answers_alone_and_says_why(served, goo
     assert len(result["boxes"])
 
 
-async def test_a_fault_inside_still_gives_the_ego_its_own_boxes(served, good_frame, monkeypatch, caplog):
+async def test_a_fault_inside_still_gives_the_ego_its_own_boxes(hooked, good_frame, caplog):
     caplog.set_level("CRITICAL")
 
-    def broken(*_):
-        raise RuntimeError("boom")
+    def broken(_, teammates):
+        if teammates:
+            raise RuntimeError("boom")
 
-    monkeypatch.setattr("robosac.fusion.compare", broken)
-    session = await served.open()
-    result = (await served.post(session, "frames", good_frame(0))).json()
+    hooked.detector.before_prepare = broken
+    session = await hooked.open()
+    result = (await hooked.post(session, "frames", good_frame(0))).json()
     assert (result["source"], result["degraded_by"]) == ("ego_only", "fault")
-    assert "boom" in (await served.ego(session).audit())[-1]["fault"]
-    monkeypatch.undo()
-    assert (await served.post(session, "frames", good_frame(1))).json()["source"] == "consensus"
+    assert "boom" in (await hooked.ego(session).audit())[-1]["fault"]
+    hooked.detector.before_prepare = None
+    assert (await hooked.post(session, "frames", good_frame(1))).json()["source"] == "consensus"
 
 
 async def test_an_empty_street_is_no_evidence_and_earns_nobody_trust(served, ego_message):

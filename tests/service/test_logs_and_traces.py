@@ -1,6 +1,6 @@
 import asyncio
+import contextlib
 import gc
-import itertools
 import json
 import logging
 import os
@@ -22,7 +22,7 @@ from opentelemetry.sdk.trace.export.in_memory_span_exporter import InMemorySpanE
 from robosac import wire
 from service.settings import Settings
 from service.watching.tracing import provider_from_environment
-from tests.service.conftest import EGO, problem, serve
+from tests.service.conftest import EGO, HOOKED, problem, serve
 from tests.service.test_identity import bearer
 
 
@@ -64,53 +64,59 @@ KEY, OTHER_KEY, SECRET = "an-api-key-0123456789", "another-key-9876543210", "not
 LOG_BYTES = 10_000
 
 
-async def a_faulty_frame(served, monkeypatch, messages, benign):
+class Seeds:
+    """Seeds that can be foreseen, until drawing one fails."""
+
+    fault: Exception | None = None
+
+    def __iter__(self):
+        return self
+
+    def __next__(self):
+        if self.fault is not None:
+            raise self.fault
+        return SEED
+
+
+SEED = 12345678901234567890123456789
+
+
+async def a_faulty_frame(served, _, messages, benign):
     """A fault inside the detector, whose calls hold messages and the frame's draws."""
 
     def broken(*arguments):
         if arguments[-1]:
             raise ValueError(f"{arguments}") from RuntimeError(arguments)
-        return prepare(*arguments)
 
     session = await served.open(defense={"kind": "none"})
-    detector = served.gateway.engine.detectors["intersection-mean"]
-    prepare = detector.prepare
-    monkeypatch.setattr(detector, "prepare", broken)
+    served.detector.before_prepare = broken
     answer = await served.ego(session).post_frame(0, messages[EGO], benign)
     assert (answer.source, answer.degraded_by) == ("ego_only", "fault")
     return session
 
 
-async def a_faulty_store(served, monkeypatch, messages, benign):
+async def a_faulty_decision(served, seeds, messages, benign):
     """A fault beneath a route, in calls that hold tokens, seeds and tensors."""
     session = await served.open(defense={"kind": "none"})
-
-    def broken(*arguments, **options):
-        raise KeyError(arguments, options, session)
-
-    monkeypatch.setattr(served.gateway.sessions._store, "decide", broken)
+    seeds.fault = KeyError(benign, f"{SEED:064x}", session)
     body = wire.pack_frame(0, messages[EGO], benign)
     problem(await served.post(session, "frames", body), 500, "internal-error")
     return session
 
 
-async def a_faulty_opening(served, monkeypatch, messages, benign):
+async def a_faulty_opening(served, seeds, messages, benign):
     """A fault with the caller's credential in its message, and causes without end."""
     session = await served.open()
-
-    def broken(*arguments):
-        error = RuntimeError(f"{KEY}, {OTHER_KEY}, {SECRET} and {session}" + " and so on" * 10_000)
-        for _ in range(50):
-            error.__cause__, error = RuntimeError(bytes(range(256)) * 10), error.__cause__ or error
-        raise error
-
-    monkeypatch.setattr(served.gateway.opening, "open", broken)
+    error = RuntimeError(f"{KEY}, {OTHER_KEY}, {SECRET} and {session}" + " and so on" * 10_000)
+    for _ in range(50):
+        error.__cause__, error = RuntimeError(bytes(range(256)) * 10), error.__cause__ or error
+    seeds.fault = error
     opening = await served.http.post("/v1/sessions", json={"ego_id": "a", "teammates": []}, headers=bearer(KEY))
     problem(opening, 500, "internal-error")
     return session
 
 
-async def a_faulty_task(served, monkeypatch, messages, benign):
+async def a_faulty_task(served, _, messages, benign):
     """A fault that nobody waits for: asyncio tells of it."""
     session = await served.open()
 
@@ -125,23 +131,23 @@ async def a_faulty_task(served, monkeypatch, messages, benign):
 
 
 @pytest.mark.parametrize("log_format", ["json", "console"])
-@pytest.mark.parametrize("fault", [a_faulty_frame, a_faulty_store, a_faulty_opening, a_faulty_task])
+@pytest.mark.parametrize("fault", [a_faulty_frame, a_faulty_decision, a_faulty_opening, a_faulty_task])
 async def test_a_fault_leaves_no_secret_in_the_log_and_little_of_it(
-    fault, log_format, messages, benign, capsys, monkeypatch, tmp_path
+    fault, log_format, messages, benign, capsys, tmp_path
 ):
     file = tmp_path / "keys"
     file.write_text(OTHER_KEY)
     settings = {"api_keys": KEY, "api_keys_file": file, "token_secrets": SECRET, "log_format": log_format}
-    async with serve(itertools.repeat(12345678901234567890123456789), api_key=KEY, **settings) as served:
+    seeds = Seeds()
+    async with serve(seeds, api_key=KEY, extra_detectors=HOOKED, **settings) as served:
         await served.client.ready()
         capsys.readouterr()
-        session = await fault(served, monkeypatch, messages, benign)
+        session = await fault(served, seeds, messages, benign)
         text = capsys.readouterr().err
     assert "Error" in text
     assert len(text.encode()) < LOG_BYTES
     tokens = [session.ego_token, *session.teammate_tokens.values()]
-    seed = f"{12345678901234567890123456789:064x}"
-    for secret in (KEY, OTHER_KEY, SECRET, seed, "12345678901234567890123456789", *tokens):
+    for secret in (KEY, OTHER_KEY, SECRET, f"{SEED:064x}", str(SEED), *tokens):
         assert secret[8:] not in text
         assert secret.rpartition(".")[2][:20] not in text
     assert not re.search(r"(?:[-+]?\d*\.\d+[\s,\]\[]+){6}", text)
@@ -150,18 +156,18 @@ async def test_a_fault_leaves_no_secret_in_the_log_and_little_of_it(
         assert all("level" in json.loads(line) for line in text.splitlines())
 
 
-async def test_a_fault_is_told_with_the_calls_that_led_to_it(served, monkeypatch, capsys):
+async def test_a_fault_is_told_with_the_calls_that_led_to_it(hooked, capsys):
     def inner(token):
         raise LookupError("what went wrong")
 
-    def outer(*_):
+    def outer():
         try:
             inner("not-for-the-log")
         except LookupError as error:
             raise RuntimeError("what came of it") from error
 
-    monkeypatch.setattr("service.routes.DetectorEntry.of", outer)
-    problem(await served.http.get("/v1/detectors"), 500, "internal-error")
+    hooked.detector.before_info = outer
+    problem(await hooked.http.get("/v1/detectors"), 500, "internal-error")
     (event,) = [json.loads(line) for line in capsys.readouterr().err.splitlines() if "unhandled" in line]
     assert (event["level"], event["path"]) == ("error", "/v1/detectors")
     late, early = event["exception"].split("\nfrom ")
@@ -172,15 +178,13 @@ async def test_a_fault_is_told_with_the_calls_that_led_to_it(served, monkeypatch
     assert "not-for-the-log" not in late.replace('inner("not-for-the-log")', "")
 
 
-async def test_a_database_that_fails_tells_of_no_row(caplog, tmp_path, monkeypatch):
+async def test_a_database_that_fails_tells_of_no_row(caplog, tmp_path):
     async with serve(database_url=f"sqlite:///{tmp_path}/robosac.db") as served:
         session = await served.open()
         token = session.ego_token
-
-        def broken(*_):
-            raise sqlite3.IntegrityError(f"failing row: {token}, {'ab' * 32}")
-
-        monkeypatch.setattr("service.keeping.sql_store.seal", broken)
+        with contextlib.closing(sqlite3.connect(tmp_path / "robosac.db")) as database:
+            fail = f"SELECT RAISE(ABORT, 'failing row: {token}, {'ab' * 32}')"
+            database.execute(f"CREATE TRIGGER refusing BEFORE INSERT ON audit_lines BEGIN {fail}; END")
         path = f"/v1/sessions/{session.session_id}/token"
         problem(await served.http.post(path, headers=bearer(token)), 503, "store-unavailable")
     (record,) = [r for r in caplog.records if "database failed" in r.getMessage()]
@@ -191,10 +195,12 @@ async def test_a_database_that_fails_tells_of_no_row(caplog, tmp_path, monkeypat
 
 FAULTY = """
 from service.app import create_app
-app = create_app()
-def broken(*arguments, **options):
+drawn = iter(["ab" * 32])
+def seed():
+    for one in drawn:
+        return one
     raise RuntimeError("broken")
-app.state.gateway.sessions.describe = broken
+app = create_app(seeds=seed)
 """
 
 
@@ -217,8 +223,8 @@ def test_a_running_gateway_writes_no_more_either(tmp_path):
                 time.sleep(0.1)
             opened = http.post("/v1/sessions", json={"ego_id": "a", "teammates": ["b"]}, headers=bearer(KEY)).json()
             before = (tmp_path / "log").stat().st_size
-            path = f"/v1/sessions/{opened['session_id']}"
-            problem(http.get(path, headers=bearer(opened["ego_token"])), 500, "internal-error")
+            again = http.post("/v1/sessions", json={"ego_id": "a", "teammates": ["b"]}, headers=bearer(KEY))
+            problem(again, 500, "internal-error")
     finally:
         process.terminate()
         process.wait(30)

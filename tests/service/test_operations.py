@@ -70,14 +70,14 @@ async def test_the_api_describes_itself(served):
     assert (await served.http.get("/docs")).status_code == 200
 
 
-async def test_an_error_nobody_foresaw_is_a_problem_without_its_inside(served, monkeypatch, caplog):
+async def test_an_error_nobody_foresaw_is_a_problem_without_its_inside(hooked, caplog):
     caplog.set_level("CRITICAL")
 
-    def broken(*_):
+    def broken():
         raise RuntimeError("secret")
 
-    monkeypatch.setattr("service.routes.DetectorEntry.of", broken)
-    response = await served.http.get("/v1/detectors")
+    hooked.detector.before_info = broken
+    response = await hooked.http.get("/v1/detectors")
     problem(response, 500, "internal-error")
     assert "secret" not in response.text
 

@@ -5,7 +5,7 @@ import pytest
 
 from robosac import wire
 from service.deciding.admission import SESSION_FRAMES, Admission
-from service.problems import Problem
+from service.errors import Kind, Refused
 from tests.service.conftest import EGO, problem, serve
 
 
@@ -21,11 +21,11 @@ def test_frames_are_admitted_as_long_as_they_can_be_answered_in_time():
             block.__enter__()
             taken.append(block)
 
-    with pytest.raises(Problem) as refused:
+    with pytest.raises(Refused) as refused:
         take_on_until_refused()
     assert 9 <= len(taken) <= 10  # 0.5 x 200 ms / 10 ms
-    assert (refused.value.status, refused.value.slug) == (503, "overloaded")
-    assert int(refused.value.headers["Retry-After"]) >= 1
+    assert refused.value.kind is Kind.OVERLOADED
+    assert refused.value.retry_after_s >= 1
     with admission.frame("more time", 20.0):
         pass
     taken.pop().__exit__(None, None, None)
@@ -47,7 +47,7 @@ def test_a_frame_that_cannot_be_in_time_anyway_is_admitted_if_nothing_else_is_in
     admission = Admission()
     for number in range(200):
         admission.learn(2.0 * number, 2.0 * number + 1.0, 0.001)
-    with admission.frame("slow", 0.1), pytest.raises(Problem):
+    with admission.frame("slow", 0.1), pytest.raises(Refused):
         admission.check("other", 0.1)
 
 

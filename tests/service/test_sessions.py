@@ -141,16 +141,14 @@ async def test_the_number_of_sessions_is_bounded():
         await served.open()
 
 
-async def test_a_session_does_not_expire_under_a_waiting_ego(monkeypatch, messages):
-    monkeypatch.setattr("service.sessions.sessions.SWEEP_EVERY_S", 0.02)
+async def test_a_session_does_not_expire_under_a_waiting_ego(messages):
     async with serve(session_idle_s=0.1) as served:
         session = await served.open(gather_ms=500)
         answer = await served.ego(session).ask(0, messages["car-1"])
         assert answer.source == "ego_only"
 
 
-async def test_idle_sessions_expire(monkeypatch):
-    monkeypatch.setattr("service.sessions.sessions.SWEEP_EVERY_S", 0.02)
+async def test_idle_sessions_expire():
     async with serve(session_idle_s=0.3) as served:
         idle, busy = await served.open(), await served.open()
         import asyncio

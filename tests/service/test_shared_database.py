@@ -1,5 +1,6 @@
 """Gateways that come after one another, or run side by side, on one database."""
 
+import asyncio
 import contextlib
 import dataclasses
 import shutil
@@ -12,7 +13,7 @@ from clients.errors import AccessDenied, FrameConflict, SessionNotFound
 from robosac import wire
 from robosac.detectors.base import calibration_beside
 from robosac.detectors.embedded import SHIPPED_WEIGHTS, EmbeddedDetector
-from tests.service.conftest import EGO, TEAM, problem, serve
+from tests.service.conftest import EGO, HOOKED, TEAM, problem, serve
 
 
 @pytest.fixture
@@ -22,7 +23,8 @@ def url(tmp_path):
 
 @pytest.fixture
 async def two(url):
-    async with serve(database_url=url) as one, serve(database_url=url) as other:
+    hooked = {"database_url": url, "extra_detectors": HOOKED}
+    async with serve(**hooked) as one, serve(**hooked) as other:
         yield one, other
 
 
@@ -79,33 +81,31 @@ async def test_who_left_at_one_gateway_is_a_stranger_at_the_other(two, messages,
 
 
 @contextlib.contextmanager
-def meanwhile(served, monkeypatch, *happenings):
-    """Let something happen at each of the next fusions, once it is done but before the decision is kept."""
-    decide, left = served.gateway.engine.decide, list(happenings)
+def meanwhile(served, *happenings):
+    """Let something happen in each of the next fusions, before the decision is kept."""
+    loop, left = asyncio.get_running_loop(), list(happenings)
 
-    async def interrupted(*arguments, **options):
-        outcome = await decide(*arguments, **options)
+    def interrupted(*_):
         if left:
-            await left.pop(0)()
-        return outcome
+            asyncio.run_coroutine_threadsafe(left.pop(0)(), loop).result()
 
-    monkeypatch.setattr(served.gateway.engine, "decide", interrupted)
+    served.detector.before_prepare = interrupted
     yield
     assert not left
 
 
-async def test_a_decision_is_worked_out_again_if_the_team_changed_elsewhere(two, messages, benign, monkeypatch):
+async def test_a_decision_is_worked_out_again_if_the_team_changed_elsewhere(two, messages, benign):
     one, other = two
     session = await one.open(defense={"kind": "none"})
     ego = other.ego(session)
-    with meanwhile(other, monkeypatch, lambda: one.ego(session).dismiss("rsu")):
+    with meanwhile(other, lambda: one.ego(session).dismiss("rsu")):
         answer = await ego.post_frame(0, messages[EGO], benign)
     assert answer.accepted == TEAM[:-1]
     records = await ego.audit()
     assert [record["event"] for record in records] == ["session_opened", "team_changed", "frame_answered"]
 
 
-async def test_a_decision_that_is_worked_out_again_forgets_nothing(two, messages, benign, monkeypatch):
+async def test_a_decision_that_is_worked_out_again_forgets_nothing(two, messages, benign):
     one, other = two
     session = await one.open(defense={"kind": "none"}, gather_ms=20)
     liar, rsu, path = (
@@ -119,7 +119,7 @@ async def test_a_decision_that_is_worked_out_again_forgets_nothing(two, messages
     for _ in range(20):
         problem(await other.post(session, "messages", b"", session.teammate_tokens["rsu"]), 400, "malformed-msgpack")
         problem(await other.http.get(path), 401, "unauthenticated")
-    with meanwhile(other, monkeypatch, lambda: one.ego(session).dismiss("car-5")):
+    with meanwhile(other, lambda: one.ego(session).dismiss("car-5")):
         answer = await other.ego(session).ask(0, messages[EGO])
     reasons = {name: entry.reason for name, entry in answer.rejected.items()}
     assert reasons == {"car-2": "distrusted", "car-3": "missing", "car-4": "missing", "rsu": "malformed"}
@@ -129,11 +129,11 @@ async def test_a_decision_that_is_worked_out_again_forgets_nothing(two, messages
     assert (await one.ego(session).audit())[-1]["unlogged_refusals"] == {}
 
 
-async def test_a_frame_that_is_decided_elsewhere_meanwhile_is_stale(two, messages, benign, monkeypatch):
+async def test_a_frame_that_is_decided_elsewhere_meanwhile_is_stale(two, messages, benign):
     one, other = two
     session = await one.open()
     with (
-        meanwhile(other, monkeypatch, lambda: one.ego(session).post_frame(0, messages[EGO], benign)),
+        meanwhile(other, lambda: one.ego(session).post_frame(0, messages[EGO], benign)),
         pytest.raises(FrameConflict),
     ):
         await other.ego(session).post_frame(0, messages[EGO], benign)
@@ -144,11 +144,11 @@ async def test_a_frame_that_is_decided_elsewhere_meanwhile_is_stale(two, message
     assert second["seed"] not in seeds
 
 
-async def test_a_session_that_keeps_changing_is_a_conflict(two, messages, benign, monkeypatch):
+async def test_a_session_that_keeps_changing_is_a_conflict(two, messages, benign):
     one, other = two
     session = await one.open(defense={"kind": "none"})
     changes = [lambda name=name: one.ego(session).dismiss(name) for name in TEAM[:3]]
-    with meanwhile(other, monkeypatch, *changes), pytest.raises(FrameConflict, match="session-changed"):
+    with meanwhile(other, *changes), pytest.raises(FrameConflict, match="session-changed"):
         await other.ego(session).post_frame(0, messages[EGO], benign)
     remaining = {name: benign[name] for name in TEAM[3:]}
     assert (await other.ego(session).post_frame(0, messages[EGO], remaining)).accepted == TEAM[3:]
@@ -165,20 +165,16 @@ async def test_a_session_that_ended_at_one_gateway_is_over_at_the_other(two, mes
     assert (await other.ego(session).audit())[-1]["event"] == "session_ended"
 
 
-async def test_teams_that_change_at_both_gateways_at_once(two, monkeypatch):
+async def test_teams_that_change_at_both_gateways_at_once(two):
     one, other = two
     session = await one.open(defense={"kind": "none"})
-    store = other.gateway.sessions._store
-    change_team = store.change_team
-
-    async def late(*arguments):
+    await other.ego(session).state()
+    async with other.gateway.sessions._live[session.session_id].lock:
+        dismissing = asyncio.create_task(other.ego(session).dismiss("car-2"))
+        await asyncio.sleep(0.2)  # it knows the session by now, and waits for the lock
         await one.ego(session).dismiss("rsu")
-        await change_team(*arguments)
-
-    monkeypatch.setattr(store, "change_team", late)
     with pytest.raises(FrameConflict, match="session-changed"):
-        await other.ego(session).dismiss("car-2")
-    monkeypatch.undo()
+        await dismissing
     await other.ego(session).dismiss("car-2")
     assert (await one.ego(session).state())["teammates"] == ["car-3", "car-4", "car-5"]
 

@@ -10,13 +10,14 @@ from collections.abc import AsyncIterator, Iterator
 from dataclasses import dataclass
 from itertools import count
 from pathlib import Path
+from types import SimpleNamespace
 
 import asyncpg
 import pytest
 
 from robosac.audit import GENESIS, digest
-from service.keeping.sql_store import SqlStore
-from service.keeping.store import SessionRecord
+from service.keeping.record import SessionRecord
+from service.keeping.store import Store
 
 NUMBERS = count()
 
@@ -105,8 +106,8 @@ async def shared_url(request: pytest.FixtureRequest, tmp_path: Path) -> str:
 
 
 @contextlib.asynccontextmanager
-async def opened(url: str) -> AsyncIterator[SqlStore]:
-    store = SqlStore(url)
+async def opened(url: str) -> AsyncIterator[Store]:
+    store = Store(url)
     try:
         await store.start()
         yield store
@@ -115,9 +116,29 @@ async def opened(url: str) -> AsyncIterator[SqlStore]:
 
 
 @pytest.fixture
-async def store(url: str) -> AsyncIterator[SqlStore]:
+async def store(url: str) -> AsyncIterator[Store]:
     async with opened(url) as store:
         yield store
+
+
+class Event(SimpleNamespace):
+    """What a store asks of an event: its JSON, and the fields that it keeps beside the log."""
+
+    def as_json(self) -> dict[str, object]:
+        return dict(vars(self))
+
+
+def note(**fields: object) -> Event:
+    return Event(**{"event": "note", **fields})
+
+
+def a_decision(frame: int = 1, **state: object) -> Event:
+    return Event(event="frame_answered", frame=frame, state=state)
+
+
+A_TOKEN = Event(event="token_renewed", vehicle_id="a")
+A_TEAM = Event(event="team_changed", teammates=("a",), public_keys={}, state={"trusted": []})
+THE_END = Event(event="session_ended", time="2025-01-01T01:00:00Z")
 
 
 def a_session(number: int = 0, **changes: object) -> SessionRecord:
@@ -132,18 +153,17 @@ def a_session(number: int = 0, **changes: object) -> SessionRecord:
     return SessionRecord(**{**values, **changes})
 
 
-async def added(store: SqlStore, number: int = 0, **changes: object) -> str:
+async def added(store: Store, number: int = 0, **changes: object) -> str:
     record = a_session(number, **changes)
-    await store.create(record, {"event": "session_opened"})
+    await store.create(record, Event(event="session_opened"))
     return record.session_id
 
 
-async def decided(store: SqlStore, sid: str, frame: int, **state: object) -> None:
-    record = await store.get(sid)
-    await store.decide(sid, record.revision, frame, state, f"{frame:064x}", {"event": "frame", "frame": frame})
+async def decided(store: Store, sid: str, frame: int, **state: object) -> None:
+    await store.decide(await store.get(sid), a_decision(frame, **state), f"{frame:064x}")
 
 
-async def check_chain(store: SqlStore, sid: str) -> list[str]:
+async def check_chain(store: Store, sid: str) -> list[str]:
     """The log, whose chain ends at the session's head."""
     lines, before = await store.audit(sid, 0), GENESIS
     for seq, line in enumerate(lines, 1):

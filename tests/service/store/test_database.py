@@ -19,13 +19,13 @@ from alembic.util import CommandError
 from sqlalchemy import text
 
 from clients.errors import SessionNotFound
+from service.errors import StoreUnavailable
 from service.keeping import migrations
 from service.keeping.database import _keep_a_journal, connect
-from service.keeping.sql_store import SqlStore
-from service.keeping.store import StoreUnavailable
+from service.keeping.store import Store
 from service.keeping.tables import metadata
 from tests.service.conftest import problem, serve
-from tests.service.store.conftest import added, all_of, check_chain, opened
+from tests.service.store.conftest import added, all_of, check_chain, note, opened
 
 INI = Path(migrations.__file__).parent / "alembic.ini"
 
@@ -56,7 +56,7 @@ def test_the_latest_step_is_the_one_that_is_looked_for():
 
 
 async def test_several_stores_may_start_at_once_on_an_empty_database(shared_url):
-    stores = [SqlStore(shared_url) for _ in range(6)]
+    stores = [Store(shared_url) for _ in range(6)]
     assert set(await all_of(*(store.start() for store in stores))) == {None}
     sid = await added(stores[0])
     assert (await stores[5].get(sid)).session_id == sid
@@ -71,7 +71,7 @@ async def test_a_database_of_a_later_version_is_refused(shared_url):
         await database.write(
             lambda connection: connection.execute(text("UPDATE alembic_version SET version_num = '9'"))
         )
-    store = SqlStore(shared_url)
+    store = Store(shared_url)
     with pytest.raises(CommandError, match="9"):
         await store.start()
     await store.close()
@@ -131,12 +131,12 @@ async def test_the_file_is_locked_as_long_as_it_is_open(tmp_path):
             assert is_held(path)
             sid = await added(store, number)
             await asyncio.gather(*(store.get(sid) for _ in range(20)))  # each reader opens the file
-            await asyncio.gather(*(store.log(sid, {"event": "note"}) for _ in range(20)))
+            await asyncio.gather(*(store.log(sid, note()) for _ in range(20)))
             assert is_held(path)
             for threads in (store._database._writer, store._database._readers):
                 threads.engine.dispose()  # as after a fault: all connections are opened again
             await store.get(sid)
-            await store.log(sid, {"event": "note"})
+            await store.log(sid, note())
             assert is_held(path)
             async with opened(f"sqlite:///{path}") as second:
                 await second.get(sid)
@@ -153,7 +153,7 @@ async def test_what_another_process_reads_costs_no_decision(tmp_path):
         reads = "import sqlite3, sys; sqlite3.connect(sys.argv[1]).execute('SELECT * FROM sessions').fetchall()"
         subprocess.run([sys.executable, "-c", reads, str(path)], check=True)
         for _ in range(3):
-            await store.log(sid, {"event": "note"})
+            await store.log(sid, note())
         for suffix in ("", "-wal"):  # what a kill would leave
             subprocess.run(["cp", f"{path}{suffix}", f"{copy}{suffix}"], check=True)
     with contextlib.closing(sqlite3.connect(copy)) as connection:
@@ -179,19 +179,16 @@ def test_other_urls_are_refused_without_showing_them(url):
 
 async def test_a_database_that_is_not_there_is_unavailable(tmp_path):
     for url in (f"sqlite:///{tmp_path}/no/such/folder/x.db", f"postgresql://nobody@/x?host={tmp_path}"):
-        store = SqlStore(url)
+        store = Store(url)
         for call in (store.start(), store.count(), store.get("0" * 32)):
             with pytest.raises(StoreUnavailable):
                 await call
         await store.close()
 
 
-async def test_while_another_process_holds_the_file_nothing_is_acknowledged_and_then_it_goes_on(
-    tmp_path, monkeypatch, good_frame
-):
-    monkeypatch.setattr("service.keeping.database.BUSY_TIMEOUT_S", 0.05)
+async def test_while_another_process_holds_the_file_nothing_is_acknowledged_and_then_it_goes_on(tmp_path, good_frame):
     path = tmp_path / "robosac.db"
-    async with serve(database_url=f"sqlite:///{path}") as served:
+    async with serve(database_url=f"sqlite:///{path}?timeout=0.05") as served:
         session = await served.open()
         assert (await served.post(session, "frames", good_frame(0))).status_code == 200
         with contextlib.closing(sqlite3.connect(path, isolation_level=None)) as other:
@@ -228,28 +225,28 @@ async def test_a_gateway_serves_from_each_database(shared_url, good_frame):
 async def test_a_server_that_goes_away_and_comes_back(postgres):
     async with opened(await postgres.new_database()) as store:
         sid = await added(store)
-        assert set(await all_of(*(store.log(sid, {"event": "note"}) for _ in range(10)))) == {None}
+        assert set(await all_of(*(store.log(sid, note()) for _ in range(10)))) == {None}
         postgres.stop()
         try:
-            failed = await all_of(*(store.log(sid, {"event": "lost"}) for _ in range(5)), store.get(sid))
+            failed = await all_of(*(store.log(sid, note()) for _ in range(5)), store.get(sid))
         finally:
             postgres.start()
         assert {type(outcome) for outcome in failed} == {StoreUnavailable}
         for _ in range(30):  # connections that broke are found out one by one
             with contextlib.suppress(StoreUnavailable):
-                await store.log(sid, {"event": "again"})
+                await store.log(sid, note(event="again"))
                 break
         assert "again" in (await check_chain(store, sid))[-1]
 
 
 async def test_a_write_goes_on_when_who_asked_has_gone(store):
     sid = await added(store)
-    asking = asyncio.create_task(store.log(sid, {"event": "note"}))
+    asking = asyncio.create_task(store.log(sid, note()))
     await asyncio.sleep(0)
     asking.cancel()
     with pytest.raises(asyncio.CancelledError):
         await asking
-    await store.log(sid, {"event": "note"})
+    await store.log(sid, note())
     assert len(await check_chain(store, sid)) in (2, 3)
 
 

@@ -8,15 +8,28 @@ import pytest
 import rfc8785
 from sqlalchemy import text
 
-from service.keeping.store import FrameDecided, SessionChanged, SessionOver
-from tests.service.store.conftest import a_session, added, all_of, check_chain, decided, opened
+from service.errors import FrameDecided, SessionChanged, SessionOver
+from service.keeping.store import Store
+from tests.service.store.conftest import (
+    A_TEAM,
+    A_TOKEN,
+    THE_END,
+    a_decision,
+    a_session,
+    added,
+    all_of,
+    check_chain,
+    decided,
+    note,
+    opened,
+)
 
 LATER = time.time() + 3600
 
 
 async def test_a_session_comes_back_as_it_was_kept(store):
     record = a_session()
-    await store.create(record, {"event": "session_opened", "note": "first"})
+    await store.create(record, note(note="first"))
     kept = await store.get(record.session_id)
     (line,) = await check_chain(store, record.session_id)
     assert json.loads(line)["note"] == "first"
@@ -34,7 +47,7 @@ async def test_a_session_that_is_not_there(store, sid):
 
 async def test_a_decision_changes_state_seed_frame_and_log_together(store):
     sid = await added(store)
-    await store.decide(sid, 0, 2**53 - 1, {"trusted": ["b"]}, "cd" * 32, {"event": "frame"}, b"\x00messages\xff")
+    await store.decide(a_session(), a_decision(2**53 - 1, trusted=["b"]), "cd" * 32, b"\x00messages\xff")
     kept = await store.get(sid)
     assert (kept.last_frame, kept.frames_answered, kept.state) == (2**53 - 1, 1, {"trusted": ["b"]})
     assert (kept.seed, kept.revision) == ("cd" * 32, 1)
@@ -55,7 +68,7 @@ async def test_a_frame_is_decided_once_and_frames_increase(store):
 
 async def test_of_decisions_at_once_one_is_kept(store):
     sid = await added(store)
-    calls = [store.decide(sid, 0, frame, {}, f"{frame:064x}", {"event": "frame"}) for frame in (7, 7, 7, 8, 9)]
+    calls = [store.decide(a_session(), a_decision(frame), f"{frame:064x}") for frame in (7, 7, 7, 8, 9)]
     outcomes = await all_of(*calls)
     assert sum(outcome is None for outcome in outcomes) == 1
     assert {type(outcome) for outcome in outcomes if outcome} <= {FrameDecided, SessionChanged}
@@ -66,9 +79,9 @@ async def test_of_decisions_at_once_one_is_kept(store):
 async def test_fifty_logs_at_once_make_one_chain(store):
     sid, other = await added(store), await added(store, 1)
     outcomes = await all_of(
-        *(store.log(sid, {"event": "note", "n": n}) for n in range(50)),
+        *(store.log(sid, note(n=n)) for n in range(50)),
         decided(store, sid, 3),
-        *(store.log(other, {"event": "note", "n": n}) for n in range(5)),
+        *(store.log(other, note(n=n)) for n in range(5)),
     )
     assert set(outcomes) == {None}
     lines = [json.loads(line) for line in await check_chain(store, sid)]
@@ -83,58 +96,58 @@ async def test_an_exception_inside_a_transaction_leaves_nothing(store):
     sid = await added(store)
     before, lines = await store.get(sid), await store.audit(sid, 0)
     outcomes = await all_of(
-        store.decide(sid, 0, 1, {}, "ef" * 32, {"event": "frame"}, "no bytes"),
-        store.decide(sid, 0, 1, {"bad": object()}, "ef" * 32, {"event": "frame"}),
-        store.log(sid, {"event": "note", "value": float("nan")}),
+        store.decide(a_session(), a_decision(), "ef" * 32, "no bytes"),
+        store.decide(a_session(), a_decision(bad=object()), "ef" * 32),
+        store.log(sid, note(value=float("nan"))),
     )
     assert all(isinstance(outcome, Exception) for outcome in outcomes)
     assert await store.get(sid) == before
     assert await store.audit(sid, 0) == lines
     with pytest.raises(rfc8785.FloatDomainError):
-        await store.create(a_session(1), {"value": float("nan")})
+        await store.create(a_session(1), note(value=float("nan")))
     assert await store.get(a_session(1).session_id) is None
 
 
 async def test_what_fails_takes_nothing_else_with_it(store):
     sid = await added(store)
-    bad = {"event": "note", "value": float("inf")}
-    outcomes = await all_of(*(store.log(sid, bad if n % 3 == 0 else {"event": "note"}) for n in range(30)))
+    bad = note(value=float("inf"))
+    outcomes = await all_of(*(store.log(sid, bad if n % 3 == 0 else note()) for n in range(30)))
     assert [isinstance(outcome, Exception) for outcome in outcomes] == [n % 3 == 0 for n in range(30)]
     assert len(await check_chain(store, sid)) == 1 + 20
 
 
 async def test_a_change_worked_out_from_an_older_session_is_refused(store):
     sid = await added(store)
-    await store.log(sid, {"event": "note"})
+    await store.log(sid, note())
     assert (await store.get(sid)).revision == 0
-    await store.renew_token(sid, "a", "t9", {"event": "token"})
-    team = (("a",), {"ego": "t0", "a": "t1"}, {}, {"trusted": []}, {"event": "team"})
-    for change in (store.decide(sid, 0, 1, {}, "00" * 32, {"event": "frame"}), store.change_team(sid, 0, *team)):
+    await store.renew_token(sid, "t9", A_TOKEN)
+    before, tokens = a_session(), {"ego": "t0", "a": "t1"}
+    for change in (store.decide(before, a_decision(), "00" * 32), store.change_team(before, A_TEAM, tokens)):
         with pytest.raises(SessionChanged):
             await change
-    await store.change_team(sid, 1, *team)
+    await store.change_team(a_session(revision=1), A_TEAM, tokens)
     kept = await store.get(sid)
-    assert (kept.teammates, kept.token_ids, kept.public_keys) == (("a",), {"ego": "t0", "a": "t1"}, {})
+    assert (kept.teammates, kept.token_ids, kept.public_keys) == (("a",), tokens, {})
     assert kept.state == {"trusted": []}
     assert len(await check_chain(store, sid)) == 4
 
 
 async def test_one_token_is_renewed_and_the_others_stay(store):
     sid = await added(store)
-    await store.renew_token(sid, "a", "new", {"event": "token"})
+    await store.renew_token(sid, "new", A_TOKEN)
     assert (await store.get(sid)).token_ids == {"ego": "t0", "a": "new", "b": "t2"}
 
 
 async def test_nothing_is_added_to_a_session_that_is_over(store):
     sid = await added(store)
-    await store.end(sid, "2025-01-01T01:00:00Z", {"event": "session_ended"})
-    for session_id in (sid, "f" * 32):
+    await store.end(sid, THE_END)
+    for record in (await store.get(sid), a_session(99)):
         calls = (
-            store.decide(session_id, 1, 1, {}, "00" * 32, {"event": "frame"}),
-            store.log(session_id, {"event": "note"}),
-            store.renew_token(session_id, "a", "t", {"event": "token"}),
-            store.change_team(session_id, 1, ("a",), {}, {}, {}, {"event": "team"}),
-            store.end(session_id, "later", {"event": "session_ended"}),
+            store.decide(record, a_decision(), "00" * 32),
+            store.log(record.session_id, note()),
+            store.renew_token(record.session_id, "t", A_TOKEN),
+            store.change_team(record, A_TEAM, {}),
+            store.end(record.session_id, THE_END),
         )
         for call in calls:
             with pytest.raises(SessionOver):
@@ -146,9 +159,9 @@ async def test_nothing_is_added_to_a_session_that_is_over(store):
 
 async def test_old_messages_are_forgotten(store):
     sid, other = await added(store), await added(store, 1)
-    for session_id in (sid, other):
+    for number in range(2):
         for frame in range(4):
-            await store.decide(session_id, frame, frame, {}, "00" * 32, {"event": "frame"}, bytes([frame]))
+            await store.decide(a_session(number, revision=frame), a_decision(frame), "00" * 32, bytes([frame]))
     await store.forget_messages(sid, 2)
     assert [await store.messages(sid, frame) for frame in range(4)] == [None, None, b"\x02", b"\x03"]
     assert await store.messages(other, 0) == b"\x00"
@@ -156,8 +169,8 @@ async def test_old_messages_are_forgotten(store):
 
 async def test_idle_sessions_are_found_and_only_ended_ones_are_purged(store):
     idle, ended = await added(store), await added(store, 1)
-    await store.decide(ended, 0, 0, {}, "00" * 32, {"event": "frame"}, b"kept")
-    await store.end(ended, "2025-01-01T01:00:00Z", {"event": "session_ended"})
+    await store.decide(a_session(1), a_decision(0), "00" * 32, b"kept")
+    await store.end(ended, THE_END)
     assert await store.unused_since(LATER) == [idle]
     assert await store.unused_since(time.time() - 60) == []
     await store.purge(time.time() - 60)
@@ -193,9 +206,9 @@ async def test_two_stores_on_one_database_never_fork_a_chain_or_decide_twice(sha
     async with opened(shared_url) as one, opened(shared_url) as two:
         sid = await added(one)
         assert (await two.get(sid)).revision == 0
-        outcomes = await all_of(*(store.log(sid, {"event": "note"}) for _ in range(15) for store in (one, two)))
+        outcomes = await all_of(*(store.log(sid, note()) for _ in range(15) for store in (one, two)))
         assert set(outcomes) == {None}
-        calls = [store.decide(sid, 0, 1, {}, "00" * 32, {"event": "frame"}) for store in (one, two)]
+        calls = [store.decide(a_session(), a_decision(), "00" * 32) for store in (one, two)]
         assert sum(outcome is None for outcome in await all_of(*calls)) == 1
         assert len(await check_chain(one, sid)) == len(await check_chain(two, sid)) == 32
 
@@ -203,24 +216,26 @@ async def test_two_stores_on_one_database_never_fork_a_chain_or_decide_twice(sha
 async def test_a_store_learns_of_a_conflict_what_the_other_did(shared_url):
     async with opened(shared_url) as one, opened(shared_url) as two:
         sid = await added(one)
-        await two.renew_token(sid, "a", "t9", {"event": "token"})
+        await two.renew_token(sid, "t9", A_TOKEN)
         assert one.seen(sid).revision == 0
         with pytest.raises(SessionChanged):
-            await one.decide(sid, 0, 1, {}, "00" * 32, {"event": "frame"})
+            await one.decide(a_session(), a_decision(), "00" * 32)
         assert one.seen(sid) == await two.get(sid)
 
 
-async def test_many_sessions_are_remembered_but_not_all(store, monkeypatch):
-    monkeypatch.setattr("service.keeping.sql_store.REMEMBERED", 3)
+async def test_many_sessions_are_remembered_but_not_all():
+    store = Store("sqlite://", remembered=3)
+    await store.start()
     sids = [await added(store, number) for number in range(5)]
     assert [store.seen(sid) is None for sid in sids] == [True, True, False, False, False]
     assert (await store.get(sids[0])).session_id == sids[0]
+    await store.close()
 
 
 async def test_the_database_is_right_even_where_it_lost_what_was_written(store):
     """As a standby may have that is promoted."""
     sid = await added(store)
-    await store.renew_token(sid, "a", "t9", {"event": "token"})
+    await store.renew_token(sid, "t9", A_TOKEN)
     undone = text("UPDATE sessions SET revision = 0, audit_seq = 1")
     await store._database.write(lambda connection: connection.execute(undone))
     assert (await store.get(sid)).revision == 0

@@ -1,0 +1,102 @@
+"""What the trials of a gateway share: options, folders, a gateway to try, how a trial ends, tables and percentiles."""
+
+from __future__ import annotations
+
+import asyncio
+import json
+import sys
+import tempfile
+from collections.abc import AsyncIterator, Coroutine, Sequence
+from contextlib import AsyncExitStack, asynccontextmanager
+from pathlib import Path
+from typing import Annotated, Any, TypeVar
+
+import numpy as np
+import typer
+from rich.box import SIMPLE_HEAD
+from rich.console import Console
+from rich.table import Table
+
+from clients.client import API_KEY_VARIABLE, GatewayClient
+from clients.errors import GatewayError
+from clients.local_gateway import local_gateway
+from robosac.extras import MissingExtra
+from robosac.figures import need_figures
+
+T = TypeVar("T")
+
+Url = Annotated[str | None, typer.Option(help="The gateway; by default one is started for the test.")]
+ApiKey = Annotated[
+    str | None, typer.Option(envvar=API_KEY_VARIABLE, help="Opens sessions, where the gateway asks for one.")
+]
+Seconds = Annotated[float, typer.Option(min=0.5, help="Length of each part.")]
+Budget = Annotated[float, typer.Option(min=1, help="Latency budget.")]
+Out = Annotated[Path | None, typer.Option(help="Folder for the report, a JSON file.")]
+
+
+def make_folder(path: Path | None, option: str, *, for_pictures: bool = False) -> None:
+    """Make an output folder, where one is wanted, before any work is done; a bad one is the option's fault.
+
+    Ends the program where pictures are wanted and none can be drawn.
+    """
+    if path is None:
+        return
+    try:
+        if for_pictures:
+            need_figures()
+        path.mkdir(parents=True, exist_ok=True)
+    except MissingExtra as missing:
+        sys.exit(f"Error: {missing}")
+    except OSError as error:
+        raise typer.BadParameter(str(error), param_hint=option) from error
+
+
+@asynccontextmanager
+async def gateway_to_try(
+    url: str | None, api_key: str | None = None, own_key: str | None = None
+) -> AsyncIterator[tuple[str, GatewayClient]]:
+    """A gateway's URL and a client of it; without a URL one is started for the block, which asks for ``own_key``."""
+    async with AsyncExitStack() as stack:
+        if url is None:
+            folder, api_key = Path(stack.enter_context(tempfile.TemporaryDirectory())), own_key
+            url = await stack.enter_async_context(local_gateway(folder / "gateway.log", own_key))
+        yield url, await stack.enter_async_context(GatewayClient(url, api_key))
+
+
+def run(trial: Coroutine[Any, Any, T], console: Console, what: str, *others: type[Exception]) -> T:
+    """The outcome of a trial; ends the program where the gateway, whoever waits, or another such error ends it."""
+    failures: tuple[type[Exception], ...] = (GatewayError, OSError, *others)
+    try:
+        return asyncio.run(trial)
+    except asyncio.CancelledError:
+        console.print(f"[red]{what} was ended.[/red]")
+        sys.exit(143)
+    except failures as error:
+        console.print(f"[red]{what} stopped:[/red] {error}")
+        sys.exit(1)
+
+
+def write(report: Any, out: Path | None, name: str, console: Console) -> None:
+    """Write a report to a folder, where one is given, and say so."""
+    if out is not None:
+        (out / name).write_text(json.dumps(report, indent=2) + "\n")
+        console.print(f"Written: {out / name}")
+
+
+def percentiles(values: Sequence[float]) -> dict[str, float | None]:
+    """Of figures that were measured: the median, 95 % and 99 %; None without any."""
+    found = np.percentile(values, [50, 95, 99]).tolist() if values else [None] * 3
+    return dict(zip(("p50", "p95", "p99"), found, strict=True))
+
+
+def shown(value: float | None, digits: int) -> str:
+    """A figure for a table; a dash without one."""
+    return "-" if value is None else f"{value:.{digits}f}"
+
+
+def a_table(title: str, columns: Sequence[str]) -> Table:
+    """An empty table with words on the left and figures beside them."""
+    table = Table(title=title, title_justify="left", box=SIMPLE_HEAD, padding=(0, 0, 0, 1))
+    for number, heading in enumerate(columns):
+        table.add_column(heading, justify="right" if number else "left", no_wrap=not number)
+    return table
