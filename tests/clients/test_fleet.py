@@ -96,7 +96,7 @@ def test_a_fleet_without_a_gateway_says_so():
 
 @pytest.mark.parametrize(
     ("option", "complaint"),
-    [("--attack", "known: pgd"), ("--detector", "give one of"), ("--defense", "give one of a2cp, ")],
+    [("--attack", "give one of bim"), ("--detector", "give one of"), ("--defense", "give one of a2cp, ")],
 )
 def test_an_unknown_attack_detector_or_defence_is_explained(option, complaint):
     result = CliRunner().invoke(command(main), [option, "nonesuch"])
