@@ -115,13 +115,15 @@ def evaluate_bounds(
     """
     ratio = attackers / TEAM_SIZE if attackers else ASSUMED_RATIO
     samplers = {
-        f"Algorithm 1, N = {n}": SampleConsensus(ratio, sampling_budget=n, collaborators=collaborators, distinct=False)
+        f"Algorithm 1, N = {n}": SampleConsensus.independent(
+            attacker_ratio=ratio, sampling_budget=n, collaborators=collaborators
+        )
         for n in budgets
     }
     samplers[f"no subset twice, N = {budgets[0]}"] = SampleConsensus(
-        ratio, sampling_budget=budgets[0], collaborators=collaborators
+        attacker_ratio=ratio, sampling_budget=budgets[0], collaborators=collaborators
     )
-    samplers["gateway default"] = SampleConsensus(ratio)
+    samplers["gateway default"] = SampleConsensus(attacker_ratio=ratio)
     table = _Table(detector, collaborators, samplers, repeats)
     for index, frame in enumerate(frames):
         table.add(frame, [seed, 1, index])  # each row has the same luck, whatever else is evaluated

@@ -8,7 +8,8 @@ import numpy as np
 
 from robosac.boxes import FloatArray, IntArray
 from robosac.defenses.group_testing.choice import HARM, gain
-from robosac.defenses.group_testing.posterior import EXACT, BoolArray, Posterior
+from robosac.defenses.group_testing.distribution import BoolArray
+from robosac.defenses.group_testing.posterior import EXACT, Posterior
 
 SUSPECTS_AT_ONCE = 4
 """Most unresolved teammates in a test of a larger team."""

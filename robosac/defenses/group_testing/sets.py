@@ -163,18 +163,6 @@ def awakened(table: FloatArray, team: int, hijack: float, attacker_prior: float)
     return after
 
 
-def packed(sizes: Sequence[int], room: int) -> list[list[int]]:
-    """Items in bins, first fit by decreasing size: their indices, bin by bin."""
-    bins: list[list[int]] = []
-    for item in sorted(range(len(sizes)), key=lambda i: -sizes[i]):
-        fit = next((b for b in bins if sum(sizes[i] for i in b) + sizes[item] <= room), None)
-        if fit is None:
-            bins.append([item])
-        else:
-            fit.append(item)
-    return bins
-
-
 def products_but(each: FloatArray) -> FloatArray:
     """For each factor (n, ...), the product of all others."""
     before, after = np.ones((2, *each.shape))
@@ -185,8 +173,9 @@ def products_but(each: FloatArray) -> FloatArray:
 
 
 def short(values: FloatArray) -> list[list[float]]:
-    """Where it is not 0, and how much: seven decimals. What is less likely is as likely as what the next frame's
-    hazards let happen.
+    """The places of the values (n,) that are not 0 to seven decimals, and those values so rounded.
+
+    Nothing is lost by it: in the next frame the hazards make more likely than that what is rounded away.
     """
     rounded = values.round(7)
     where = np.flatnonzero(rounded)
@@ -194,7 +183,7 @@ def short(values: FloatArray) -> list[list[float]]:
 
 
 def long(kept: Sequence[Sequence[float]], size: int) -> FloatArray:
-    """What `short` made of an array of this size."""
+    """The array (size,) that `short` was given, but for its rounding."""
     values = np.zeros(size)
     values[np.asarray(kept[0], dtype=np.int64)] = kept[1]
     return values

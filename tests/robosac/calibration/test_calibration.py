@@ -11,8 +11,7 @@ from robosac.calibration import Recipe, calibration_of
 from robosac.calibration.making import check
 from robosac.calibration.verdicts import Verdicts, complementary, validation_stretches
 from robosac.cli import app
-from robosac.defenses import GroupTesting
-from robosac.defenses.group_testing import Calibration, CalibrationError
+from robosac.defenses.group_testing import Calibration, CalibrationError, GroupTestingSettings
 from robosac.detectors import DetectorInfo
 from robosac.detectors.embedded import SHIPPED_WEIGHTS, EmbeddedDetector
 from robosac.evaluation.encounters import LiveFrame
@@ -126,7 +125,7 @@ def test_the_shipped_detector_is_calibrated(detector):
 
 
 def test_the_shipped_detector_finds_an_attacker(detector, ego_message, attacked):
-    defense = GroupTesting.calibrated(calibration_of(detector.info))
+    defense = GroupTestingSettings().build(calibration_of(detector.info))
     frame = LiveFrame(detector, EvaluationFrame(ego_message, {}, attacked, frozenset({"car-2"}), np.empty((0, 5))))
     results = [answer.result for answer in play(defense, [frame] * 3, np.random.default_rng(0))]
     assert all("car-2" not in r.accepted for r in results)
