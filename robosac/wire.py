@@ -132,7 +132,7 @@ def unpack(body: bytes, *, trusted: bool = False) -> Any:
     Raises
     ------
     WireError
-        ``malformed-msgpack`` if the body is cut off, has bytes left over, or holds what msgpack or the limits do not allow.
+        ``malformed-msgpack``: it is cut off, has bytes left over, or holds what msgpack or the limits do not allow.
     """
     limit = len(body)
     entries = 0

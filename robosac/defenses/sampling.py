@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Iterator, Sequence
+from collections.abc import Sequence
 from math import comb
 from typing import Annotated, Any, Self
 
@@ -115,7 +115,13 @@ def search(
     tuple of str
         The subset in consensus; empty if there is none.
     """
-    for subset in _draws(team, *plan, rng, distinct=distinct):
+    (s, left), seen = plan, set[Hypothesis]()
+    while left > 0:
+        subset = draw(team, s, rng)
+        if distinct and subset in seen:  # so that large teams cost no memory
+            continue
+        seen.add(subset)
+        left -= 1
         tested = yield [subset]
         outcomes.extend(tested)
         if not tested:
@@ -128,16 +134,3 @@ def search(
 def draw(team: Sequence[str], s: int, rng: np.random.Generator) -> Hypothesis:
     """A random subset of size ``s``, in team order."""
     return tuple(team[i] for i in np.sort(rng.choice(len(team), s, replace=False)))
-
-
-def _draws(team: Sequence[str], s: int, n: int, rng: np.random.Generator, *, distinct: bool) -> Iterator[Hypothesis]:
-    """``n`` random subsets; distinct ones by rejection, so that large teams cost no memory."""
-    seen: set[Hypothesis] = set()
-    drawn = 0
-    while drawn < n:
-        subset = draw(team, s, rng)
-        if distinct and subset in seen:
-            continue
-        seen.add(subset)
-        drawn += 1
-        yield subset

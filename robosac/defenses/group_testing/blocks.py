@@ -4,13 +4,13 @@ from __future__ import annotations
 
 from collections.abc import Sequence
 from dataclasses import dataclass
-from functools import reduce
+from functools import cached_property, reduce
 
 from robosac.boxes import FloatArray
 from robosac.defenses.group_testing import sets
 
 
-@dataclass(eq=False)
+@dataclass(frozen=True, eq=False)
 class Block:
     """Teammates whose states are held together.
 
@@ -19,13 +19,15 @@ class Block:
     names : sequence of str
     table : (1 + K, 3 ** n) ndarray
         Probability of their states (see `sets`), given each kind of attack; "nobody attacks" is the first.
-    below : (1 + K, 3 ** n) ndarray or None
-        `sets.at_most` of the table, once somebody has asked for it.
     """
 
     names: Sequence[str]
     table: FloatArray
-    below: FloatArray | None = None
+
+    @cached_property
+    def below(self) -> FloatArray:
+        """Probability (1 + K, 3 ** n), given the kind, that no state is above given ones."""
+        return sets.at_most(self.table)
 
     def __len__(self) -> int:
         return len(self.names)

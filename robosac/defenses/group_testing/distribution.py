@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Iterable, Sequence
+from collections.abc import Sequence
 from typing import Any
 
 import numpy as np
@@ -62,7 +62,7 @@ class Distribution:
     def clean_within(self, block: int) -> FloatArray:
         """Probability (2 ** n,) that nobody of each subset of a block attacks, by its mask there."""
         codes = sets.codes(len(self._blocks[block]))
-        clean: FloatArray = self._weights @ self._below()[block][:, 2 * codes[-1] - codes]
+        clean: FloatArray = self._weights @ self._blocks[block].below[:, 2 * codes[-1] - codes]
         return clean
 
     def masks(self, subsets: BoolArray) -> IntArray:
@@ -112,27 +112,10 @@ class Distribution:
         """
         of_a, of_d = 2 - np.array(limits).T[:, :, None]
         product = np.ones((1 + self._kinds, len(limits), a.shape[1]))
-        below = self._below()
         for b in np.flatnonzero((a | d).any(axis=1)).tolist():
             codes = sets.codes(len(self._blocks[b]))
-            product *= below[b].take(2 * codes[-1] - of_a * codes[a[b]] - of_d * codes[d[b]], axis=1)
+            product *= self._blocks[b].below.take(2 * codes[-1] - of_a * codes[a[b]] - of_d * codes[d[b]], axis=1)
         return product
-
-    def _below(self) -> list[FloatArray]:
-        """For each block and kind, the probability that no state is above given ones."""
-        stale = [b for b, block in enumerate(self._blocks) if block.below is None]
-        for alike in self._by_size(stale):
-            below = sets.at_most(np.concatenate([self._blocks[b].table for b in alike]))
-            for b, table in zip(alike, np.split(below, len(alike)), strict=True):
-                self._blocks[b].below = table
-        return [block.below for block in self._blocks if block.below is not None]
-
-    def _by_size(self, of: Iterable[int]) -> list[list[int]]:
-        """Blocks of one size together, which is faster than each by itself."""
-        alike: dict[int, list[int]] = {}
-        for b in of:
-            alike.setdefault(len(self._blocks[b]), []).append(b)
-        return list(alike.values())
 
     def _hold(self, weights: FloatArray, team: Sequence[Block]) -> None:
         """Stand for this from now on."""

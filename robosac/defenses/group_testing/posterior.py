@@ -123,12 +123,11 @@ class Posterior(Distribution):
         """For each touched block (number, mask of a, mask of d), the likelihood (1 + K, 9) by the levels in it alone,
         expected over what the other blocks hold.
         """
-        below = self._below()
         each = np.empty((len(touched), *by_level.shape))
         for known, (b, a, d) in zip(each, touched, strict=True):
             codes = sets.codes(len(self._blocks[b]))
             limits = 2 * codes[-1] - (2 - _LEVELS[:, None]) * codes[a] - (2 - _LEVELS) * codes[d]
-            below[b].take(limits, axis=1, out=known)
+            self._blocks[b].below.take(limits, axis=1, out=known)
         chance = sets.products_but(each)
         chance[..., 1:, :] -= chance[..., :-1, :].copy()
         chance[..., 1:] -= chance[..., :-1].copy()
@@ -138,15 +137,11 @@ class Posterior(Distribution):
 
     def step(self, hazards: Hazards) -> None:
         """Go to the next frame: teammates are hijacked or recover, and the kind of attack may change."""
-        h, r = hazards.hijack, hazards.recovery
-        kernel = sets.transition(h, r)
+        kernel = sets.transition(hazards.hijack, hazards.recovery)
         team = len(self.members)
         awakened, after = self._parted()
-        for alike in self._by_size(range(len(self._blocks))):
-            attacked = sets.through(np.concatenate([after[b] for b in alike]), kernel)
-            benign = sets.awakened(np.concatenate([awakened[b] for b in alike]), team, h, self._attacker_prior)
-            for i, (b, table) in enumerate(zip(alike, np.split(attacked, len(alike)), strict=True)):
-                after[b], awakened[b] = table, benign[i : i + 1]
+        after = [sets.through(table, kernel) for table in after]
+        awakened = [sets.awakened(table, team, hazards.hijack, self._attacker_prior) for table in awakened]
         self._mix(after, awakened)
         change = hazards.change if self._kinds > 1 else 0.0
         attacked = self._weights[1:]
