@@ -57,8 +57,17 @@ def remembered(
 
 
 def trusted_in(state: State) -> tuple[str, ...]:
-    """The trust list of a state; empty where the defence keeps none."""
-    return tuple(state.get("trusted", ()))
+    """The trust list of a state; empty where the defence keeps none.
+
+    Raises
+    ------
+    ValueError
+        If there are no names where it should be, as only a damaged log can have it.
+    """
+    trusted = state.get("trusted", ())
+    if not (isinstance(trusted, list | tuple) and all(isinstance(name, str) for name in trusted)):
+        raise ValueError("trusted must hold names")
+    return tuple(trusted)
 
 
 def named_in(state: State) -> tuple[str, ...] | None:
