@@ -67,8 +67,7 @@ class Conformal(Memoryless):
         """Conformal p-values (n,) of single teammates with these Jaccard indices (n,)."""
         known = np.sort(self.calibration if self.calibration is not None else SINGLE_TEAMMATE)
         as_bad = np.searchsorted(known, jaccard_indices, side="right")
-        p: FloatArray = (1.0 + as_bad) / (1.0 + len(known))
-        return p
+        return (1.0 + as_bad) / (1.0 + len(known))
 
 
 def discoveries(p_values: FloatArray, rate: float) -> np.ndarray[tuple[int], np.dtype[np.bool_]]:

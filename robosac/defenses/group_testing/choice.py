@@ -27,15 +27,13 @@ UNDILUTED_SIZE = 8
 
 def gain(sizes: FloatArray | IntArray) -> FloatArray:
     """What the answer of so many benign messages is worth above the ego's own."""
-    worth: FloatArray = GAIN * (1.0 - np.exp(-np.asarray(sizes, dtype=np.float64) / GAIN_SCALE))
-    return worth
+    return GAIN * (1.0 - np.exp(-np.asarray(sizes, dtype=np.float64) / GAIN_SCALE))
 
 
 def utility(posterior: Posterior, subsets: BoolArray) -> FloatArray:
     """``U(m) = P(m clean) G(|m|) - (1 - P(m clean)) HARM`` of each subset (n,); the ego's own answer has 0."""
     clean = posterior.unattacked(posterior.masks(subsets))
-    worth: FloatArray = clean * gain(subsets.sum(axis=1)) - (1.0 - clean) * HARM
-    return worth
+    return clean * gain(subsets.sum(axis=1)) - (1.0 - clean) * HARM
 
 
 def expected_information(known: Knowledge, subsets: BoolArray, decoded: BoolArray, *, ego_sees: bool) -> FloatArray:
@@ -95,5 +93,4 @@ def dilution(sizes: IntArray) -> FloatArray:
     """What evidence of subsets of these sizes (n,) is worth: among more than were calibrated, an attacker is one voice
     among more, and shows less.
     """
-    worth: FloatArray = np.minimum(1.0, UNDILUTED_SIZE / sizes)
-    return worth
+    return np.minimum(1.0, UNDILUTED_SIZE / sizes)

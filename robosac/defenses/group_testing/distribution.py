@@ -62,8 +62,7 @@ class Distribution:
     def clean_within(self, block: int) -> FloatArray:
         """Probability (2 ** n,) that nobody of each subset of a block attacks, by its mask there."""
         codes = sets.codes(len(self._blocks[block]))
-        clean: FloatArray = self._weights @ self._blocks[block].below[:, 2 * codes[-1] - codes]
-        return clean
+        return self._weights @ self._blocks[block].below[:, 2 * codes[-1] - codes]
 
     def masks(self, subsets: BoolArray) -> IntArray:
         """Subsets (n, S), in the order of `members`, as masks (B, n): block by block, bit by bit."""
@@ -72,8 +71,7 @@ class Distribution:
             place = np.arange(starts[-1])[:, None] - starts[:-1]
             inside = (place >= 0) & (place < np.diff(starts))
             self._powers = np.where(inside, 2.0**place, 0.0)
-        masks: IntArray = (subsets.astype(np.float64) @ self._powers).astype(np.int64).T
-        return masks
+        return (subsets.astype(np.float64) @ self._powers).astype(np.int64).T
 
     def rows(self, which: IntArray, masks: IntArray) -> BoolArray:
         """Subsets (n, S), each within one block: which block (n,), and its mask there (n,)."""
@@ -85,8 +83,7 @@ class Distribution:
 
     def unattacked(self, masks: IntArray) -> FloatArray:
         """Probability (n,) that nobody of each subset attacks."""
-        chance: FloatArray = self._weights @ self._at_most(masks, np.zeros_like(masks), ((BENIGN, ATTACKS),))[:, 0]
-        return chance
+        return self._weights @ self._at_most(masks, np.zeros_like(masks), ((BENIGN, ATTACKS),))[:, 0]
 
     def cells(self, a: IntArray, d: IntArray) -> FloatArray:
         """Joint probabilities (n, CLEAN + 3 K) of what pairs of disjoint subsets hold, by rows of an `EvidenceModel`.

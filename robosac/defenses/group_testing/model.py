@@ -133,16 +133,14 @@ class EvidenceModel:
 
     def tables(self, a: IntArray, d: IntArray) -> FloatArray:
         """Tables (n, CLEAN + 3 K, BINS) for pairs of these sizes (n,) and (n,); d at least 1."""
-        tables: FloatArray = self._by_size[size_row(a, d)]
-        return tables
+        return self._by_size[size_row(a, d)]
 
     def change(self, size: int, boxes: int, changes: int) -> FloatArray:
         """Likelihoods (CLEAN + 3 K,), by the rows of `pairs`, of so many changes in a fusion of this many teammates in
         which there are so many boxes. The teammates are d; nobody is in a.
         """
         table = self.changes[:, min(size, CHANGE_SIZES) - 1, crowd_bin(boxes), change_bin(changes)]
-        likelihood: FloatArray = np.concatenate([np.repeat(table[:1], CLEAN), np.repeat(table[1:], CELLS)])
-        return likelihood
+        return np.concatenate([np.repeat(table[:1], CLEAN), np.repeat(table[1:], CELLS)])
 
     def change_information(self, sizes: IntArray, boxes: IntArray, cells: FloatArray) -> FloatArray:
         """Bits (n,) that fusions of so many teammates (n,) promise about who attacks, by what changed since the frame
