@@ -10,7 +10,7 @@ from __future__ import annotations
 import json
 import time
 from collections.abc import Iterator, Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from typing import Annotated
 
 import numpy as np
@@ -20,9 +20,10 @@ import typer
 from robosac import attacks
 from robosac.answers import Verdict
 from robosac.calibration import calibration_of
-from robosac.defenses import GroupTesting, Outcome
-from robosac.defenses.group_testing import frame as judging
+from robosac.defenses import Outcome
+from robosac.defenses.group_testing import GroupTestingSettings
 from robosac.defenses.group_testing import model as likelihoods
+from robosac.defenses.group_testing.evidence import Evidence
 from robosac.defenses.group_testing.geometry import PairMeasure
 from robosac.detectors import Detector, load
 from robosac.evaluation.average_precision import AveragePrecision
@@ -37,6 +38,7 @@ CHANGES = (0, *likelihoods.CHANGE_EDGES)
 SHOWN = np.tile([0.0, 0.0, 0.0, 0.9], (28, 1))
 POSE = np.eye(4)
 EGO = "car-1"
+DRAWN = ("measure", "followed", "changes")
 
 
 class _Subset(np.ndarray):  # boxes that only say whose they are
@@ -62,6 +64,10 @@ class World:
         agrees = self.attackers.isdisjoint(subset) or self.model.kinds[self.kind] != "pgd"
         index, verdict = (0.5, Verdict.CONSENSUS) if agrees else (0.1, Verdict.DISSENSUS)
         return Outcome(subset, index, verdict, boxes, REFERENCE, POSE, frame)
+
+    def evidence(self) -> type[Evidence]:
+        """Evidence that is drawn here instead of measured."""
+        return type("Drawn", (Evidence,), {name: staticmethod(getattr(self, name)) for name in DRAWN})
 
     def measure(self, smaller: _Subset, larger: _Subset) -> PairMeasure:
         a, d = smaller.members, larger.members - smaller.members
@@ -102,16 +108,14 @@ def main(
 
 def draw(teammates: int, attackers: int, kind: str, runs: int, frames: int) -> None:
     """Outcomes drawn from the likelihoods."""
-    defense = GroupTesting.calibrated(calibration_of(load().info))
+    calibrated = GroupTestingSettings().build(calibration_of(load().info))
     team = [f"v{i:03d}" for i in range(teammates)]
     rng = np.random.default_rng(0)
     until_named, seconds, passes, honest, sizes = [], [], [], set(), []
     for run in range(runs):
         bad = frozenset(str(name) for name in rng.choice(team, attackers, replace=False))
-        world = World(defense.model, bad, defense.model.kinds.index(kind), rng)
-        judging.measure = world.measure  # type: ignore[assignment]
-        judging.followed = world.followed  # type: ignore[assignment]
-        judging.changes = world.changes  # type: ignore[assignment]
+        world = World(calibrated.model, bad, calibrated.model.kinds.index(kind), rng)
+        defense = replace(calibrated, evidence=world.evidence())
         state, spent, done = defense.initial_state(team), 0, None
         for frame in range(frames):
             before, deciding, tested = spent, 0.0, None
@@ -145,7 +149,7 @@ def play_scenes(teammates: int, attackers: int, kind: str, frames: int, sequence
     """
     torch.set_num_threads(1)
     detector = load()
-    defense = GroupTesting.calibrated(calibration_of(detector.info))
+    defense = GroupTestingSettings().build(calibration_of(detector.info))
     ours, oracle, undefended = AveragePrecision(), AveragePrecision(), AveragePrecision()
     until_named, passes, infiltrated, honest = [], [], [], 0
     for seed in TEST_SEEDS[:sequences]:

@@ -14,6 +14,11 @@ import numpy as np
 FloatArray = np.ndarray[tuple[Any, ...], np.dtype[np.floating[Any]]]
 IntArray = np.ndarray[tuple[Any, ...], np.dtype[np.int64]]
 
+RIGID_TOLERANCE = 1e-3
+MIN_UPRIGHT = 0.5
+"""Cosine of the largest tilt of a sensor; views from above mean nothing beyond it."""
+MAX_TRANSLATION_M = 1e8
+"""Farther than any earth-fixed frame needs; beyond it single precision would lose the warp."""
 _UNIT_CORNERS = np.array([[0.5, 0.5], [-0.5, 0.5], [-0.5, -0.5], [0.5, -0.5]])
 _NMS_BLOCK = 64
 
@@ -22,6 +27,21 @@ def pose_matrix(x: float, y: float, z: float, yaw: float) -> FloatArray:
     """The rigid transform ``world_from_sensor`` (4, 4) of a sensor at (x, y, z) metres, turned by yaw about z."""
     c, s = np.cos(yaw), np.sin(yaw)
     return np.array([[c, -s, 0.0, x], [s, c, 0.0, y], [0.0, 0.0, 1.0, z], [0.0, 0.0, 0.0, 1.0]])
+
+
+def pose_fault(pose: FloatArray) -> str | None:
+    """Why a matrix (4, 4) of finite numbers can be no sensor's pose; None if it can."""
+    rotation = pose[:3, :3]
+    rigid = (np.abs(rotation) <= 1 + RIGID_TOLERANCE).all() and np.allclose(
+        rotation @ rotation.T, np.eye(3), atol=RIGID_TOLERANCE
+    )
+    if not rigid or np.linalg.det(rotation) < 0 or not np.allclose(pose[3], (0, 0, 0, 1), atol=1e-9):
+        return "must be a rigid transform: a rotation, a translation, last row 0 0 0 1"
+    if rotation[2, 2] < MIN_UPRIGHT:
+        return "must be upright: the sensor's z axis within 60 degrees of the world's"
+    if np.abs(pose[:3, 3]).max() > MAX_TRANSLATION_M:
+        return f"must lie within {MAX_TRANSLATION_M:g} m of the world's origin"
+    return None
 
 
 def from_world(boxes: FloatArray, pose: FloatArray) -> FloatArray:

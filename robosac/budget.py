@@ -1,10 +1,18 @@
 """How many hypotheses to test, and how many collaborators can be had for that.
 
-Notation of the paper (*Among Us: Adversarially Robust Collaborative Perception by Consensus*, ICCV 2023): team size S
-(teammates without the ego), attackers A, attacker ratio eta = A / S, collaborators s in a hypothesis, sampling budget
-N, confidence p. The paper's Eq. 1 and Eq. 2 treat the members of a hypothesis as drawn independently; in truth they are
-drawn without replacement, and the exact law is hypergeometric. Both are here: `eq1_collaborators` and `eq2_budget` are
-the paper's, `exact_collaborators` and `exact_budget` what the gateway uses.
+The paper's Eq. 1 and Eq. 2 (*Among Us: Adversarially Robust Collaborative Perception by Consensus*, ICCV 2023) treat
+the members of a hypothesis as drawn independently. In truth they are drawn without replacement, and the exact law is
+hypergeometric. Both are here: `eq1_collaborators` and `eq2_budget` are the paper's, `exact_budget` and
+`exact_collaborators` what the gateway uses. All take these arguments, and raise `DomainError` if one is out of range:
+
+========================  ==========================================================  =========================
+``team_size``             S, teammates without the ego                                S >= 1
+``attackers``             A, of them                                                  0 <= A <= S
+``attacker_ratio``        eta = A / S                                                 0 < eta < 1
+``collaborators``         s, members of a hypothesis                                  1 <= s, and s <= S if known
+``sampling_budget``       N, hypotheses                                               N >= 1
+``confidence``            p, chance that one of the hypotheses has no attacker        0 < p < 1
+========================  ==========================================================  =========================
 """
 
 from __future__ import annotations
@@ -25,26 +33,10 @@ class DomainError(ValueError):
 def eq1_collaborators(sampling_budget: int, attacker_ratio: float, confidence: float = DEFAULT_CONFIDENCE) -> int:
     """The paper's Eq. 1: ``floor(ln(1 - (1-p)^(1/N)) / ln(1-eta))``, collaborators guaranteed by a budget.
 
-    Parameters
-    ----------
-    sampling_budget : int
-        N >= 1.
-    attacker_ratio : float
-        0 < eta < 1.
-    confidence : float
-        0 < p < 1.
-
-    Returns
-    -------
-    int
-        s >= 0; not bounded by a team size, which the formula does not know.
-
-    Raises
-    ------
-    DomainError
-        If an argument is outside its range, or too close to its ends for floating point.
+    At least 0, and not bounded by a team size, which the formula does not know. `DomainError` also if the arguments are
+    too close to the ends of their ranges for floating point.
     """
-    _check_budget(sampling_budget)
+    _check_at_least_one("sampling_budget", sampling_budget)
     _check_open_unit("attacker_ratio", attacker_ratio)
     _check_open_unit("confidence", confidence)
     clean_needed = -math.expm1(math.log1p(-confidence) / sampling_budget)
@@ -57,42 +49,17 @@ def eq1_collaborators(sampling_budget: int, attacker_ratio: float, confidence: f
 def eq2_budget(collaborators: int, attacker_ratio: float, confidence: float = DEFAULT_CONFIDENCE) -> int:
     """The paper's Eq. 2: ``ceil(ln(1-p) / ln(1 - (1-eta)^s))``, hypotheses needed for s collaborators.
 
-    Parameters
-    ----------
-    collaborators : int
-        s >= 1.
-    attacker_ratio : float
-        0 < eta < 1.
-    confidence : float
-        0 < p < 1.
-
-    Returns
-    -------
-    int
-        N >= 1.
-
-    Raises
-    ------
-    DomainError
-        If an argument is outside its range, or so many collaborators are asked for that N is not a finite number.
+    At least 1. `DomainError` also if so many collaborators are asked for that N is not a finite number.
     """
-    if collaborators < 1:
-        raise DomainError(f"collaborators must be at least 1, got {collaborators}")
+    _check_at_least_one("collaborators", collaborators)
     _check_open_unit("attacker_ratio", attacker_ratio)
     _check_open_unit("confidence", confidence)
     return _trials((1.0 - attacker_ratio) ** collaborators, confidence)
 
 
 def attackers_in_team(team_size: int, attacker_ratio: float) -> int:
-    """Attackers that a ratio means for a team: eta * S, rounded up, so that a fraction of an attacker counts as one.
-
-    Raises
-    ------
-    DomainError
-        If the team is empty or the ratio is not in [0, 1].
-    """
-    if team_size < 1:
-        raise DomainError(f"team_size must be at least 1, got {team_size}")
+    """Attackers that a ratio, here in [0, 1], means for a team: eta * S, rounded up."""
+    _check_at_least_one("team_size", team_size)
     if not 0.0 <= attacker_ratio <= 1.0:
         raise DomainError(f"attacker_ratio must be in [0, 1], got {attacker_ratio}")
     return math.ceil(attacker_ratio * team_size - _ROUNDING)
@@ -101,20 +68,7 @@ def attackers_in_team(team_size: int, attacker_ratio: float) -> int:
 def clean_probability(team_size: int, attackers: int, collaborators: int) -> float:
     """Chance that a random hypothesis holds no attacker: ``q = C(S-A, s) / C(S, s)``.
 
-    Parameters
-    ----------
-    team_size, attackers, collaborators : int
-        S >= 1, 0 <= A <= S, 1 <= s <= S.
-
-    Returns
-    -------
-    float
-        In [0, 1]; 0 if more collaborators are asked for than benign teammates exist.
-
-    Raises
-    ------
-    DomainError
-        If an argument is outside its range.
+    0 if more collaborators are asked for than benign teammates exist.
     """
     total, clean = _hypotheses(team_size, attackers, collaborators)
     return clean / total
@@ -130,27 +84,14 @@ def exact_budget(
 ) -> int:
     """Hypotheses needed to meet an attacker-free one with a given confidence.
 
-    Parameters
-    ----------
-    team_size, attackers, collaborators : int
-        S >= 1, 0 <= A <= S, 1 <= s <= S - A.
-    confidence : float
-        0 < p < 1.
-    distinct : bool, default True
-        Whether no hypothesis is tried twice. Then the first n tries all fail with probability ``C(D, n) / C(T, n)``,
-        where T hypotheses exist and D of them hold an attacker, and D + 1 tries always suffice. Otherwise tries are
-        independent: ``ceil(ln(1-p) / ln(1-q))``.
+    If none is tried twice (``distinct``), the first n tries all fail with probability ``C(D, n) / C(T, n)``, where T
+    hypotheses exist and D of them hold an attacker; D + 1 tries always suffice. Otherwise tries are independent:
+    ``ceil(ln(1-p) / ln(1-q))``.
 
-    Returns
-    -------
-    int
-        N >= 1; the least that suffices, except for distinct hypotheses when there are more than 100,000 of them: then
-        it is the smaller of two bounds that always suffice, the independent one and ``T (1 - (1-p)^(1/(T-D)))``.
+    The answer is the least that suffices, at least 1, but for distinct hypotheses when there are more than 100,000 of
+    them: then it is the smaller of two bounds that always suffice, the independent one and ``T (1 - (1-p)^(1/(T-D)))``.
 
-    Raises
-    ------
-    DomainError
-        If an argument is outside its range, or no attacker-free hypothesis exists.
+    `DomainError` also if no attacker-free hypothesis exists.
     """
     _check_open_unit("confidence", confidence)
     total, clean = _hypotheses(team_size, attackers, collaborators)
@@ -179,14 +120,8 @@ def exact_collaborators(
     *,
     distinct: bool = True,
 ) -> int:
-    """Most collaborators for which a budget suffices by `exact_budget`; 0 if it does not suffice for one.
-
-    Raises
-    ------
-    DomainError
-        If an argument is outside its range.
-    """
-    _check_budget(sampling_budget)
+    """Most collaborators for which a budget suffices by `exact_budget`; 0 if it does not suffice for one."""
+    _check_at_least_one("sampling_budget", sampling_budget)
     _check_team(team_size, attackers, 1)
     for s in range(team_size - attackers, 0, -1):
         total, clean = _hypotheses(team_size, attackers, s)
@@ -215,9 +150,9 @@ def _trials(success: float, confidence: float) -> int:
         raise DomainError("the chance of an attacker-free hypothesis is too small for any budget") from error
 
 
-def _check_budget(sampling_budget: int) -> None:
-    if sampling_budget < 1:
-        raise DomainError(f"sampling_budget must be at least 1, got {sampling_budget}")
+def _check_at_least_one(name: str, value: int) -> None:
+    if value < 1:
+        raise DomainError(f"{name} must be at least 1, got {value}")
 
 
 def _check_open_unit(name: str, value: float) -> None:
@@ -226,8 +161,7 @@ def _check_open_unit(name: str, value: float) -> None:
 
 
 def _check_team(team_size: int, attackers: int, collaborators: int) -> None:
-    if team_size < 1:
-        raise DomainError(f"team_size must be at least 1, got {team_size}")
+    _check_at_least_one("team_size", team_size)
     if not 0 <= attackers <= team_size:
         raise DomainError(f"attackers must be between 0 and the team size {team_size}, got {attackers}")
     if not 1 <= collaborators <= team_size:

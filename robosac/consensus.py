@@ -33,8 +33,7 @@ class Comparison:
 
 def at_least(boxes: FloatArray, score: float) -> FloatArray:
     """Boxes (n, 6) with this score or more: those that take part in the test."""
-    confident: FloatArray = boxes[boxes[:, 5] >= score]
-    return confident
+    return boxes[boxes[:, 5] >= score]
 
 
 def match(reference: FloatArray, candidate: FloatArray, iou_threshold: float = MATCH_IOU) -> tuple[IntArray, IntArray]:

@@ -9,7 +9,7 @@ from __future__ import annotations
 import logging
 from collections.abc import Iterator, Mapping, Sequence
 from contextlib import contextmanager
-from dataclasses import dataclass, field
+from dataclasses import dataclass, field, fields
 
 import numpy as np
 import rfc8785
@@ -26,7 +26,6 @@ from robosac.defenses import (
     Reference,
     Rejection,
     State,
-    named_in,
     shipped,
     trusted_in,
 )
@@ -41,23 +40,16 @@ class UnverifiedAnswer(Exception):
     """A defence tried to answer with, or to trust, teammates that were not in consensus, or left one unexplained."""
 
 
-@dataclass(frozen=True)
-class FusionResult:
-    """The answer to one frame.
+@dataclass(frozen=True, kw_only=True)
+class FusionResult(Decision):
+    """The answer to one frame: what the defence decided, and what came of it.
 
     Attributes
     ----------
     boxes : (n, 6) float64 ndarray
         x, y, length, width, yaw, score; ego frame, best first.
-    source : Source
-    accepted : tuple of str
-        Teammates whose messages are in the boxes.
-    rejected : mapping of teammate id to Rejection
-        Every other teammate of the frame.
     hypotheses : tuple of Outcome
         In the order tested.
-    attacker_ratio : float or None
-        As the defence assumed or estimated it.
     deadline_met : bool
         Whether the answer was ready in time.
     out_of_time : bool
@@ -66,37 +58,22 @@ class FusionResult:
         What went wrong inside (`robosac.faults.describe`), if anything; the boxes are then the ego's own.
     timings_ms : mapping of stage to float
         ``prepare``, ``ego_only``, ``hypotheses`` (decoding), ``consensus`` (matching).
-    state : mapping
-        The defence's state for the next frame.
     previous : PreviousAnswer or None
         What the next frame may be compared with; None after an ego-only answer.
-    suspicion : mapping of teammate id to float, or None
-        Probability that each teammate attacks, from a defence that knows it.
     """
 
     boxes: FloatArray
-    source: Source
-    accepted: Hypothesis
-    rejected: Mapping[str, Rejection]
     hypotheses: tuple[Outcome, ...]
-    attacker_ratio: float | None
     deadline_met: bool
     out_of_time: bool
     fault: str | None
     timings_ms: Mapping[str, float]
-    state: State
     previous: PreviousAnswer | None
-    suspicion: Mapping[str, float] | None = None
 
     @property
     def sampling_steps(self) -> int:
         """Hypotheses tested."""
         return len(self.hypotheses)
-
-    @property
-    def named(self) -> tuple[str, ...] | None:
-        """Teammates held to be attackers; None from a defence that names nobody."""
-        return named_in(self.state)
 
     def answer(self, frame: int, left_out: Mapping[str, Rejection], timings_ms: Mapping[str, float]) -> FrameAnswer:
         """What is answered about the frame. Whoever the defence names is told so.
@@ -133,7 +110,7 @@ class FusionResult:
         )
 
 
-def fuse(
+def fuse(  # all that a decision follows from, so that it can be made again
     detector: Preparer,
     defense: Defense,
     ego: Message,
@@ -210,19 +187,14 @@ class _FrameRun:
             decision = Decision((), Source.EGO_ONLY, rejected, None, state)
             boxes = self._decode(self._prepare({}), ())
         return FusionResult(
+            **{part.name: getattr(decision, part.name) for part in fields(Decision)},
             boxes=boxes,
-            source=decision.source,
-            accepted=decision.accepted,
-            rejected=decision.rejected,
             hypotheses=tuple(self.outcomes),
-            attacker_ratio=decision.attacker_ratio,
             deadline_met=self.deadline.is_met,
             out_of_time=self.out_of_time,
             fault=self.fault,
             timings_ms=self.timings,
-            state=decision.state,
-            previous=self._to_remember(boxes) if decision.accepted else None,
-            suspicion=decision.suspicion,
+            previous=PreviousAnswer.of(self.frame, self.ego.pose, boxes, self.previous) if decision.accepted else None,
         )
 
     def _prepare(self, teammates: Mapping[str, Message]) -> PreparedFrame:
@@ -287,9 +259,6 @@ class _FrameRun:
             with self._spending("hypotheses" if subset else "ego_only"), self.deadline.a_pass():
                 self.boxes[subset] = prepared.detect(subset)
         return self.boxes[subset]
-
-    def _to_remember(self, boxes: FloatArray) -> PreviousAnswer:
-        return PreviousAnswer.of(self.frame, self.ego.pose, boxes, self.previous)
 
     def _confident(self, boxes: FloatArray) -> FloatArray:
         return at_least(boxes, self.detector.info.consensus_score)

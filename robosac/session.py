@@ -9,9 +9,8 @@ import numpy as np
 
 from robosac.calibrated import calibration_of
 from robosac.deadline import Deadline
-from robosac.defenses import Defense, DefenseSettings, State, build
+from robosac.defenses import Defense, DefenseSettings, SampleConsensus, State, build
 from robosac.defenses.group_testing import GroupTestingSettings
-from robosac.defenses.sample_consensus import SampleConsensusSettings
 from robosac.detectors import Detector, DetectorInfo, Message, Preparer
 from robosac.fusion import FusionResult, fuse
 from robosac.previous import PreviousAnswer
@@ -19,7 +18,7 @@ from robosac.previous import PreviousAnswer
 
 def default_defense(info: DetectorInfo) -> DefenseSettings:
     """The defence where none is asked for: group testing if the detector is calibrated for it, else sampling."""
-    return GroupTestingSettings() if info.calibration is not None else SampleConsensusSettings()
+    return GroupTestingSettings() if info.calibration is not None else SampleConsensus()
 
 
 def defense_for(settings: DefenseSettings | Mapping[str, Any], info: DetectorInfo) -> Defense:

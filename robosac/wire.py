@@ -17,7 +17,7 @@ from typing import Any
 import msgpack
 import numpy as np
 
-from robosac.boxes import FloatArray
+from robosac.boxes import FloatArray, pose_fault
 from robosac.detectors.base import DetectorInfo, Message, Role, TensorSpec
 from robosac.signatures import SIGNATURE_BYTES
 
@@ -27,16 +27,10 @@ MAX_ARRAY = 64
 MAX_MAP = 1024
 MAX_STRING = 2**16
 MAX_ENTRIES = 2**16
-"""Entries of all arrays and maps of a body together: small containers by the million would cost far more than their
-bytes.
-"""
+"""Entries of all arrays and maps of a body: small containers by the million would cost far more than their bytes."""
 SHOWN = 40
 """Characters of a sender's own words that an error repeats."""
-RIGID_TOLERANCE = 1e-3
-MIN_UPRIGHT = 0.5
-"""Cosine of the largest tilt of a sensor; views from above mean nothing beyond it."""
-MAX_TRANSLATION_M = 1e8
-"""Farther than any earth-fixed frame needs; beyond it single precision would lose the warp."""
+_TYPES = {dict: "a map", list: "an array", str: "a string", bytes: "binary", type(None): "nil"}
 
 
 class WireError(ValueError):
@@ -104,14 +98,10 @@ def content_digest(frame: int, vehicle_id: str, message: Message) -> str:
     data of every tensor by ascending name; numbers little-endian.
     """
     total = hashlib.sha256()
-    parts: list[bytes] = [
-        str(frame).encode(),
-        vehicle_id.encode(),
-        np.ascontiguousarray(message.pose, dtype="<f8").tobytes(),
-    ]
+    parts = [str(frame).encode(), vehicle_id.encode(), message.pose.astype("<f8").tobytes()]
     for name, array in sorted(message.tensors.items()):
-        data = np.ascontiguousarray(array, dtype=array.dtype.newbyteorder("<")).tobytes()
-        parts += [name.encode(), array.dtype.name.encode(), ",".join(map(str, array.shape)).encode(), data]
+        shape = ",".join(map(str, array.shape))
+        parts += [name.encode(), array.dtype.name.encode(), shape.encode(), _little_endian(array)]
     for part in parts:
         total.update(len(part).to_bytes(8, "big"))
         total.update(part)
@@ -120,15 +110,8 @@ def content_digest(frame: int, vehicle_id: str, message: Message) -> str:
 
 def read_signature(payload: Any, path: str = "") -> bytes | None:
     """The signature that came with a message, if one did."""
-    value = _mapping(payload, path).get("signature")
-    if value is None:
-        return None
-    where = _join(path, "signature")
-    if not isinstance(value, bytes):
-        raise WireError("wrong-type", where, f"must be binary, got {_type(value)}")
-    if len(value) != SIGNATURE_BYTES:
-        raise WireError("wrong-length", where, f"must be {SIGNATURE_BYTES} bytes, got {len(value)}")
-    return value
+    fields = _Fields(payload, path)
+    return None if fields.value.get("signature") is None else fields.take_bytes("signature", SIGNATURE_BYTES)
 
 
 def pack(value: Any) -> bytes:
@@ -149,8 +132,7 @@ def unpack(body: bytes, *, trusted: bool = False) -> Any:
     Raises
     ------
     WireError
-        ``malformed-msgpack`` if the body is truncated, has bytes left over, nests too deeply, or holds what msgpack or
-        the limits do not allow.
+        ``malformed-msgpack``: it is cut off, has bytes left over, or holds what msgpack or the limits do not allow.
     """
     limit = len(body)
     entries = 0
@@ -182,15 +164,15 @@ def unpack(body: bytes, *, trusted: bool = False) -> Any:
 
 def read_message(body: bytes) -> MessageEnvelope:
     """Who sent a message and for which frame; the rest is left to `check_message`."""
-    fields = _mapping(unpack(body), "")
-    return MessageEnvelope(_frame(fields), _string(_get(fields, "vehicle_id", ""), "vehicle_id"), fields)
+    fields = _Fields(unpack(body))
+    return MessageEnvelope(_frame(fields), fields.take("vehicle_id", str), fields.value)
 
 
 def read_frame(body: bytes) -> FrameEnvelope:
     """The parts of a whole frame; each is left to `check_message`."""
-    fields = _mapping(unpack(body), "")
-    teammates = _mapping(_get(fields, "teammates", ""), "teammates")
-    return FrameEnvelope(_frame(fields), _get(fields, "ego", ""), teammates)
+    fields = _Fields(unpack(body))
+    teammates = fields.take("teammates", dict)
+    return FrameEnvelope(_frame(fields), fields.take("ego"), teammates)
 
 
 def check_message(payload: Any, info: DetectorInfo, role: Role, path: str = "") -> Message:
@@ -210,49 +192,44 @@ def check_message(payload: Any, info: DetectorInfo, role: Role, path: str = "") 
     WireError
         For the first thing that is wrong.
     """
-    fields = _mapping(payload, path)
-    pose = _pose(_get(fields, "pose", path), _join(path, "pose"))
-    where = _join(path, "tensors")
-    tensors = _mapping(_get(fields, "tensors", path), where)
+    fields = _Fields(payload, path)
+    pose = _pose(fields.take("pose"), fields.at("pose"))
+    tensors = _Fields(fields.take("tensors"), fields.at("tensors"))
     specs = info.tensors[role]
-    unknown = [name for name in tensors if name not in specs][:4]
+    unknown = [name for name in tensors.value if name not in specs][:4]
     if unknown:
-        raise WireError(
-            "unknown-tensor", where, f"unexpected {_quoted(unknown)}; detector {info.name} wants {_quoted(specs)}"
-        )
-    checked = {name: _tensor(_get(tensors, name, where), spec, _join(where, name)) for name, spec in specs.items()}
-    return Message(pose, checked)
+        found, wanted = (", ".join(map(_shown, names)) for names in (unknown, specs))
+        raise WireError("unknown-tensor", tensors.path, f"unexpected {found}; detector {info.name} wants {wanted}")
+    return Message(pose, {name: _tensor(_Fields(tensors.take(name), tensors.at(name)), specs[name]) for name in specs})
 
 
 def _message_fields(message: Message, signature: bytes | None) -> dict[str, Any]:
-    tensors = {}
-    for name, array in message.tensors.items():
-        little = np.ascontiguousarray(array, dtype=array.dtype.newbyteorder("<"))
-        tensors[name] = {"dtype": array.dtype.name, "shape": list(array.shape), "data": little.tobytes()}
-    fields: dict[str, Any] = {"pose": [float(value) for value in message.pose.reshape(-1)], "tensors": tensors}
+    tensors = {
+        name: {"dtype": array.dtype.name, "shape": list(array.shape), "data": _little_endian(array)}
+        for name, array in message.tensors.items()
+    }
+    fields = {"pose": [float(value) for value in message.pose.reshape(-1)], "tensors": tensors}
     return fields if signature is None else {**fields, "signature": signature}
 
 
-def _tensor(value: Any, spec: TensorSpec, path: str) -> np.ndarray[Any, np.dtype[Any]]:
-    fields = _mapping(value, path)
-    name = _string(_get(fields, "dtype", path), _join(path, "dtype"))
+def _little_endian(array: np.ndarray[Any, np.dtype[Any]]) -> bytes:
+    return np.ascontiguousarray(array, dtype=array.dtype.newbyteorder("<")).tobytes()
+
+
+def _tensor(fields: _Fields, spec: TensorSpec) -> np.ndarray[Any, np.dtype[Any]]:
+    name = fields.take("dtype", str)
     if name != spec.dtype:
-        raise WireError("wrong-dtype", _join(path, "dtype"), f"must be {spec.dtype!r}, got {_shown(name)}")
-    shape = _get(fields, "shape", path)
+        raise WireError("wrong-dtype", fields.at("dtype"), f"must be {spec.dtype!r}, got {_shown(name)}")
+    shape = fields.take("shape")
     if not isinstance(shape, list) or not all(type(n) is int for n in shape):
-        raise WireError("wrong-type", _join(path, "shape"), "must be an array of integers")
+        raise WireError("wrong-type", fields.at("shape"), "must be an array of integers")
     if tuple(shape) != spec.shape:
-        raise WireError("wrong-shape", _join(path, "shape"), f"must be {list(spec.shape)}, got {_shown(shape)[1:-1]}")
-    data = _get(fields, "data", path)
-    if not isinstance(data, bytes):
-        raise WireError("wrong-type", _join(path, "data"), f"must be binary, got {_type(data)}")
+        raise WireError("wrong-shape", fields.at("shape"), f"must be {list(spec.shape)}, got {_shown(shape)[1:-1]}")
     dtype = np.dtype(spec.dtype).newbyteorder("<")
-    expected = math.prod(spec.shape) * dtype.itemsize
-    if len(data) != expected:
-        raise WireError("wrong-length", _join(path, "data"), f"must be {expected} bytes, got {len(data)}")
+    data = fields.take_bytes("data", math.prod(spec.shape) * dtype.itemsize)
     array = np.frombuffer(data, dtype=dtype).reshape(spec.shape)
     if dtype.kind == "f" and not _all_finite(array):
-        raise WireError("non-finite", _join(path, "data"), "holds NaN or infinity")
+        raise WireError("non-finite", fields.at("data"), "holds NaN or infinity")
     return array
 
 
@@ -268,66 +245,56 @@ def _pose(value: Any, path: str) -> FloatArray:
         raise WireError("bad-pose", path, f"must be an array of 16 numbers, got {got}")
     if not all(type(v) in (int, float) for v in value):
         raise WireError("bad-pose", path, "must be an array of 16 numbers")
-    try:
-        pose = np.array(value, dtype=np.float64).reshape(4, 4)
-    except OverflowError as error:
-        raise WireError("bad-pose", path, "a number is too large") from error
+    pose = np.array(value, dtype=np.float64).reshape(4, 4)  # msgpack has no integers that are too large for it
     if not np.isfinite(pose).all():
         raise WireError("non-finite", path, "holds NaN or infinity")
-    rotation = pose[:3, :3]
-    rigid = (np.abs(rotation) <= 1 + RIGID_TOLERANCE).all() and np.allclose(
-        rotation @ rotation.T, np.eye(3), atol=RIGID_TOLERANCE
-    )
-    if not rigid or np.linalg.det(rotation) < 0 or not np.allclose(pose[3], (0, 0, 0, 1), atol=1e-9):
-        raise WireError("bad-pose", path, "must be a rigid transform: a rotation, a translation, last row 0 0 0 1")
-    if rotation[2, 2] < MIN_UPRIGHT:
-        raise WireError("bad-pose", path, "must be upright: the sensor's z axis within 60 degrees of the world's")
-    if np.abs(pose[:3, 3]).max() > MAX_TRANSLATION_M:
-        raise WireError("bad-pose", path, f"must lie within {MAX_TRANSLATION_M:g} m of the world's origin")
+    fault = pose_fault(pose)
+    if fault:
+        raise WireError("bad-pose", path, fault)
     return pose
 
 
-def _frame(fields: Mapping[Any, Any]) -> int:
-    frame = _get(fields, "frame", "")
-    if type(frame) is not int:
-        raise WireError("wrong-type", "frame", f"must be an integer, got {_type(frame)}")
+def _frame(fields: _Fields) -> int:
+    frame: int = fields.take("frame", int)
     if not 0 <= frame <= MAX_FRAME:
         raise WireError("out-of-range", "frame", f"must be between 0 and {MAX_FRAME}")
     return frame
 
 
-def _get(fields: Mapping[Any, Any], name: str, path: str) -> Any:
-    if name not in fields:
-        raise WireError("missing-field", _join(path, name), "is missing")
-    return fields[name]
+class _Fields:
+    """A map in a body, and its path there."""
+
+    def __init__(self, value: Any, path: str = "") -> None:
+        self.value: Mapping[Any, Any] = _of_type(value, dict, path)
+        self.path = path
+
+    def at(self, name: str) -> str:
+        return f"{self.path}.{name}" if self.path else name
+
+    def take(self, name: str, kind: type | None = None) -> Any:
+        """A field that has to be there, of a type if one is given."""
+        if name not in self.value:
+            raise WireError("missing-field", self.at(name), "is missing")
+        return self.value[name] if kind is None else _of_type(self.value[name], kind, self.at(name))
+
+    def take_bytes(self, name: str, length: int) -> bytes:
+        data: bytes = self.take(name, bytes)
+        if len(data) != length:
+            raise WireError("wrong-length", self.at(name), f"must be {length} bytes, got {len(data)}")
+        return data
 
 
-def _mapping(value: Any, path: str) -> Mapping[Any, Any]:
-    if not isinstance(value, dict):
-        raise WireError("wrong-type", path, f"must be a map, got {_type(value)}")
+def _of_type(value: Any, kind: type, path: str) -> Any:
+    if type(value) is not kind:  # a bool is no integer
+        wanted = "an integer" if kind is int else _TYPES[kind]
+        raise WireError("wrong-type", path, f"must be {wanted}, got {_type(value)}")
     return value
 
 
-def _string(value: Any, path: str) -> str:
-    if not isinstance(value, str):
-        raise WireError("wrong-type", path, f"must be a string, got {_type(value)}")
-    return value
-
-
-def _join(path: str, name: str) -> str:
-    return f"{path}.{name}" if path else name
-
-
-def _quoted(names: Any) -> str:
-    return ", ".join(_shown(name) for name in names)
+def _type(value: Any) -> str:
+    return _TYPES.get(type(value), type(value).__name__)
 
 
 def _shown(name: Any) -> str:
     text = repr(str(name))
     return text if len(text) <= SHOWN else text[:SHOWN] + "..."
-
-
-def _type(value: Any) -> str:
-    return {dict: "a map", list: "an array", str: "a string", bytes: "binary", type(None): "nil"}.get(
-        type(value), type(value).__name__
-    )

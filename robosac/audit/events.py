@@ -16,6 +16,7 @@ import rfc8785
 from pydantic import AfterValidator, BeforeValidator, Field, PlainSerializer, ValidationError, field_validator
 
 from robosac.answers import FrameAnswer, Pose, Reason, Typed
+from robosac.defenses import trusted_in
 
 
 class RecordError(ValueError):
@@ -48,14 +49,12 @@ class _Event(Typed):
     time: str = Field(default_factory=now)
 
 
-def _check_trusted(state: dict[str, Any]) -> dict[str, Any]:
-    trusted = state.get("trusted", [])
-    if not (isinstance(trusted, list | tuple) and all(isinstance(name, str) for name in trusted)):
-        raise ValueError("trusted must hold names")
+def _check_state(state: dict[str, Any]) -> dict[str, Any]:
+    trusted_in(state)
     return state
 
 
-State = Annotated[dict[str, Any], AfterValidator(_check_trusted)]
+State = Annotated[dict[str, Any], AfterValidator(_check_state)]
 """A defence's, JSON values."""
 
 

@@ -12,13 +12,12 @@ from dataclasses import dataclass, field
 from datetime import UTC, datetime, timedelta
 from typing import Any
 
-from robosac.answers import Reason, TestedHypothesis, Verdict
+from robosac.answers import Reason, Verdict
 from robosac.audit.chain import GENESIS, digest
 from robosac.audit.events import (
     Equivocation,
     FrameAnswered,
     Proof,
-    RecordError,
     SessionOpened,
     TeamChanged,
     event_on,
@@ -71,7 +70,6 @@ def report(lines: Iterable[bytes], vehicle: str, now: datetime) -> dict[str, Any
         case.take(line.removesuffix(b"\n"))
     if not case.observations:
         raise NothingToReport(f"the log holds neither a dissensus nor an equivocation of {vehicle}")
-    targets = {target: [o for t, o in case.observations if t == target] for target, _ in case.observations}
     return {
         "version": VERSION,
         "generationTime": _time64(now),
@@ -79,7 +77,9 @@ def report(lines: Iterable[bytes], vehicle: str, now: datetime) -> dict[str, Any
         "report": {
             "aid": AID_APP_AGNOSTIC,
             "content": {
-                "observations": [{"tgtId": target, "observations": found} for target, found in targets.items()],
+                "observations": [
+                    {"tgtId": target, "observations": found} for target, found in case.observations.items()
+                ],
                 "v2xPduEvidence": case.pdus,
                 "nonV2xPduEvidence": [
                     *case.decisions,
@@ -111,7 +111,7 @@ class _Case:
     key: str | None = None
     location: dict[str, Any] | None = None
     proofs: dict[str, Proof] = field(default_factory=dict)
-    observations: list[tuple[str, dict[str, Any]]] = field(default_factory=list)
+    observations: dict[str, list[dict[str, Any]]] = field(default_factory=dict)
     pdus: list[dict[str, Any]] = field(default_factory=list)
     decisions: list[dict[str, Any]] = field(default_factory=list)
     seqs: list[int] = field(default_factory=list)
@@ -138,7 +138,9 @@ class _Case:
         self.proofs[proof.digest] = proof
         if self.vehicle not in answer.rejected or answer.rejected[self.vehicle].reason is not Reason.DISSENSUS:
             return
-        against = [i for i, o in enumerate(answer.hypotheses) if self._contradicted(o)]
+        against = [
+            i for i, o in enumerate(answer.hypotheses) if self.vehicle in o.teammates and o.verdict is Verdict.DISSENSUS
+        ]
         self._observe(
             "perception",
             "dissensus",
@@ -182,10 +184,8 @@ class _Case:
         self, target: str, kind: str, detector_class: int, obs: dict[str, Any], frame: int, proofs: list[Proof]
     ) -> None:
         """Keep an observation; the n-th is about the n-th stream of messages."""
-        index = len(self.pdus)
-        self.observations.append(
-            (target, {"obsId": kind, "class": detector_class, "v2xPduEvidenceIndex": index, "obs": obs})
-        )
+        seen = {"obsId": kind, "class": detector_class, "v2xPduEvidenceIndex": len(self.pdus), "obs": obs}
+        self.observations.setdefault(target, []).append(seen)
         self.pdus.append(
             {
                 "type": "robosac-message",
@@ -196,14 +196,10 @@ class _Case:
         )
         self.seqs.append(self.last_seq)
 
-    def _contradicted(self, outcome: TestedHypothesis) -> bool:
-        return self.vehicle in outcome.teammates and outcome.verdict is Verdict.DISSENSUS
-
     def _followed_previous(self, answer: FrameAnswered) -> bool:
         """Whether the hypotheses were compared with what stations had said before, not with the ego's perception."""
-        if self.session is None or self.session.defense.get("reference") != Reference.PREVIOUS:
-            return False
-        return answer.previous_frame is not None and answer.previous_frame == answer.frame - 1
+        reference = self.session.defense.get("reference") if self.session else None
+        return reference == Reference.PREVIOUS and answer.previous_frame == answer.frame - 1
 
 
 def _shown(proof: Proof) -> dict[str, str | None]:
@@ -214,6 +210,3 @@ def _shown(proof: Proof) -> dict[str, str | None]:
 def _time64(moment: datetime) -> int:
     """Microseconds since 2004, leap seconds among them (IEEE 1609.2)."""
     return (moment - _EPOCH + timedelta(seconds=_LEAP_SECONDS)) // timedelta(microseconds=1)
-
-
-__all__ = ["NothingToReport", "RecordError", "report"]

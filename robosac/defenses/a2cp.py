@@ -2,36 +2,32 @@
 
 from __future__ import annotations
 
-from collections.abc import Generator, Sequence
-from dataclasses import dataclass
+from collections.abc import Sequence
 from math import comb
-from typing import ClassVar, Literal
+from typing import Literal
 
 import numpy as np
 from pydantic import Field
 
-from robosac.answers import Source, Verdict
+from robosac.answers import Verdict
 from robosac.budget import DEFAULT_CONFIDENCE, DomainError, eq2_budget
-from robosac.consensus import DEFAULT_THRESHOLD
-from robosac.defenses.protocol import Conversation, Decision, Hypothesis, Outcome, Reference, State, explain_rejections
-from robosac.defenses.sampling import MAX_BUDGET, check_budget, check_threshold, draw, search
+from robosac.defenses.protocol import Asking, Conversation, Hypothesis, Outcome, State, conclude
+from robosac.defenses.sampling import Budget, Confidence, draw, search
 from robosac.defenses.settings import ConsensusSettings
 
 DEFAULT_BUDGET = 5
 
 
-@dataclass(frozen=True)
-class A2CP:
-    """Aggressive-to-conservative probing with retrospect (Algorithm 2 of *Among Us*, ICCV 2023), with errata.
+class A2CP(ConsensusSettings):
+    """Aggressive-to-conservative probing: estimate the attacker ratio while answering.
 
-    For ascending ratios R_k of a team of S, ``U_k`` (Eq. 2 at eta = R_k, s = S (1 - R_k)) bounds the attempts and
-    ``T_k`` counts the failed ones.
+    Algorithm 2 of *Among Us* (ICCV 2023), with retrospect and errata. For ascending ratios R_k of a team of S, ``U_k``
+    (Eq. 2 at eta = R_k, s = S (1 - R_k)) bounds the attempts and ``T_k`` counts the failed ones.
 
     1. A frame visits k = 1..K as long as its budget N lasts and some ``T_k < U_k``, and tests one hypothesis of
        S (1 - R_k) teammates for each k with ``T_k < U_k``.
     2. At a dissensus T_k grows by one. At a consensus the estimate becomes R_k, and k and all higher ratios are
-    settled;
-       lower ratios go on being tried, in this and in later frames, until their U is spent (the retrospect).
+       settled; lower ratios go on being tried, in this and in later frames, until their U is spent (the retrospect).
     3. The frame's answer is its largest hypothesis in consensus, else the ego's own perception.
     4. Once all is settled, frames go on as Algorithm 1 at the estimated ratio.
 
@@ -39,46 +35,20 @@ class A2CP:
     is a hard limit, which the listing's inner loop overruns; and the listing keeps no answer for the frame. A verdict
     of no evidence spends a step and moves no counter. In a frame with teammates missing nothing is counted, since the
     bounds hold for the full team.
-
-    Parameters
-    ----------
-    ratios : tuple of float, optional
-        Ascending, in [0, 1), multiples of 1 / S; by default 0, 1/S, ..., (S-1)/S.
-    sampling_budget : int
-        N, from 1 to 10,000.
-    confidence : float
-        p of Eq. 2.
-    consensus_threshold : float
-        Jaccard index from which on two perceptions agree.
-    reference : Reference
-        What hypotheses are compared with.
-
-    Raises
-    ------
-    DomainError
-        If an argument is outside its range.
     """
 
-    kind: ClassVar[str] = "a2cp"
-
-    ratios: tuple[float, ...] | None = None
-    sampling_budget: int = DEFAULT_BUDGET
-    confidence: float = DEFAULT_CONFIDENCE
-    consensus_threshold: float = DEFAULT_THRESHOLD
-    reference: Reference = Reference.EGO
-
-    def __post_init__(self) -> None:
-        check_budget(self.sampling_budget)
-        if not 0.0 < self.confidence < 1.0:
-            raise DomainError(f"confidence must lie strictly between 0 and 1, got {self.confidence}")
-        check_threshold(self.consensus_threshold)
-        if self.ratios is not None:
-            ascending = all(a < b for a, b in zip(self.ratios, self.ratios[1:], strict=False))
-            if not self.ratios or not ascending or not all(0.0 <= r < 1.0 for r in self.ratios):
-                raise DomainError(f"ratios must ascend within [0, 1), got {list(self.ratios)}")
+    kind: Literal["a2cp"] = "a2cp"
+    ratios: tuple[float, ...] | None = Field(
+        None,
+        min_length=1,
+        max_length=64,
+        description="Ascending in [0, 1), multiples of 1 / S; by default all that the team size allows.",
+    )
+    sampling_budget: Budget = DEFAULT_BUDGET
+    confidence: Confidence = DEFAULT_CONFIDENCE
 
     def check_team(self, team_size: int) -> None:
-        """Raise `DomainError` if a ratio does not mean a whole number of attackers in a team of this size."""
+        """Raise `DomainError` if the ratios do not ascend or one means no whole number of attackers in such a team."""
         self._benign(team_size)
 
     def initial_state(self, team: Sequence[str]) -> State:
@@ -106,70 +76,64 @@ class A2CP:
     def converse(self, team: Sequence[str], state: State, rng: np.random.Generator) -> Conversation:
         """Probe, or go on at the estimate."""
         outcomes: list[Outcome] = []
-        attempts, estimate = list(state["attempts"]), float(state["estimate"])
+        attempts, estimate = state["attempts"], float(state["estimate"])
         complete = len(team) == state["team_size"]
         if not team:
             accepted: Hypothesis = ()
         elif all(t >= u for t, u in zip(attempts, state["bounds"], strict=True)):
             accepted = yield from self._settled(team, estimate, rng, outcomes)
         else:
-            probed = yield from self._probe(team, state, attempts, rng, outcomes)
+            probed = yield from self._probe(team, state, rng, outcomes)
             if complete:
                 attempts, found = probed
                 estimate = estimate if found is None else found
             in_consensus = [o.teammates for o in outcomes if o.verdict is Verdict.CONSENSUS]
             accepted = max(in_consensus, key=len, default=())
-        return Decision(
-            accepted=accepted,
-            source=Source.CONSENSUS if accepted else Source.EGO_ONLY,
-            rejected=explain_rejections(team, accepted, outcomes),
-            attacker_ratio=estimate if complete or estimate < 1.0 else None,
-            state={**state, "attempts": attempts if complete else list(state["attempts"]), "estimate": estimate},
-        )
+        ratio = estimate if complete or estimate < 1.0 else None
+        state = {**state, "attempts": list(attempts), "estimate": estimate}
+        return conclude(team, accepted, outcomes, state, attacker_ratio=ratio)
 
     def _probe(
-        self, team: Sequence[str], state: State, attempts: list[int], rng: np.random.Generator, outcomes: list[Outcome]
-    ) -> Generator[Sequence[Hypothesis], Sequence[Outcome], tuple[list[int], float | None]]:
+        self, team: Sequence[str], state: State, rng: np.random.Generator, outcomes: list[Outcome]
+    ) -> Asking[tuple[list[int], float | None]]:
         """Steps 1 and 2; returns the counters and the estimate, if there is a new one."""
-        bounds, ratios = list(state["bounds"]), list(state["ratios"])
-        attempts = list(attempts)
+        attempts, bounds = list(state["attempts"]), list(state["bounds"])
         estimate: float | None = None
-        spent = 0
-        while spent < self.sampling_budget:
-            before = spent
-            for k, ratio in enumerate(ratios):
+        while len(outcomes) < self.sampling_budget:
+            before = len(outcomes)
+            for k, ratio in enumerate(state["ratios"]):
                 s = round(state["team_size"] * (1 - ratio))
-                if spent == self.sampling_budget or attempts[k] >= bounds[k] or s > len(team):
+                if len(outcomes) == self.sampling_budget or attempts[k] >= bounds[k] or s > len(team):
                     continue
                 tested = yield [draw(team, s, rng)]
                 if not tested:
                     return attempts, estimate
                 outcomes.extend(tested)
-                spent += 1
                 if tested[0].verdict is Verdict.CONSENSUS:
                     estimate = ratio
                     attempts[k:] = bounds[k:]
                     break
                 if tested[0].verdict is Verdict.DISSENSUS:
                     attempts[k] += 1
-            if spent == before:
+            if len(outcomes) == before:
                 break
         return attempts, estimate
 
     def _settled(
         self, team: Sequence[str], estimate: float, rng: np.random.Generator, outcomes: list[Outcome]
-    ) -> Generator[Sequence[Hypothesis], Sequence[Outcome], Hypothesis]:
+    ) -> Asking[Hypothesis]:
         """Step 4."""
         s = round(len(team) * (1 - estimate))
         if s == 0:
             return ()
-        accepted = yield from search(team, s, min(self.sampling_budget, comb(len(team), s)), True, rng, outcomes)
-        return accepted
+        return (yield from search(team, (s, min(self.sampling_budget, comb(len(team), s))), rng, outcomes))
 
     def _benign(self, team_size: int) -> list[int]:
         """Benign teammates that each ratio means, S (1 - R_k)."""
         if self.ratios is None:
             return list(range(team_size, 0, -1))
+        if sorted({r for r in self.ratios if 0.0 <= r < 1.0}) != list(self.ratios):
+            raise DomainError(f"ratios must ascend within [0, 1), got {list(self.ratios)}")
         benign = []
         for ratio in self.ratios:
             s = team_size * (1 - ratio)
@@ -177,15 +141,3 @@ class A2CP:
                 raise DomainError(f"ratio {ratio} does not mean a whole number of attackers in a team of {team_size}")
             benign.append(round(s))
         return benign if team_size else []
-
-
-class A2CPSettings(ConsensusSettings):
-    """Aggressive-to-conservative probing: estimate the attacker ratio while answering."""
-
-    makes = A2CP
-    kind: Literal["a2cp"]
-    ratios: tuple[float, ...] | None = Field(
-        None, min_length=1, max_length=64, description="Ascending in [0, 1); by default all that the team size allows."
-    )
-    sampling_budget: int = Field(DEFAULT_BUDGET, ge=1, le=MAX_BUDGET, description="Most hypotheses tested in a frame.")
-    confidence: float = Field(DEFAULT_CONFIDENCE, gt=0, lt=1)

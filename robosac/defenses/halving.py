@@ -3,20 +3,19 @@
 from __future__ import annotations
 
 from collections.abc import Sequence
-from dataclasses import dataclass
-from typing import ClassVar, Literal
+from typing import Literal
 
 import numpy as np
 
 from robosac.answers import Verdict
-from robosac.defenses.memoryless import Memoryless, decide, unite
-from robosac.defenses.protocol import Conversation, Hypothesis, Outcome, State
-from robosac.defenses.settings import ConsensusSettings
+from robosac.defenses.memoryless import Memoryless, unite
+from robosac.defenses.protocol import Conversation, Hypothesis, Outcome, State, conclude
 
 
-@dataclass(frozen=True)
 class Halving(Memoryless):
-    """The idea of PASAC (*CP-Guard*, AAAI 2025): sample consensus that needs no attacker ratio.
+    """Split the team until every group agrees with the reference or is a single teammate.
+
+    The idea of PASAC (*CP-Guard*, AAAI 2025): sample consensus that needs no attacker ratio.
 
     1. Test the whole team against the ego.
     2. A group in consensus passes as a whole. A group in dissensus is split in two at random, and both halves are
@@ -25,10 +24,10 @@ class Halving(Memoryless):
        fails, the answer is the largest group that passed.
 
     With nobody attacking that is one test, with A attackers of S at most ``2 A ceil(log2 S) + 2``. A group without
-    evidence passes nothing and is not split. The settings are those of `Memoryless`.
+    evidence passes nothing and is not split.
     """
 
-    kind: ClassVar[str] = "halving"
+    kind: Literal["halving"] = "halving"
 
     def converse(self, team: Sequence[str], state: State, rng: np.random.Generator) -> Conversation:
         """Steps 1 to 3; the groups of one depth are a batch."""
@@ -38,25 +37,13 @@ class Halving(Memoryless):
         while groups:
             tested = yield groups
             outcomes.extend(tested)
+            passed.update(*(o.teammates for o in tested if o.verdict is Verdict.CONSENSUS))
             if len(tested) < len(groups):
-                passed.update(*(o.teammates for o in tested if o.verdict is Verdict.CONSENSUS))
                 break
-            halves: list[Hypothesis] = []
-            for outcome in tested:
-                if outcome.verdict is Verdict.CONSENSUS:
-                    passed.update(outcome.teammates)
-                elif outcome.verdict is Verdict.DISSENSUS and len(outcome.teammates) > 1:
-                    halves += _split(outcome.teammates, rng)
-            groups = halves
+            divided = [o.teammates for o in tested if o.verdict is Verdict.DISSENSUS and len(o.teammates) > 1]
+            groups = [half for group in divided for half in _split(group, rng)]
         accepted = yield from unite(team, passed, outcomes)
-        return decide(team, accepted, outcomes, state)
-
-
-class HalvingSettings(ConsensusSettings):
-    """Split the team until every group agrees with the reference or is a single teammate."""
-
-    makes = Halving
-    kind: Literal["halving"]
+        return conclude(team, accepted, outcomes, state)
 
 
 def _split(group: Hypothesis, rng: np.random.Generator) -> list[Hypothesis]:

@@ -14,7 +14,7 @@ from __future__ import annotations
 from collections.abc import Collection, Generator, Mapping, Sequence
 from dataclasses import dataclass, field
 from enum import StrEnum
-from typing import Any, Protocol
+from typing import Any, Protocol, TypeVar
 
 import numpy as np
 
@@ -57,8 +57,17 @@ def remembered(
 
 
 def trusted_in(state: State) -> tuple[str, ...]:
-    """The trust list of a state; empty where the defence keeps none."""
-    return tuple(state.get("trusted", ()))
+    """The trust list of a state; empty where the defence keeps none.
+
+    Raises
+    ------
+    ValueError
+        If there are no names where it should be, as only a damaged log can have it.
+    """
+    trusted = state.get("trusted", ())
+    if not (isinstance(trusted, list | tuple) and all(isinstance(name, str) for name in trusted)):
+        raise ValueError("trusted must hold names")
+    return tuple(trusted)
 
 
 def named_in(state: State) -> tuple[str, ...] | None:
@@ -166,7 +175,10 @@ class Decision:
         return named_in(self.state)
 
 
-Conversation = Generator[Sequence[Hypothesis], Sequence[Outcome], Decision]
+_Result = TypeVar("_Result")
+Asking = Generator[Sequence[Hypothesis], Sequence[Outcome], _Result]
+"""A part of a conversation: yields batches of hypotheses, is sent their outcomes, and returns what came of it."""
+Conversation = Asking[Decision]
 
 
 class Defense(Protocol):
@@ -225,3 +237,31 @@ def explain_rejections(
         else:
             rejected[teammate] = otherwise
     return rejected
+
+
+def conclude(
+    team: Sequence[str],
+    accepted: Hypothesis,
+    outcomes: Sequence[Outcome],
+    state: State,
+    *,
+    attacker_ratio: float | None = None,
+    accused: Mapping[str, Rejection] | None = None,
+) -> Decision:
+    """The decision of a defence that trusts nobody: a subset in consensus, or, if that is empty, the ego alone.
+
+    Parameters
+    ----------
+    team, accepted, outcomes, state, attacker_ratio
+        As in `explain_rejections` and `Decision`.
+    accused : mapping of teammate id to Rejection, optional
+        Why some are left out, where the outcomes alone do not say it.
+    """
+    said = {name: why for name, why in (accused or {}).items() if name not in accepted}
+    return Decision(
+        accepted=accepted,
+        source=Source.CONSENSUS if accepted else Source.EGO_ONLY,
+        rejected=explain_rejections(team, accepted, outcomes) | said,
+        attacker_ratio=attacker_ratio,
+        state=state,
+    )

@@ -3,14 +3,12 @@
 from __future__ import annotations
 
 from collections.abc import Sequence
-from dataclasses import dataclass
-from typing import ClassVar, Literal
+from typing import Literal
 
 import numpy as np
 from pydantic import Field
 
 from robosac.answers import Distrust, Reason, Source, Verdict
-from robosac.budget import DomainError
 from robosac.defenses.protocol import (
     Conversation,
     Decision,
@@ -22,47 +20,31 @@ from robosac.defenses.protocol import (
     remembered,
     trusted_in,
 )
-from robosac.defenses.sampling import Sampling, SamplingSettings, search
+from robosac.defenses.sampling import Sampling
 
 DEFAULT_RECHECK = 10
 
 
-@dataclass(frozen=True)
 class StaticTeam(Sampling):
-    """The paper's static team, with a re-check.
+    """Find trustworthy teammates once, rely on them, and look again now and then.
+
+    The paper's static team, with a re-check.
 
     1. Until there is a consensus, Algorithm 1. Its subset becomes the trust list.
-    2. From then on, the answer is the fusion of the trusted teammates that are present: one pass a frame, and no pass
-    of
-       the ego alone.
+    2. From then on, the answer is the fusion of the trusted teammates that are present. That is one pass a frame, and
+       none of the ego alone.
     3. Every ``recheck_every`` frames the trusted fusion is compared with the ego again. A dissensus empties the list,
-    and
-       the frame goes on with 1. (The paper never looks again; but a trusted vehicle can be hijacked.) No evidence, or
-       no time, leaves the list as it is, and the next frame tries again.
+       and the frame goes on with 1. (The paper never looks again; but a trusted vehicle can be hijacked.) No evidence,
+       or no time, leaves the list as it is, and the next frame tries again.
 
     The list survives frames in which trusted teammates are missing. If none of them is there, the frame is sampled as
     in 1, and the teammates it finds in consensus are added.
-
-    Parameters
-    ----------
-    recheck_every : int or None
-        Frames between two re-checks, at least 1; None never looks again, as in the paper. The other settings are those
-        of `SamplingSettings`.
-
-    Raises
-    ------
-    DomainError
-        If an argument is outside its range.
     """
 
-    kind: ClassVar[str] = "static_team"
-
-    recheck_every: int | None = DEFAULT_RECHECK
-
-    def __post_init__(self) -> None:
-        super().__post_init__()
-        if self.recheck_every is not None and self.recheck_every < 1:
-            raise DomainError(f"recheck_every must be at least 1 or null, got {self.recheck_every}")
+    kind: Literal["static_team"] = "static_team"
+    recheck_every: int | None = Field(
+        DEFAULT_RECHECK, ge=1, description="Frames between two re-checks of the trusted; null never looks again."
+    )
 
     def initial_state(self, team: Sequence[str]) -> State:  # noqa: ARG002
         """Nobody is trusted; ``frames_since_check`` counts from the latest consensus."""
@@ -88,10 +70,7 @@ class StaticTeam(Sampling):
             if tested[0].verdict is Verdict.CONSENSUS:
                 return self._decide(team, present, Source.CONSENSUS, outcomes, trusted, 0)
             trusted = []
-        accepted: Hypothesis = ()
-        if team:
-            s, n = self.plan(len(team))
-            accepted = yield from search(team, s, n - len(outcomes), self.distinct, rng, outcomes)
+        accepted = yield from self.search(team, rng, outcomes, spent=len(outcomes))
         source = Source.CONSENSUS if accepted else Source.EGO_ONLY
         kept = [*trusted, *(name for name in accepted if name not in trusted)]
         return self._decide(team, accepted, source, outcomes, kept, 0)
@@ -114,13 +93,3 @@ class StaticTeam(Sampling):
             attacker_ratio=self.attacker_ratio,
             state=remembered({"frames_since_check": waited}, trusted=trusted),
         )
-
-
-class StaticTeamSettings(SamplingSettings):
-    """Find trustworthy teammates once, rely on them, and look again now and then."""
-
-    makes = StaticTeam
-    kind: Literal["static_team"]
-    recheck_every: int | None = Field(
-        DEFAULT_RECHECK, ge=1, description="Frames between two re-checks of the trusted; null never looks again."
-    )

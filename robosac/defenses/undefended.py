@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 from collections.abc import Sequence
-from dataclasses import dataclass
 from typing import ClassVar, Literal
 
 import numpy as np
@@ -14,37 +13,27 @@ from robosac.defenses.protocol import Conversation, Decision, Reference, State, 
 from robosac.defenses.settings import DefenseSettings
 
 
-@dataclass(frozen=True)
-class Undefended:
-    """Every teammate is on the trust list from the start, because whoever chose this says so; nothing is ever
-    tested.
+class Undefended(DefenseSettings):
+    """No defence: everybody is fused and nothing is tested. A baseline.
+
+    Every teammate is on the trust list from the start, because whoever chose this says so.
     """
 
-    kind: ClassVar[str] = "none"
+    consensus_threshold: ClassVar[float] = DEFAULT_THRESHOLD
+    reference: ClassVar[Reference] = Reference.EGO
 
-    consensus_threshold: float = DEFAULT_THRESHOLD
-    reference: Reference = Reference.EGO
+    kind: Literal["none"] = "none"
 
     def initial_state(self, team: Sequence[str]) -> State:
-        """Everybody is trusted."""
         return remembered({}, trusted=team)
 
     def change_team(self, state: State, team: Sequence[str]) -> State:  # noqa: ARG002
-        """Everybody is trusted."""
         return self.initial_state(team)
 
-    def check_team(self, team_size: int) -> None:
-        """Any team will do."""
+    def check_team(self, team_size: int) -> None: ...
 
     def converse(self, team: Sequence[str], state: State, rng: np.random.Generator) -> Conversation:  # noqa: ARG002
         """Fuse all that are present."""
         yield from ()
         source = Source.TRUSTED if team else Source.EGO_ONLY
         return Decision(tuple(team), source, rejected={}, attacker_ratio=None, state=state)
-
-
-class UndefendedSettings(DefenseSettings):
-    """No defence: everybody is fused and nothing is tested. A baseline."""
-
-    makes = Undefended
-    kind: Literal["none"]

@@ -101,9 +101,10 @@ class Sampling:
     def defenses(self) -> dict[str, SampleConsensus]:
         """The defences, by the names of their rows."""
         ratio, s = self.attackers / self.team_size if self.attackers else ASSUMED_RATIO, self.collaborators
-        rows = {f"Algorithm 1, N = {n}": SampleConsensus(ratio, n, s, distinct=False) for n in self.budgets}
-        rows[f"no subset twice, N = {self.budgets[0]}"] = SampleConsensus(ratio, self.budgets[0], s)
-        return rows | {"gateway default": SampleConsensus(ratio)}
+        given = {"attacker_ratio": ratio, "collaborators": s}
+        rows = {f"Algorithm 1, N = {n}": SampleConsensus.independent(**given, sampling_budget=n) for n in self.budgets}
+        rows[f"no subset twice, N = {self.budgets[0]}"] = SampleConsensus(**given, sampling_budget=self.budgets[0])
+        return rows | {"gateway default": SampleConsensus(attacker_ratio=ratio)}
 
 
 def evaluate_bounds(

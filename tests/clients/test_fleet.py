@@ -19,7 +19,7 @@ from clients.fleet import FleetOptions, _asked, _Vehicle, close_run, main, run_f
 from clients.local_gateway import local_gateway
 from clients.simulation import Fleet
 from robosac.attacks import PGD, load_campaign
-from robosac.defenses.halving import HalvingSettings
+from robosac.defenses.halving import Halving
 from robosac.detectors.embedded import ADVERSARIAL_WEIGHTS
 from robosac.scenes import IntersectionScene
 
@@ -119,7 +119,7 @@ def test_settings_that_a_defence_does_not_take_are_refused_before_anything_is_se
 
 
 def test_a_fleet_asks_for_a_defence_of_ones_own_by_its_kind(monkeypatch):
-    class Own(HalvingSettings):
+    class Own(Halving):
         kind: Literal["own"] = "own"
 
     module = ModuleType("own")

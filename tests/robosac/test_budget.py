@@ -47,13 +47,13 @@ def test_algorithm_1_with_a_perfect_oracle_reproduces_table_1(eta, s, n, _, mean
     attackers, runs = attackers_in_team(5, eta), 4000
     q = clean_probability(5, attackers, s)
 
-    independent = SampleConsensus(eta, sampling_budget=10_000, collaborators=s, distinct=False)
+    independent = SampleConsensus.independent(attacker_ratio=eta, sampling_budget=10_000, collaborators=s)
     steps = simulate_sampling(independent, 5, attackers, runs, np.random.default_rng(1))
     assert abs(steps.mean() - 1 / q) <= 3 * np.sqrt((1 - q) / q**2 / runs)
     succeeded, expected = (steps <= n).mean(), 1 - (1 - q) ** n
     assert abs(succeeded - expected) <= 3 * np.sqrt(expected * (1 - expected) / runs)
 
-    distinct = SampleConsensus(eta, sampling_budget=10_000, collaborators=s)
+    distinct = SampleConsensus(attacker_ratio=eta, sampling_budget=10_000, collaborators=s)
     steps = simulate_sampling(distinct, 5, attackers, runs, np.random.default_rng(2))
     assert abs(steps.mean() - mean_distinct) <= 3 * steps.std() / np.sqrt(runs) + 0.005
     assert steps.max() == most_distinct
@@ -108,8 +108,8 @@ def test_large_teams_are_planned_at_once():
     assert exact_budget(63, 32, 20) > 10**6
     assert exact_budget(30, 10, 5) == exact_budget(30, 10, 5, distinct=False) == 40
     for size in (36, 63, 1000):
-        SampleConsensus(0.5, collaborators=size // 2).plan(size)
-        SampleConsensus(0.2).plan(size)
+        SampleConsensus(attacker_ratio=0.5, collaborators=size // 2).plan(size)
+        SampleConsensus().plan(size)
     assert time.process_time() - started < 1.0
 
 

@@ -2,6 +2,7 @@ import logging
 import math
 from collections.abc import Collection
 from dataclasses import replace
+from typing import Literal
 
 import numpy as np
 import pytest
@@ -270,7 +271,7 @@ def test_trust_comes_from_consensus_and_from_nothing_else(defense, caplog):
 class Hoarder(SampleConsensus):
     """A defence of one's own, which remembers what no log can hold."""
 
-    kind = "hoarder"
+    kind: Literal["hoarder"] = "hoarder"
 
     def converse(self, team, state, rng):
         decision = yield from super().converse(team, state, rng)

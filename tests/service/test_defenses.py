@@ -205,7 +205,7 @@ async def test_a_session_stored_before_frames_were_compared_is_served_by_its_per
     sessions = served.gateway.sessions
     record = await sessions._store.get(session.session_id)
     older = {name: value for name, value in record.defense.items() if name != "compare_frames"}
-    assert sessions._revive(replace(record, defense=older)).session.defense.compare_frames is compared
+    assert sessions._revive(replace(record, defense=older)).session.defense.settings.compare_frames is compared
 
 
 async def test_other_defences_have_no_suspicion(served, ego_message, benign):

@@ -7,32 +7,26 @@ from typing import Literal
 import pytest
 from pydantic import Field
 
-from robosac.defenses import ConsensusSettings
 from robosac.defenses.one_by_one import OneByOne
 from service.settings import Settings
 from tests.service.conftest import TEAM, problem, serve
 
 
 class Wary(OneByOne):
-    kind = "wary"
-
-
-class WarySettings(ConsensusSettings):
     """Tests every teammate alone."""
 
     kind: Literal["wary"] = "wary"
-    makes = Wary
     consensus_threshold: float = Field(0.4, gt=0, le=1)
 
 
-class Twin(WarySettings):
+class Twin(Wary):
     kind: Literal["none"] = "none"
 
 
 @pytest.fixture(autouse=True)
 def own(monkeypatch):
     module = ModuleType("own")
-    module.Wary, module.Twin = WarySettings, Twin
+    module.Wary, module.Twin = Wary, Twin
     monkeypatch.setitem(sys.modules, "own", module)
 
 

@@ -25,7 +25,7 @@ async def test_over_http_and_through_the_library_the_answer_is_the_same(detector
             answer = await served.ego(session).post_frame(frame, ego_message, attacked)
             expected = fuse(
                 detector,
-                SampleConsensus(0.2, 7, 3),
+                SampleConsensus(sampling_budget=7, collaborators=3),
                 ego_message,
                 {name: attacked[name] for name in TEAM},
                 rng=np.random.default_rng(frame),

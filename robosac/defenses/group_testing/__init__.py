@@ -2,12 +2,11 @@
 
 from __future__ import annotations
 
-from robosac.defenses.group_testing.defense import DEFAULT_HAZARDS, GroupTesting, GroupTestingSettings
+from robosac.defenses.group_testing.defense import GroupTesting, GroupTestingSettings
 from robosac.defenses.group_testing.model import OPEN, Calibration, CalibrationError, EvidenceModel
 from robosac.defenses.group_testing.posterior import Hazards
 
 __all__ = [
-    "DEFAULT_HAZARDS",
     "OPEN",
     "Calibration",
     "CalibrationError",

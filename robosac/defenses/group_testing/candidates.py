@@ -8,7 +8,8 @@ import numpy as np
 
 from robosac.boxes import FloatArray, IntArray
 from robosac.defenses.group_testing.choice import HARM, gain
-from robosac.defenses.group_testing.posterior import EXACT, BoolArray, Posterior
+from robosac.defenses.group_testing.distribution import BoolArray
+from robosac.defenses.group_testing.posterior import EXACT, Posterior
 
 SUSPECTS_AT_ONCE = 4
 """Most unresolved teammates in a test of a larger team."""
@@ -48,14 +49,12 @@ def candidates(posterior: Posterior, present: BoolArray, decoded: BoolArray) -> 
 def unresolved(suspicion: FloatArray) -> BoolArray:
     """Who (S,) is neither as good as cleared nor as good as named."""
     low, high = UNRESOLVED
-    doubtful: BoolArray = (suspicion >= low) & (suspicion <= high)
-    return doubtful
+    return (suspicion >= low) & (suspicion <= high)
 
 
 def cleared(suspicion: FloatArray) -> BoolArray:
     """Who (S,) is as good as cleared."""
-    good: BoolArray = suspicion < UNRESOLVED[0]
-    return good
+    return suspicion < UNRESOLVED[0]
 
 
 def _all_of(members: IntArray, size: int) -> BoolArray:
@@ -118,5 +117,4 @@ def _answer_sizes(ascending: FloatArray) -> IntArray:
     """How many of the least suspected make the best answers, as if teammates were independent."""
     clean = np.cumprod(1.0 - ascending)
     worth = clean * gain(np.arange(1, len(clean) + 1)) - (1.0 - clean) * HARM
-    best: IntArray = np.argsort(-worth, kind="stable")[:ANSWERS] + 1
-    return best
+    return np.argsort(-worth, kind="stable")[:ANSWERS] + 1

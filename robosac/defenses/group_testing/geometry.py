@@ -82,8 +82,7 @@ def followed(boxes: FloatArray, pose: FloatArray) -> FloatArray:
     """
     placed = to_world(boxes[boxes[:, 5] >= KNOWN_SCORE], pose)
     placed[:, 4] = (placed[:, 4] + np.pi / 8) % np.pi - np.pi / 8  # the seam where few vehicles head
-    kept: FloatArray = placed[:, [0, 1, 4, 5]].round(6)
-    return kept
+    return placed[:, [0, 1, 4, 5]].round(6)
 
 
 def crowd(now: FloatArray) -> int:

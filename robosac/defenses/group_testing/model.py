@@ -27,8 +27,6 @@ NOVELTY_BINS = len(NOVELTY_EDGES) + 1
 BINS = LOSS_BINS * NOVELTY_BINS
 CROWD_BINS = len(CROWD_EDGES) + 1
 CHANGE_BINS = len(CHANGE_EDGES) + 1
-COARSE = (2, 2)
-"""Neighbouring bins of loss, and of novelty, that are taken together to reckon what a test promises."""
 JOINING_SIZES = (5, 3, 2, 2)
 """Numbers of joining teammates told apart beside none (the ego alone), one, two, and three or more."""
 SIZES = tuple((a, d) for a, most in enumerate(JOINING_SIZES) for d in range(1, most + 1))
@@ -90,12 +88,16 @@ class EvidenceModel:
     changes : (1 + K, CHANGE_SIZES, CROWD_BINS, CHANGE_BINS) ndarray
         How many boxes come or go from one frame to the next in a fusion with so many boxes: unattacked, and attacked
         by each kind in both frames. Each last axis sums to 1.
+    coarse : (int, int)
+        Neighbouring bins of loss, and of novelty, that are taken together to reckon what a test promises, which need
+        not be known exactly.
     """
 
     pose_error_m: float
     kinds: tuple[str, ...]
     pairs: FloatArray
     changes: FloatArray
+    coarse: tuple[int, int] = (2, 2)
 
     def __post_init__(self) -> None:
         kinds = len(self.kinds)
@@ -122,27 +124,23 @@ class EvidenceModel:
 
     @cached_property
     def _by_part(self) -> FloatArray:
-        """The table (len(SIZES), CLEAN + 3 K, 4 x fewer bins), each row beside zeros for the other parts; as many bins
-        of loss and of novelty as `COARSE` says are one, since what a test promises need not be known exactly.
-        """
+        """The table (len(SIZES), CLEAN + 3 K, 4 x fewer bins), each row beside zeros for the other parts."""
         grid = self._by_size.reshape(*self._by_size.shape[:2], LOSS_BINS, NOVELTY_BINS)
-        for axis, width in enumerate(COARSE, start=2):
+        for axis, width in enumerate(self.coarse, start=2):
             grid = np.add.reduceat(grid, np.arange(0, grid.shape[axis], width), axis=axis)
         apart = self._parts[None, :, :, None] * grid.reshape(*grid.shape[:2], 1, -1)
         return apart.reshape(*grid.shape[:2], -1)
 
     def tables(self, a: IntArray, d: IntArray) -> FloatArray:
         """Tables (n, CLEAN + 3 K, BINS) for pairs of these sizes (n,) and (n,); d at least 1."""
-        tables: FloatArray = self._by_size[size_row(a, d)]
-        return tables
+        return self._by_size[size_row(a, d)]
 
     def change(self, size: int, boxes: int, changes: int) -> FloatArray:
         """Likelihoods (CLEAN + 3 K,), by the rows of `pairs`, of so many changes in a fusion of this many teammates in
         which there are so many boxes. The teammates are d; nobody is in a.
         """
         table = self.changes[:, min(size, CHANGE_SIZES) - 1, crowd_bin(boxes), change_bin(changes)]
-        likelihood: FloatArray = np.concatenate([np.repeat(table[:1], CLEAN), np.repeat(table[1:], CELLS)])
-        return likelihood
+        return np.concatenate([np.repeat(table[:1], CLEAN), np.repeat(table[1:], CELLS)])
 
     def change_information(self, sizes: IntArray, boxes: IntArray, cells: FloatArray) -> FloatArray:
         """Bits (n,) that fusions of so many teammates (n,) promise about who attacks, by what changed since the frame

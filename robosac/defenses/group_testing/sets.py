@@ -22,8 +22,7 @@ COMPLEMENTARY_MEMBERS = 0.3
 @lru_cache(maxsize=16)
 def states(n: int) -> IntArray:
     """State of each of n members in each of the 3 ** n entries, (n, 3 ** n)."""
-    states: IntArray = np.arange(STATES**n)[None] // STATES ** np.arange(n)[:, None] % STATES
-    return states
+    return np.arange(STATES**n)[None] // STATES ** np.arange(n)[:, None] % STATES
 
 
 @lru_cache(maxsize=16)
@@ -44,8 +43,7 @@ def unattacked(n: int) -> FloatArray:
 def codes(n: int) -> IntArray:
     """Of each subset of n members (2 ** n,), by its bits, the sum of ``3 ** i`` over its members."""
     members = np.arange(1 << n)[:, None] >> np.arange(n) & 1
-    total: IntArray = members @ STATES ** np.arange(n)
-    return total
+    return members @ STATES ** np.arange(n)
 
 
 @lru_cache(maxsize=16)
@@ -75,8 +73,7 @@ def views(n: int) -> FloatArray:
 def forgotten_views(table: FloatArray) -> FloatArray:
     """Tables (K, 3 ** n) after what was known of who is complementary is forgotten."""
     n = members(table)
-    known: FloatArray = (table @ _by_attackers(n))[:, _attackers(n)] * views(n)
-    return known
+    return (table @ _by_attackers(n))[:, _attackers(n)] * views(n)
 
 
 @lru_cache(maxsize=16)
@@ -112,8 +109,7 @@ def at_most(table: FloatArray) -> FloatArray:
 
 def joint(low: FloatArray, high: FloatArray) -> FloatArray:
     """Tables (K, 3 ** (n + m)) of two groups that are independent given the kind, from (K, 3 ** n) and (K, 3 ** m)."""
-    table: FloatArray = (high[:, :, None] * low[:, None, :]).reshape(len(low), -1)
-    return table
+    return (high[:, :, None] * low[:, None, :]).reshape(len(low), -1)
 
 
 def marginal(table: FloatArray, kept: Sequence[int]) -> FloatArray:
@@ -159,20 +155,7 @@ def awakened(table: FloatArray, team: int, hijack: float, attacker_prior: float)
     alone = through(table, transition(hijack, 0.0))
     drawn = through(table, transition(attacker_prior, 0.0))
     together = (1 - benign) * (drawn - nobody * table) / (1 - nobody) + benign * table
-    after: FloatArray = (alone + together) / 2
-    return after
-
-
-def packed(sizes: Sequence[int], room: int) -> list[list[int]]:
-    """Items in bins, first fit by decreasing size: their indices, bin by bin."""
-    bins: list[list[int]] = []
-    for item in sorted(range(len(sizes)), key=lambda i: -sizes[i]):
-        fit = next((b for b in bins if sum(sizes[i] for i in b) + sizes[item] <= room), None)
-        if fit is None:
-            bins.append([item])
-        else:
-            fit.append(item)
-    return bins
+    return (alone + together) / 2
 
 
 def products_but(each: FloatArray) -> FloatArray:
@@ -185,8 +168,9 @@ def products_but(each: FloatArray) -> FloatArray:
 
 
 def short(values: FloatArray) -> list[list[float]]:
-    """Where it is not 0, and how much: seven decimals. What is less likely is as likely as what the next frame's
-    hazards let happen.
+    """The places of the values (n,) that are not 0 to seven decimals, and those values so rounded.
+
+    Nothing is lost by it: in the next frame the hazards make more likely than that what is rounded away.
     """
     rounded = values.round(7)
     where = np.flatnonzero(rounded)
@@ -194,7 +178,7 @@ def short(values: FloatArray) -> list[list[float]]:
 
 
 def long(kept: Sequence[Sequence[float]], size: int) -> FloatArray:
-    """What `short` made of an array of this size."""
+    """The array (size,) that `short` was given, but for its rounding."""
     values = np.zeros(size)
     values[np.asarray(kept[0], dtype=np.int64)] = kept[1]
     return values

@@ -179,7 +179,7 @@ def qualitative(context: Context) -> Section:
 
 def _sampling(n: int, s: int = COLLABORATORS, threshold: float = 0.3) -> SampleConsensus:
     """Algorithm 1 as in the paper, one attacker of five assumed."""
-    return SampleConsensus(0.2, sampling_budget=n, collaborators=s, consensus_threshold=threshold, distinct=False)
+    return SampleConsensus.independent(sampling_budget=n, collaborators=s, consensus_threshold=threshold)
 
 
 def _score(context: Context, frames: list[DecodedOnce], defense: SampleConsensus) -> tuple[float, float, float, float]:

@@ -67,12 +67,13 @@ def _play(context: Context, defenses: dict[str, Defense]) -> dict[str, _Run]:
 
 def teams(context: Context) -> Section:
     """Static against dynamic team, and temporal consistency."""
+    tested = {"sampling_budget": BUDGET, "collaborators": COLLABORATORS}
     defenses: dict[str, Defense] = {
         "undefended": Undefended(),
-        "dynamic team": SampleConsensus(0.2, BUDGET, COLLABORATORS),
-        "static team, re-check every 10": StaticTeam(0.2, BUDGET, COLLABORATORS),
-        "static team, no re-check": StaticTeam(0.2, BUDGET, COLLABORATORS, recheck_every=None),
-        "temporal consistency": SampleConsensus(0.2, BUDGET, COLLABORATORS, reference=Reference.PREVIOUS),
+        "dynamic team": SampleConsensus(**tested),
+        "static team, re-check every 10": StaticTeam(**tested),
+        "static team, no re-check": StaticTeam(**tested, recheck_every=None),
+        "temporal consistency": SampleConsensus(**tested, reference=Reference.PREVIOUS),
     }
     runs = _play(context, defenses)
     baseline = runs["undefended"].steady_seconds

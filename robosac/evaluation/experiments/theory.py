@@ -28,7 +28,7 @@ def derivation(context: Context) -> Section:
     steps_rows, success_rows = [], []
     for number, (eta, s, n, paper_steps, paper_success) in enumerate(paper.TABLE_1):
         attackers = attackers_in_team(TEAM_SIZE, eta)
-        defense = SampleConsensus(eta, sampling_budget=MOST_STEPS, collaborators=s, distinct=False)
+        defense = SampleConsensus.independent(attacker_ratio=eta, sampling_budget=MOST_STEPS, collaborators=s)
         oracle = simulate_sampling(defense, TEAM_SIZE, attackers, context.scale.oracle_runs, context.rng(3, number))
         q = clean_probability(TEAM_SIZE, attackers, s)
         steps = _steps_until_consensus(context, defense, attackers, number)

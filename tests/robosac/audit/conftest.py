@@ -48,8 +48,19 @@ def answered(frame: int, seed: str, *outcomes: Outcome, trusted: tuple[str, ...]
     state = {"trusted": list(trusted), "frames_since_check": 0}
     boxes = np.array([[1.5, 2.0, 4.0, 2.0, 0.25, 0.75]])
     result = FusionResult(
-        boxes, source, accepted, rejected, outcomes, 0.2, True, False, None, {}, state, None
-    )  # fmt: skip
+        accepted,
+        source,
+        rejected,
+        0.2,
+        state,
+        boxes=boxes,
+        hypotheses=outcomes,
+        deadline_met=True,
+        out_of_time=False,
+        fault=None,
+        timings_ms={},
+        previous=None,
+    )
     event = FrameAnswered(
         **dict(result.answer(frame, {}, {})),
         seed=seed,

@@ -4,23 +4,25 @@ import asyncio
 import dataclasses
 import itertools
 import json
+import math
+import sys
 import time
 from pathlib import Path
+from types import ModuleType, SimpleNamespace
 
 import numpy as np
 import pytest
 import torch
 from typer.testing import CliRunner
 
-from robosac import consensus, fusion, wire
+from robosac import wire
 from robosac.audit import replay, verify
 from robosac.cli import app
-from robosac.deadline import Deadline
 from robosac.detectors import Message
-from service.deciding.admission import Admission
 from tests.robosac.audit.conftest import seal_all
 from tests.service.conftest import serve
 
+BUDGET_MS = 1000
 SAMPLING = {"sampling_budget": 7, "collaborators": 3}
 
 
@@ -34,11 +36,12 @@ class Downloaded:
         return replay.replay(replay.find(lines or self.lines, frame), self.bodies[frame], detector)
 
 
-async def drive(frames, change=None, **options):
-    """Post frames (number, ego's message, teammates' messages) to a gateway of its own."""
-    async with serve(itertools.count(40), keep_frames=100) as served:
+async def drive(frames, change=None, serving=None, ready=lambda: None, **options):
+    """Post frames (number, ego's message, teammates' messages) to a gateway of its own, once it is ready."""
+    async with serve(itertools.count(40), keep_frames=100, **(serving or {})) as served:
         session = await served.open(**options)
         ego = served.ego(session)
+        ready()
         for number, own, others in frames:
             if change is not None and change[0] == number:
                 await ego.dismiss(change[1])
@@ -94,21 +97,42 @@ async def test_group_testing_comes_out_the_same_with_who_is_missing_and_who_is_n
     assert "state" in told(got, detector, frame=2, index=index, state=lie)
 
 
+class Tiring:
+    """The shipped detector; after so many passes the next one takes longer than the frame has."""
+
+    def __init__(self, detector):
+        self.detector, self.info = detector, dataclasses.replace(detector.info, name="tiring")
+        self.passes_left = math.inf  # until the gateway has warmed up
+
+    def __getattr__(self, name):
+        return getattr(self.detector, name)
+
+    def prepare(self, ego, teammates):
+        prepared = self.detector.prepare(ego, teammates)
+        return SimpleNamespace(detect=lambda subset=(): self.detect(prepared, subset))
+
+    def detect(self, prepared, subset):
+        if self.passes_left == 0:
+            time.sleep(BUDGET_MS / 1e3)
+        self.passes_left -= 1
+        return prepared.detect(subset)
+
+
 @pytest.mark.parametrize("after", [0, 2])
 async def test_a_decision_cut_short_comes_out_the_same(after, detector, ego_message, attacked, monkeypatch):
-    tested = []
+    """The pass of the ego, or the one after so many hypotheses, takes all the time."""
+    module = ModuleType("tired")
+    module.detector = Tiring(detector)
+    module.build = lambda: module.detector
+    monkeypatch.setitem(sys.modules, "tired", module)
 
-    def compare(*args):
-        tested.append(args)
-        return consensus.compare(*args)
+    def tire():
+        module.detector.passes_left = after
 
-    def due(self, arrived, budget_s):
-        return Deadline(arrived + budget_s, clock=lambda: time.perf_counter() + (60 if len(tested) == after else 0))
-
-    monkeypatch.setattr(fusion, "compare", compare)
-    monkeypatch.setattr(Admission, "deadline", due)
-    got = await drive([(0, ego_message, attacked)], defense={"kind": "a2cp", "consensus_threshold": 1.0})
-    monkeypatch.undo()
+    options = {"detector": "tiring", "latency_budget_ms": BUDGET_MS, "gather_ms": 0}
+    defense = {"kind": "a2cp", "consensus_threshold": 1.0}
+    frames = [(0, ego_message, attacked)]
+    got = await drive(frames, serving={"extra_detectors": "tired:build"}, ready=tire, defense=defense, **options)
     answer = replay.find(got.lines, 0).answer
     assert (answer.out_of_time, len(answer.hypotheses)) == (True, after)
     assert got.differences(0, detector) == []

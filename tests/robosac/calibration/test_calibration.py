@@ -11,8 +11,7 @@ from robosac.calibration import Recipe, calibration_of
 from robosac.calibration.making import check
 from robosac.calibration.verdicts import Trial, Verdicts, complementary, validation_stretches
 from robosac.cli import app
-from robosac.defenses import GroupTesting
-from robosac.defenses.group_testing import Calibration, CalibrationError
+from robosac.defenses.group_testing import Calibration, CalibrationError, GroupTestingSettings
 from robosac.detectors import DetectorInfo
 from robosac.detectors.embedded import SHIPPED_WEIGHTS, EmbeddedDetector
 from robosac.evaluation.frames import EvaluationFrame
@@ -125,7 +124,7 @@ def test_the_shipped_detector_is_calibrated(detector):
 
 
 def test_the_shipped_detector_finds_an_attacker(detector, ego_message, attacked):
-    defense = GroupTesting.calibrated(calibration_of(detector.info))
+    defense = GroupTestingSettings().build(calibration_of(detector.info))
     frame = EvaluationFrame(detector, ego_message, {}, attacked, frozenset({"car-2"}), np.empty((0, 5)))
     results = [answer.result for answer in play(defense, [frame] * 3, np.random.default_rng(0))]
     assert all("car-2" not in r.accepted for r in results)
@@ -173,7 +172,7 @@ def test_the_command_writes_a_calibration(tmp_path):
 def test_the_command_names_an_unknown_attack(tmp_path):
     result = CliRunner().invoke(app, ["calibrate", "--out", str(tmp_path / "x.json"), "--attack", "nonesuch"])
     assert result.exit_code == 1
-    assert "unknown attack 'nonesuch'" in " ".join(result.output.split())
+    assert "no attack 'nonesuch'" in " ".join(result.output.split())
 
 
 def test_a_teammate_that_adds_a_box_to_every_fusion_is_complementary():

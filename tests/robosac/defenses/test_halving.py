@@ -5,7 +5,6 @@ import numpy as np
 import pytest
 
 from robosac.answers import Reason, Source, Verdict
-from robosac.budget import DomainError
 from robosac.defenses import Halving
 from robosac.evaluation.oracle import converse_with_oracle
 from tests.robosac.defenses.conversation import converse
@@ -86,5 +85,5 @@ def test_it_runs_against_a_detector(detector, ego_message, attacked):
 
 
 def test_an_impossible_threshold_is_refused():
-    with pytest.raises(DomainError, match="consensus_threshold"):
+    with pytest.raises(ValueError, match="consensus_threshold"):
         Halving(consensus_threshold=0.0)

@@ -138,7 +138,6 @@ def test_a_reference_gives_settings():
         ("nonesuch:Thing", "No module named 'nonesuch'"),
         ("own:missing", "no attribute 'missing'"),
         ("own:number", "own:number made no defence but 7, which has to derive from DefenseSettings"),
-        ("own:Undefended", "has to derive from DefenseSettings"),
         ("own:Mute", "own:Mute .* which lacks converse .The conversation about one frame with the teammates present"),
         ("own:Vague", "kind has to be a Literal of one name"),
         ("own:Silent", "kind Field required"),

@@ -61,7 +61,7 @@ def test_no_subset_is_tested_twice(rng):
 
 
 def test_independent_draws_repeat_themselves(rng):
-    defense = SampleConsensus(sampling_budget=50, collaborators=3, distinct=False)
+    defense = SampleConsensus.independent(sampling_budget=50, collaborators=3)
     _, tested = converse(defense, [Verdict.DISSENSUS] * 100, rng)
     assert len(tested) == 50 > len({o.teammates for o in tested})
 
@@ -85,7 +85,7 @@ def test_an_empty_team_is_answered_by_the_ego_alone(rng):
 
 @pytest.mark.parametrize("present", range(1, 6))
 def test_the_plan_follows_the_teammates_that_are_present(present, rng):
-    s, n = SampleConsensus(0.2, sampling_budget=7, collaborators=4).plan(present)
+    s, n = SampleConsensus(sampling_budget=7, collaborators=4).plan(present)
     assert s == max(1, present - 1)
     assert 1 <= n <= 7
 
@@ -93,12 +93,12 @@ def test_the_plan_follows_the_teammates_that_are_present(present, rng):
 @pytest.mark.parametrize(
     ("defense", "plan"),
     [
-        (SampleConsensus(0.2), (4, 5)),
-        (SampleConsensus(0.2, sampling_budget=3), (1, 3)),
-        (SampleConsensus(0.2, collaborators=3), (3, 6)),
-        (SampleConsensus(0.2, collaborators=3, distinct=False), (3, 10)),
-        (SampleConsensus(0.2, sampling_budget=9, collaborators=3), (3, 9)),
-        (SampleConsensus(0.9), (1, 5)),
+        (SampleConsensus(), (4, 5)),
+        (SampleConsensus(sampling_budget=3), (1, 3)),
+        (SampleConsensus(collaborators=3), (3, 6)),
+        (SampleConsensus.independent(collaborators=3), (3, 10)),
+        (SampleConsensus(sampling_budget=9, collaborators=3), (3, 9)),
+        (SampleConsensus(attacker_ratio=0.9), (1, 5)),
     ],
 )
 def test_what_is_not_given_follows_from_the_exact_law(defense, plan):
@@ -106,8 +106,8 @@ def test_what_is_not_given_follows_from_the_exact_law(defense, plan):
 
 
 def test_a_lone_teammate_is_tested_once():
-    assert SampleConsensus(0.2, collaborators=3).plan(1) == (1, 1)
-    SampleConsensus(0.9, collaborators=1).check_team(5)
+    assert SampleConsensus(collaborators=3).plan(1) == (1, 1)
+    SampleConsensus(attacker_ratio=0.9, collaborators=1).check_team(5)
 
 
 def test_the_lowest_index_is_the_evidence():
@@ -123,7 +123,9 @@ def test_the_lowest_index_is_the_evidence():
 
 def test_with_a_perfect_oracle_the_plan_always_finds_the_benign(rng):
     for _ in range(50):
-        decision, _ = converse_with_oracle(SampleConsensus(0.4, collaborators=3), TEAM, {"b", "d"}, {}, rng)
+        decision, _ = converse_with_oracle(
+            SampleConsensus(attacker_ratio=0.4, collaborators=3), TEAM, {"b", "d"}, {}, rng
+        )
         assert decision.accepted == ("a", "c", "e")
         assert {decision.rejected[t].reason for t in "bd"} <= {Reason.DISSENSUS, Reason.NOT_SAMPLED}
 
@@ -141,11 +143,11 @@ def test_with_a_perfect_oracle_the_plan_always_finds_the_benign(rng):
     ],
 )
 def test_impossible_settings_are_refused(settings):
-    with pytest.raises(DomainError, match=next(iter(settings))):
+    with pytest.raises(ValueError, match=next(iter(settings))):
         SampleConsensus(**settings)
 
 
 def test_a_team_without_enough_benign_teammates_is_refused():
     with pytest.raises(DomainError, match="at most 4 can be collaborators"):
-        SampleConsensus(0.2, collaborators=5).check_team(5)
-    SampleConsensus(0.2, collaborators=4).check_team(5)
+        SampleConsensus(collaborators=5).check_team(5)
+    SampleConsensus(collaborators=4).check_team(5)

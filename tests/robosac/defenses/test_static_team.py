@@ -1,7 +1,6 @@
 import pytest
 
 from robosac.answers import Reason, Source, Verdict
-from robosac.budget import DomainError
 from robosac.defenses import StaticTeam
 from tests.robosac.defenses.conversation import converse
 
@@ -95,5 +94,5 @@ def test_those_who_leave_are_no_longer_trusted():
 
 
 def test_a_recheck_interval_must_be_positive():
-    with pytest.raises(DomainError, match="recheck_every"):
+    with pytest.raises(ValueError, match="recheck_every"):
         StaticTeam(recheck_every=0)

@@ -167,7 +167,7 @@ def test_passes_are_fused_subsets_each_counted_once(recorded):
     assert passes(OneByOne()) == [4, 4, 4]
     asked = []
     spied = replace(frame, boxes=_Spied(frame.boxes, asked))
-    for defense in (A2CP(), Halving(), SampleConsensus(distinct=False)):
+    for defense in (A2CP(), Halving(), SampleConsensus.independent()):
         for seed in range(5):
             asked.clear()
             (answer,) = play(defense, [spied], np.random.default_rng(seed))

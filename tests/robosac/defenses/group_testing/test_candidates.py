@@ -25,7 +25,7 @@ def learn(posterior, subset, log_ratio):
 @pytest.fixture
 def halfway():
     """Twenty teammates: somebody attacks, the first eight are cleared."""
-    posterior = Posterior.of(KINDS, 0.5, 0.25, [f"v{i:02d}" for i in range(20)])
+    posterior = Posterior(KINDS, 0.5, 0.25, [f"v{i:02d}" for i in range(20)])
     learn(posterior, np.arange(20) >= 18, 6.0)
     for index in range(8):
         learn(posterior, np.arange(20) == index, -8.0)
@@ -33,7 +33,7 @@ def halfway():
 
 
 def test_a_small_team_has_all_its_subsets_but_those_decoded():
-    posterior = Posterior.of(KINDS, 0.5, 0.25, list("abcde"))
+    posterior = Posterior(KINDS, 0.5, 0.25, list("abcde"))
     decoded = np.array([[True, False, False, True, False]])
     found = candidates(posterior, np.ones(5, dtype=bool), decoded)
     assert len(np.unique(found, axis=0)) == len(found) == 2**5 - 2

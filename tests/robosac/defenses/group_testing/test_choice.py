@@ -2,21 +2,23 @@ import numpy as np
 import pytest
 
 from robosac.boxes import pose_matrix
-from robosac.defenses.group_testing import choice
+from robosac.defenses.group_testing.choice import DEPENDENCE, expected_information
 from robosac.defenses.group_testing.geometry import followed
+from robosac.defenses.group_testing.knowledge import Knowledge
 from robosac.defenses.group_testing.memory import CHANGE_REPEAT, Memory, identity, keys
 from robosac.defenses.group_testing.posterior import Posterior
 from tests.robosac.defenses.group_testing.conversing import SEEN, TEAM, make_model
 
 MODEL = make_model()
+POSTERIOR = Posterior(len(MODEL.kinds), 0.5, 0.25, TEAM)
 IDENTITIES = np.array([identity(name) for name in TEAM], dtype=np.uint64)
 SINGLES = np.eye(len(TEAM), dtype=bool)
 NONE = np.zeros((0, len(TEAM)), dtype=bool)
 
 
 def bits(memory, subsets=SINGLES, decoded=NONE, *, ego_sees=True):
-    posterior = Posterior.of(len(MODEL.kinds), 0.5, 0.25, TEAM)
-    return choice.expected_information(MODEL, posterior, memory, IDENTITIES, subsets, decoded, ego_sees=ego_sees)
+    known = Knowledge(MODEL, POSTERIOR, memory)
+    return expected_information(known, subsets, decoded, ego_sees=ego_sees)
 
 
 def test_what_was_decoded_in_the_frame_before_promises_more():
@@ -30,11 +32,14 @@ def test_what_was_decoded_in_the_frame_before_promises_more():
     assert (repeated - plain)[2] == pytest.approx((1 - CHANGE_REPEAT) * more[2])
 
 
-def test_comparisons_within_a_frame_promise_less_than_if_they_were_independent(monkeypatch):
-    pairs = SINGLES | SINGLES[0]
-    apart = [bits(Memory()), bits(Memory(), pairs[1:], SINGLES[:1], ego_sees=False)]
-    monkeypatch.setattr(choice, "DEPENDENCE", 1.0)
-    together = [bits(Memory()), bits(Memory(), pairs[1:], SINGLES[:1], ego_sees=False)]
-    for less, more in zip(apart, together, strict=True):
-        assert less.max() > 0.05
-        assert less / more == pytest.approx(np.full(len(less), 0.85))
+def test_comparisons_within_a_frame_promise_less_than_if_they_were_independent():
+    first, others = np.repeat(SINGLES[:1], 4, axis=0), SINGLES[1:]
+    for promised, a, d in (
+        (bits(Memory(), others), np.zeros_like(first), others),
+        (bits(Memory(), first | others, SINGLES[:1], ego_sees=False), first, others),
+    ):
+        cells = POSTERIOR.cells(POSTERIOR.masks(a), POSTERIOR.masks(d))
+        independent = MODEL.information(a.sum(axis=1), d.sum(axis=1), cells)
+        assert independent.min() > 0.05
+        assert promised == pytest.approx(DEPENDENCE * independent)
+        assert DEPENDENCE == 0.85

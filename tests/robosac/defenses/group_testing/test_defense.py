@@ -5,14 +5,17 @@ import pytest
 
 from robosac.answers import Reason, Source, Verdict
 from robosac.boxes import from_world, pose_matrix
-from robosac.budget import DomainError
 from robosac.defenses import GroupTesting, Outcome
-from robosac.defenses.group_testing import OPEN, Hazards, choice
+from robosac.defenses.group_testing import OPEN, GroupTestingSettings
 from robosac.defenses.group_testing.memory import FORGETTING_FRAMES
 from tests.robosac.defenses.group_testing.conversing import SEEN, TEAM, make_model, outcome, run_frame, shifted
 
 MODEL = make_model()
 DEFENSE = GroupTesting(MODEL)
+
+
+def with_settings(**settings):
+    return GroupTesting(MODEL, GroupTestingSettings(**settings))
 
 
 def run(defense, attackers, frames, rng, state=None, team=TEAM, **options):
@@ -65,26 +68,32 @@ def test_memory_keeps_which_way_a_test_spoke(rng):
     assert {sign for _, sign in attacked.state["memory"]["tests"].values()} == {1}
 
 
-def test_an_ego_without_confident_boxes_is_no_witness(rng, monkeypatch):
-    asked = []
-    promised = choice.expected_information
-
-    def expected_information(*arguments, ego_sees):
-        asked.append(ego_sees)
-        return promised(*arguments, ego_sees=ego_sees)
-
-    monkeypatch.setattr(choice, "expected_information", expected_information)
+def test_an_ego_without_confident_boxes_is_no_witness(rng):
+    """What it says of a first subset, no other alone can be held against: those tested later hold it, or are in it."""
     unsure = np.copy(SEEN)
     unsure[:, 5] = 0.3
-    state = DEFENSE.initial_state(TEAM)
-    run_frame(DEFENSE, state, TEAM, [], rng, judge=lambda *a: outcome(*a, reference=unsure))
-    assert asked[0]
-    assert len(asked) > 1
-    assert not any(asked[1:])
+    apart = []
+    for reference in (SEEN, unsure):
+        _, (first, *later) = run_frame(
+            DEFENSE,
+            DEFENSE.initial_state(TEAM),
+            TEAM,
+            ["car-2", "car-3"],
+            rng,
+            judge=lambda *a, seen=reference: outcome(*a, reference=seen),
+        )
+        apart.append([o.teammates for o in later if not nested(o, first)])
+    assert apart[0]
+    assert not apart[1]
+
+
+def nested(one, other):
+    one, other = set(one.teammates), set(other.teammates)
+    return one <= other or other <= one
 
 
 def test_the_same_subset_again_and_again_names_nobody():
-    defense = GroupTesting(MODEL, attack_prior=0.9, attacker_prior=0.9, first_budget=1, budget=1)
+    defense = with_settings(attack_prior=0.9, attacker_prior=0.9, first_budget=1, budget=1)
     decision, tested = run(defense, ["solo"], 12, np.random.default_rng(0), team=("solo",))
     assert {o.teammates for frame in tested for o in frame} <= {("solo",)}
     assert named(decision) == set()
@@ -96,7 +105,7 @@ def test_a_hijacked_teammate_is_found_and_one_that_recovers_is_used_again(rng):
     hijacked, _ = run(DEFENSE, ["car-4"], 4, rng, honest.state)
     assert named(hijacked) == {"car-4"}
     assert "car-4" not in hijacked.state["trusted"]
-    quick = GroupTesting(MODEL, hazards=Hazards(0.003, 0.05, 0.02))
+    quick = with_settings(recovery=0.05)
     again, _ = run(quick, [], 40, rng, hijacked.state)
     assert named(again) == set()
     assert "car-4" in again.accepted
@@ -163,23 +172,23 @@ def test_only_what_the_latest_frame_showed_is_kept():
 
 def test_honest_boxes_stay_where_they_are():
     honest = Flitting(attackers=()).last(DEFENSE)
-    apart = Flitting(attackers=()).last(GroupTesting(MODEL, compare_frames=False))
+    apart = Flitting(attackers=()).last(with_settings(compare_frames=False))
     assert set(honest.accepted) == set(TEAM)
     assert max(honest.suspicion.values()) < max(apart.suspicion.values())
 
 
 @pytest.mark.parametrize(
     ("defense", "frames"),
-    [(GroupTesting(MODEL, compare_frames=False), range(100)), (DEFENSE, range(0, 100, 2)), (DEFENSE, [7] * 100)],
+    [(with_settings(compare_frames=False), range(100)), (DEFENSE, range(0, 100, 2)), (DEFENSE, [7] * 100)],
 )
 def test_frames_that_do_not_follow_on_one_another_are_not_compared(defense, frames):
     world, apart = Flitting(frames), Flitting(frames)
     decision = world.last(defense)
-    apart.last(GroupTesting(MODEL, compare_frames=False))
+    apart.last(with_settings(compare_frames=False))
     assert world.tests <= 1.2 * apart.tests
     assert max(decision.suspicion.values()) < 0.5
     assert set(decision.accepted) == set(TEAM)
-    assert bool(decision.state["memory"]["shown"]) == defense.compare_frames
+    assert bool(decision.state["memory"]["shown"]) == (defense is DEFENSE)
 
 
 def test_an_empty_fusion_has_nothing_that_could_change():
@@ -198,7 +207,7 @@ def test_an_empty_fusion_has_nothing_that_could_change():
             state = decision.state
         return decision.suspicion
 
-    assert suspicion(DEFENSE) == suspicion(GroupTesting(MODEL, compare_frames=False))
+    assert suspicion(DEFENSE) == suspicion(with_settings(compare_frames=False))
 
 
 def test_what_an_older_version_remembered_is_taken_over(rng):
@@ -320,7 +329,7 @@ def test_a_larger_team_tests_first_and_answers_with_what_is_clean(rng):
     [
         {"attack_prior": 0.0},
         {"attacker_prior": 1.0},
-        {"hazards": Hazards(0.6, 0.001, 0.02)},
+        {"hijack": 0.6},
         {"naming_bound": 1.0},
         {"naming_bound": 0.4},
         {"first_budget": 0},
@@ -329,8 +338,8 @@ def test_a_larger_team_tests_first_and_answers_with_what_is_clean(rng):
     ],
 )
 def test_settings_out_of_range(settings):
-    with pytest.raises(DomainError):
-        GroupTesting(MODEL, **settings)
+    with pytest.raises(ValueError, match=next(iter(settings))):
+        GroupTestingSettings(**settings)
 
 
 def test_outcomes_without_boxes_tell_nothing(rng):

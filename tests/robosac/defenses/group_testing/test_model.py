@@ -1,7 +1,6 @@
 import numpy as np
 import pytest
 
-from robosac.defenses.group_testing import model as likelihoods
 from robosac.defenses.group_testing.model import (
     BINS,
     CELLS,
@@ -23,11 +22,10 @@ ROWS = CLEAN + CELLS * KINDS
 
 
 @pytest.fixture
-def model(rng, monkeypatch):
+def model(rng):
     """Likelihoods without any order, reckoned with bin by bin."""
-    monkeypatch.setattr(likelihoods, "COARSE", (1, 1))
     changes = rng.dirichlet(np.ones(CHANGE_BINS), (1 + KINDS, CHANGE_SIZES, CROWD_BINS))
-    return EvidenceModel(0.0, ("x", "y", "z"), rng.dirichlet(np.ones(BINS), (ROWS, len(SIZES))), changes)
+    return EvidenceModel(0.0, ("x", "y", "z"), rng.dirichlet(np.ones(BINS), (ROWS, len(SIZES))), changes, coarse=(1, 1))
 
 
 def mutual_information(table, cells):
@@ -47,11 +45,10 @@ def test_what_a_test_promises_is_the_mutual_information(model, rng):
     assert max(expected) > 0.1
 
 
-def test_coarser_bins_promise_less_but_not_nothing(model, rng, monkeypatch):
+def test_coarser_bins_promise_less_but_not_nothing(model, rng):
     cells = rng.dirichlet(np.full(ROWS, 0.3), 12)
     a, d = np.full(12, 2), np.ones(12, dtype=int)
     exact = model.information(a, d, cells)
-    monkeypatch.setattr(likelihoods, "COARSE", (2, 2))
     coarse = EvidenceModel(0.0, model.kinds, model.pairs, model.changes).information(a, d, cells)
     assert (coarse <= exact).all()
     assert (coarse > 0).all()

@@ -115,7 +115,7 @@ def random_tests(rng, team, count):
 
 
 def test_a_small_team_is_exact(rng):
-    posterior, brute = Posterior.of(KINDS, 0.5, 0.25, TEAM), BruteForce(TEAM)
+    posterior, brute = Posterior(KINDS, 0.5, 0.25, TEAM), BruteForce(TEAM)
     np.testing.assert_allclose(posterior.marginals(), brute.marginals(TEAM))
     for a, d, log_likelihood in random_tests(rng, TEAM, 8):
         np.testing.assert_allclose(cells(posterior, a, d), brute.cells(a, d), atol=1e-12)
@@ -150,10 +150,8 @@ def spelled_out(posterior):
     return brute
 
 
-def test_learning_across_blocks_keeps_the_marginals_exact(rng, monkeypatch):
-    monkeypatch.setattr("robosac.defenses.group_testing.posterior.EXACT", 3)
-    monkeypatch.setattr("robosac.defenses.group_testing.posterior.BLOCK", 2)
-    posterior = Posterior.of(KINDS, 0.5, 0.25, TEAM)
+def test_learning_across_blocks_keeps_the_marginals_exact(rng):
+    posterior = Posterior(KINDS, 0.5, 0.25, TEAM, limits=(3, 2))
     assert len(posterior.blocks()) == 2
     for a, d, log_likelihood in random_tests(rng, TEAM, 12):
         brute = spelled_out(posterior)
@@ -165,7 +163,7 @@ def test_learning_across_blocks_keeps_the_marginals_exact(rng, monkeypatch):
 
 
 def test_state_survives_json(rng):
-    posterior = Posterior.of(KINDS, 0.5, 0.25, TEAM)
+    posterior = Posterior(KINDS, 0.5, 0.25, TEAM)
     for a, d, log_likelihood in random_tests(rng, TEAM, 4):
         posterior.update(*rows(posterior, a, d), log_likelihood)
     again = Posterior.from_state(json.loads(json.dumps(posterior.to_state())), 0.5, 0.25)
@@ -174,7 +172,7 @@ def test_state_survives_json(rng):
 
 
 def test_one_who_leaves_takes_only_its_own_part(rng):
-    posterior, brute = Posterior.of(KINDS, 0.5, 0.25, TEAM), BruteForce(TEAM)
+    posterior, brute = Posterior(KINDS, 0.5, 0.25, TEAM), BruteForce(TEAM)
     for a, d, log_likelihood in random_tests(rng, TEAM, 4):
         posterior.update(*rows(posterior, a, d), log_likelihood)
         brute.update(a, d, log_likelihood)
@@ -186,7 +184,7 @@ def test_one_who_leaves_takes_only_its_own_part(rng):
 
 
 def test_a_team_comes_and_goes():
-    posterior = Posterior.of(KINDS, 0.5, 0.25, [])
+    posterior = Posterior(KINDS, 0.5, 0.25, [])
     for number in range(12):
         posterior.add(f"v{number}")
         assert max(map(len, posterior.blocks())) <= (EXACT if number < EXACT else BLOCK)
@@ -199,17 +197,14 @@ def test_a_team_comes_and_goes():
 
 
 @pytest.mark.parametrize("size", [5, 6])
-def test_blocks_come_near_the_exact_posterior(size, monkeypatch):
+def test_blocks_come_near_the_exact_posterior(size):
     team = [f"v{i}" for i in range(size)]
     rng = np.random.default_rng(size)
     apart = []
     for _ in range(20):
         bad = set(rng.choice(team, 2, replace=False))
-        exact = Posterior.of(1, 0.5, 0.25, team)
-        with monkeypatch.context() as patch:
-            patch.setattr("robosac.defenses.group_testing.posterior.EXACT", 3)
-            patch.setattr("robosac.defenses.group_testing.posterior.BLOCK", 4)
-            cut = Posterior.of(1, 0.5, 0.25, team)
+        exact = Posterior(1, 0.5, 0.25, team)
+        cut = Posterior(1, 0.5, 0.25, team, limits=(3, 4))
         assert len(cut.blocks()) > 1
         for _ in range(12):
             subset = rng.choice(team, rng.integers(1, 4), replace=False)
@@ -223,7 +218,7 @@ def test_blocks_come_near_the_exact_posterior(size, monkeypatch):
 
 def test_regrouping_saves_blocks_and_keeps_what_is_known(rng):
     team = [f"v{i:02d}" for i in range(20)]
-    posterior = Posterior.of(KINDS, 0.5, 0.25, team)
+    posterior = Posterior(KINDS, 0.5, 0.25, team)
     for first in range(0, 20, 5):  # what is known of two of a block hangs together
         pair = team[first : first + 2]
         posterior.update(*rows(posterior, pair, ()), rng.normal(1.0, 1.0, CLEAN + CELLS * KINDS))
@@ -245,7 +240,7 @@ def test_regrouping_saves_blocks_and_keeps_what_is_known(rng):
 
 
 def test_regrouping_that_saves_no_block_changes_nothing():
-    posterior = Posterior.of(KINDS, 0.5, 0.25, [f"v{i:02d}" for i in range(20)])
+    posterior = Posterior(KINDS, 0.5, 0.25, [f"v{i:02d}" for i in range(20)])
     before = posterior.to_state()
     posterior.regroup(np.ones(20, dtype=bool))
     posterior.regroup(np.arange(20) < 5)
@@ -254,7 +249,7 @@ def test_regrouping_that_saves_no_block_changes_nothing():
 
 
 def test_rows_are_the_subsets_of_their_masks():
-    posterior = Posterior.of(KINDS, 0.5, 0.25, [f"v{i:02d}" for i in range(13)])
+    posterior = Posterior(KINDS, 0.5, 0.25, [f"v{i:02d}" for i in range(13)])
     subsets = posterior.rows(np.array([0, 2]), np.array([0b101, 0b10]))
     sizes = [len(block) for block in posterior.blocks()]
     assert [np.flatnonzero(row).tolist() for row in subsets] == [[0, 2], [sizes[0] + sizes[1] + 1]]

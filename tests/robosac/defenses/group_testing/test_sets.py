@@ -2,6 +2,7 @@ import numpy as np
 import pytest
 
 from robosac.defenses.group_testing import sets
+from robosac.defenses.group_testing.blocks import packed
 from robosac.defenses.group_testing.sets import ATTACKS, COMPLEMENTARY, PLAIN
 
 
@@ -75,10 +76,10 @@ def test_who_awakes_was_benign(rng):
 
 
 def test_packing_fills_bins_without_splitting():
-    bins = sets.packed([2, 5, 1, 3, 4], 6)
+    bins = packed([2, 5, 1, 3, 4], 6)
     assert [sum([2, 5, 1, 3, 4][i] for i in b) for b in bins] == [6, 6, 3]
     assert sorted(i for b in bins for i in b) == list(range(5))
-    assert sets.packed([], 6) == []
+    assert packed([], 6) == []
 
 
 def test_products_of_all_others():

@@ -1,5 +1,4 @@
 import csv
-from dataclasses import dataclass
 
 import numpy as np
 import pytest
@@ -30,7 +29,6 @@ ERASED = Setting("erase", 1)
 LATE = Setting("noise@asleep", 2)
 
 
-@dataclass(frozen=True)
 class Accuser(Undefended):
     """Answers alone and names a fixed set of teammates from a frame on."""
 
@@ -48,7 +46,6 @@ class Accuser(Undefended):
         return Decision((), Source.EGO_ONLY, rejected, None, {"frames": frames, "named": named})
 
 
-@dataclass(frozen=True)
 class Broken(Undefended):
     def converse(self, team, state, rng):
         yield from ()

@@ -1,0 +1,169 @@
+"""What the outcomes of a frame tell about who attacks."""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Mapping
+from dataclasses import dataclass
+from typing import Any
+
+import numpy as np
+
+from robosac.boxes import FloatArray
+from robosac.defenses.group_testing import geometry
+from robosac.defenses.group_testing.choice import DEPENDENCE, dilution
+from robosac.defenses.group_testing.distribution import BoolArray
+from robosac.defenses.group_testing.geometry import MIN_WITNESSES, PairMeasure, crowd
+from robosac.defenses.group_testing.knowledge import Knowledge
+from robosac.defenses.group_testing.memory import CHANGE_REPEAT, EGO_REPEAT, PAIR_REPEAT, WORTH_KEEPING, keys
+from robosac.defenses.group_testing.model import CLEAN, pair_bin
+from robosac.defenses.protocol import Hypothesis, Outcome
+
+_REPEATS = {"ego": EGO_REPEAT, "pair": PAIR_REPEAT, "change": CHANGE_REPEAT}
+_CERTAIN = 1e-9
+_TINY = 1e-300
+
+
+@dataclass(frozen=True)
+class _Finding:
+    """One piece of evidence: a test of ``a`` (and ``d`` beside it), and how likely its outcome was.
+
+    ``test`` is ``ego`` (d beside the ego alone), ``pair`` (beside a), or ``change`` (d beside itself in the frame
+    before).
+    """
+
+    test: str
+    a: Hypothesis
+    d: Hypothesis
+    log_likelihood: FloatArray
+    weight: float
+    values: Mapping[str, Any]
+
+
+class Evidence:
+    """Learns from one outcome after the other; posterior and memory are changed in place.
+
+    Parameters
+    ----------
+    known : Knowledge
+        Of this frame, before its evidence.
+    compare_frames : bool
+        Whether to compare with the frame before.
+
+    Attributes
+    ----------
+    outcomes : list of Outcome
+        What was learned from.
+    ego_sees, ego_witnesses : bool
+        Whether the ego alone has boxes enough for a verdict, and confident ones enough to compare fusions with; taken
+        for granted before the first outcome.
+    shown : dict of key to (n, 4) ndarray
+        What each subset showed in this frame, see `geometry.followed`.
+    """
+
+    measure = staticmethod(geometry.measure)
+    followed = staticmethod(geometry.followed)
+    changes = staticmethod(geometry.changes)
+
+    def __init__(self, known: Knowledge, *, compare_frames: bool = True) -> None:
+        self._known = known
+        self._compare_frames = compare_frames
+        if not compare_frames:
+            known.memory.shown = {}
+        self.outcomes: list[Outcome] = []
+        self.shown: dict[int, FloatArray] = {}
+        self.ego_sees = self.ego_witnesses = True
+
+    def learn(self, outcome: Outcome) -> None:
+        """Take in a decoded subset: the pairs it makes with the ego alone and with what this frame has shown already,
+        and what has changed in it since the frame before.
+        """
+        if outcome.frame != self._known.memory.shown_in + 1:  # nothing to compare with, nor to be promised
+            self._known.memory.shown = {}
+        self.ego_sees = outcome.reference is not None and len(outcome.reference) >= MIN_WITNESSES
+        findings = self._pairs(outcome)
+        if outcome.reference is not None and outcome.boxes is not None:
+            pair = self.measure(outcome.reference, outcome.boxes)
+            self.ego_witnesses = pair is not None
+            if pair is not None:
+                values = {"jaccard_index": round(outcome.jaccard_index, 4)}
+                findings.append(self._finding((), outcome.teammates, pair, 1.0, values))
+        findings += self._changes(outcome)
+        self.outcomes.append(outcome)
+        for finding in findings:
+            self._apply(finding)
+
+    def _pairs(self, outcome: Outcome) -> list[_Finding]:
+        found = []
+        for other in self.outcomes:
+            small, large = sorted((other, outcome), key=lambda o: len(o.teammates))
+            joining = tuple(name for name in large.teammates if name not in set(small.teammates))
+            if len(joining) != len(large.teammates) - len(small.teammates) or not joining:
+                continue
+            if small.boxes is None or large.boxes is None:
+                continue
+            pair = self.measure(small.boxes, large.boxes)
+            if pair is not None:
+                found.append((small.teammates, joining, pair))
+        return [self._finding(a, d, pair, 1 / math.sqrt(len(found)), {}) for a, d, pair in found]
+
+    def _changes(self, outcome: Outcome) -> list[_Finding]:
+        if not self._compare_frames or outcome.boxes is None or outcome.pose is None:
+            return []
+        (key,) = self._known.keys(self._known.rows([outcome.teammates])).tolist()
+        self.shown[key] = now = self.followed(outcome.boxes, outcome.pose)
+        before = self._known.memory.shown.get(key)
+        if before is None or max(crowd(before), crowd(now)) < MIN_WITNESSES:
+            return []
+        boxes, changed = crowd(now), self.changes(before, now)
+        likelihood = self._known.model.change(len(outcome.teammates), boxes, changed)
+        values = {"boxes": boxes, "changes": changed}
+        return [_Finding("change", (), outcome.teammates, np.log(likelihood), 1.0, values)]
+
+    def _finding(
+        self, a: Hypothesis, d: Hypothesis, pair: PairMeasure, weight: float, values: Mapping[str, Any]
+    ) -> _Finding:
+        table = self._known.model.tables(np.array([len(a)]), np.array([len(d)]))[0]
+        values = {**values, "loss": round(pair.loss, 4), "novelty": pair.novelty}
+        weight *= DEPENDENCE
+        return _Finding("pair" if a else "ego", a, d, np.log(table[:, pair_bin(pair)]), weight, values)
+
+    def _apply(self, finding: _Finding) -> None:
+        posterior = self._known.posterior
+        rows = self._known.rows([finding.a, finding.d])
+        before = posterior.marginals()
+        posterior.update(rows[0], rows[1], self._weight(finding, rows) * finding.log_likelihood)
+        self._keep(finding, _log_odds(posterior.marginals()) - _log_odds(before))
+
+    def _weight(self, finding: _Finding, rows: BoolArray) -> float:
+        """What a finding counts: a repetition little, and one of a large subset less."""
+        posterior, memory = self._known.posterior, self._known.memory
+        cells = posterior.cells(*posterior.masks(rows)[:, :, None].swapaxes(0, 1))[0]
+        likelihood = np.exp(finding.log_likelihood)
+        clean, attacked = (
+            float(cells[part] @ likelihood[part]) / max(float(cells[part].sum()), _TINY)
+            for part in (slice(CLEAN), slice(CLEAN, None))
+        )
+        of_a, of_d = self._known.keys(rows)[:, None]
+        (key,) = (keys(of_d, of_a) if finding.test == "change" else keys(of_a, of_d)).tolist()
+        weight = finding.weight * float(dilution(np.array([len(finding.a) + len(finding.d)]))[0])
+        return weight * memory.weigh(key, _REPEATS[finding.test], 1 if attacked > clean else -1)
+
+    def _keep(self, finding: _Finding, ratios: FloatArray) -> None:
+        """Keep a finding as evidence on those (S,) whose log-odds it moved by these ratios."""
+        memory = self._known.memory
+        for index in np.flatnonzero(np.abs(ratios) >= WORTH_KEEPING):
+            name, ratio = self._known.members[index], float(ratios[index])
+            if ratio > 0 or name in memory.evidence:
+                item = {"frame": memory.frame, "test": finding.test, **finding.values}
+                item["teammates"] = list(finding.a or finding.d)
+                if finding.a:
+                    item["joining"] = list(finding.d)
+                item["log_likelihood_ratio"] = round(ratio, 3)
+                memory.add_evidence(name, item)
+
+
+def _log_odds(p: FloatArray) -> FloatArray:
+    kept = np.minimum(np.maximum(p, _CERTAIN), 1 - _CERTAIN)
+    odds: FloatArray = np.log(kept / (1 - kept))
+    return odds

@@ -1,0 +1,67 @@
+"""All that is known within a frame: how likely outcomes are, who is believed to attack, and what is remembered."""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from dataclasses import dataclass, field
+
+import numpy as np
+
+from robosac.defenses.group_testing.distribution import BoolArray
+from robosac.defenses.group_testing.memory import KeyArray, Memory, identity
+from robosac.defenses.group_testing.model import EvidenceModel
+from robosac.defenses.group_testing.posterior import Posterior
+from robosac.defenses.protocol import Hypothesis, State, remembered
+
+
+@dataclass
+class Knowledge:
+    """Posterior and memory change within a frame; who is in the team does not.
+
+    Attributes
+    ----------
+    model : EvidenceModel
+    posterior : Posterior
+    memory : Memory
+    members : list of str
+        The team, in the order of every array over teammates; some may be missing in the frame.
+    """
+
+    model: EvidenceModel
+    posterior: Posterior
+    memory: Memory
+    members: list[str] = field(init=False)
+
+    def __post_init__(self) -> None:
+        self.members = self.posterior.members
+        self._index = {name: i for i, name in enumerate(self.members)}
+        self._identities = np.array([identity(name) for name in self.members], dtype=np.uint64)
+
+    def rows(self, subsets: Sequence[Hypothesis]) -> BoolArray:
+        """Subsets as rows (n, S) of booleans over the members."""
+        rows = np.zeros((len(subsets), len(self.members)), dtype=bool)
+        for row, subset in zip(rows, subsets, strict=True):
+            row[[self._index[name] for name in subset]] = True
+        return rows
+
+    def names(self, row: BoolArray, team: Hypothesis) -> Hypothesis:
+        """The subset of a row (S,), in the order of the team."""
+        return tuple(name for name in team if row[self._index[name]])
+
+    def keys(self, rows: BoolArray) -> KeyArray:
+        """Subsets (n, S) as memory knows them (n,); nobody is 0."""
+        return rows @ self._identities
+
+    def suspicion(self) -> dict[str, float]:
+        """Probability that each member attacks."""
+        return dict(zip(self.members, self.posterior.marginals().tolist(), strict=True))
+
+
+def remember(posterior: Posterior, memory: Memory, trusted: Sequence[str], named: Sequence[str]) -> State:
+    """The defence's state for the next frame."""
+    return remembered(
+        {"posterior": posterior.to_state(), "memory": memory.to_state()},
+        trusted=trusted,
+        named=named,
+        suspicion=dict(sorted(zip(posterior.members, posterior.marginals().round(6).tolist(), strict=True))),
+    )
