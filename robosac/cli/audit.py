@@ -5,15 +5,15 @@ from __future__ import annotations
 import json
 import re
 from collections.abc import Iterable, Iterator
-from contextlib import contextmanager
 from datetime import UTC, datetime
 from pathlib import Path
-from typing import Annotated, BinaryIO
+from typing import Annotated
 
 import typer
 
 from robosac import detectors, wire
 from robosac.audit import digest, misbehaviour, verification
+from robosac.cli.blame import blaming
 
 app = typer.Typer(no_args_is_help=True, add_completion=False, help=__doc__)
 
@@ -38,7 +38,7 @@ def verify(
             count += 1
             yield last
 
-    with _opened(file) as lines:
+    with blaming("FILE", OSError), file.open("rb") as lines:
         findings = verification.verify(counted(lines), head)
     for finding in findings:
         _say(finding)
@@ -69,25 +69,16 @@ def replay_decision(
     from robosac.audit import replay  # noqa: PLC0415
 
     torch.set_num_threads(1)  # as gateways do: another order of summation shifts boxes by more than is tolerated
-    try:
+    with blaming("--messages", OSError, wire.WireError):
         body = messages.read_bytes()
         number = wire.read_frame(body).frame if frame is None else frame
-    except (OSError, wire.WireError) as error:
-        raise typer.BadParameter(str(error), param_hint="--messages") from error
-    try:
-        with _opened(file) as lines:
-            decision = replay.find(lines, number)
-    except replay.ReplayError as error:
-        raise typer.BadParameter(str(error), param_hint="FILE") from error
+    with blaming("FILE", OSError, replay.ReplayError), file.open("rb") as lines:
+        decision = replay.find(lines, number)
     loaded = _load(detector, decision.session.detector)
-    try:
+    with blaming("--defense", ValueError):
         kinds = None if defense is None else defenses.known([defense])
-    except ValueError as error:
-        raise typer.BadParameter(str(error), param_hint="--defense") from error
-    try:
+    with blaming("--messages", replay.ReplayError):
         differences = replay.replay(decision, body, loaded, kinds)
-    except replay.ReplayError as error:
-        raise typer.BadParameter(str(error), param_hint="--messages") from error
     answer = decision.answer
     what = f"frame {answer.frame} (line {decision.line})"
     if differences:
@@ -109,13 +100,13 @@ def report(
     out: Annotated[Path | None, typer.Option(help="Where to write it; by default to standard output.")] = None,
 ) -> None:
     """Write what a log says against a vehicle, in the terms of ETSI TS 103 759; 1 if it says nothing or is broken."""
-    with _opened(file) as lines:
+    with blaming("FILE", OSError), file.open("rb") as lines:
         findings = verification.verify(lines)
     if findings:
         _say(f"{file}: {findings[0]}; see robosac audit verify", err=True)
         raise typer.Exit(1)
     try:
-        with _opened(file) as lines:
+        with blaming("FILE", OSError), file.open("rb") as lines:
             fields = misbehaviour.report(lines, vehicle, datetime.now(UTC))
     except misbehaviour.NothingToReport as nothing:
         _say(f"{file}: {nothing}", err=True)
@@ -124,30 +115,17 @@ def report(
     if out is None:
         typer.echo(text, nl=False)
         return
-    try:
+    with blaming("--out", OSError):
         out.write_text(text)
-    except OSError as error:
-        raise typer.BadParameter(str(error), param_hint="--out") from error
     _say(f"{out}: {len(fields['report']['content']['v2xPduEvidence'])} observations of {vehicle}")
-
-
-@contextmanager
-def _opened(path: Path) -> Iterator[BinaryIO]:
-    try:
-        with path.open("rb") as file:
-            yield file
-    except OSError as error:
-        raise typer.BadParameter(str(error), param_hint="FILE") from error
 
 
 def _load(wanted: str | None, logged: str) -> detectors.Detector:
     """The detector that the user wants, or one that ships: what a log names may be anything."""
     if wanted is None and logged not in detectors.available():
         raise typer.BadParameter(f"the log's detector, {logged!r}, does not ship; give it", param_hint="--detector")
-    try:
+    with blaming("--detector", ValueError, OSError):
         return detectors.load(wanted or logged)
-    except (ValueError, OSError) as error:
-        raise typer.BadParameter(str(error), param_hint="--detector") from error
 
 
 def _say(what: object, *, err: bool = False) -> None:

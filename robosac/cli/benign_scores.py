@@ -10,7 +10,8 @@ import torch
 import typer
 from rich.console import Console
 
-from robosac.cli.options import DataName, DetectorName, blaming, load_data, load_detector, make_folder, progress
+from robosac.cli.blame import blaming, make_folder
+from robosac.cli.options import DataName, DetectorName, load_data, load_detector, progress
 from robosac.detectors import DEFAULT_DETECTOR
 from robosac.evaluation.benign_scores import single_teammate_indices
 from robosac.scenes import DEFAULT_DATA, first_scenes

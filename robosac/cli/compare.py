@@ -14,18 +14,8 @@ from rich.console import Console
 
 from robosac import defenses
 from robosac.attacks import lacking, load_campaign
-from robosac.cli.options import (
-    DataName,
-    DetectorName,
-    Seed,
-    blaming,
-    check_known,
-    command,
-    load_data,
-    load_detector,
-    make_folder,
-    progress,
-)
+from robosac.cli.blame import blaming, check_known, make_folder
+from robosac.cli.options import DataName, DetectorName, Seed, command, load_data, load_detector, progress
 from robosac.defenses import Defense
 from robosac.detectors import DEFAULT_DETECTOR, Detector
 from robosac.evaluation.comparison import (

@@ -10,6 +10,7 @@ from typing import Annotated
 import torch
 import typer
 
+from robosac.cli.blame import blaming, check_known
 from robosac.detectors.v2xsim import write_weights
 from robosac.detectors.v2xsim.fusions import FUSIONS
 from robosac.detectors.weights_file import WeightsError
@@ -21,14 +22,9 @@ def run(
     fusion: Annotated[str, typer.Option(help=f"One of {', '.join(FUSIONS)}.")] = "mean",
 ) -> None:
     """Convert a published V2X-Sim checkpoint into a weights file. Nothing in the checkpoint is executed."""
-    if fusion not in FUSIONS:
-        raise typer.BadParameter(f"unknown fusion {fusion!r}; known: {', '.join(FUSIONS)}", param_hint="--fusion")
-    try:
+    check_known([fusion], FUSIONS, "--fusion")
+    with blaming("CHECKPOINT", WeightsError), blaming("OUT", OSError):
         recipe = write_weights(read_state(checkpoint), fusion, out)
-    except WeightsError as error:
-        raise typer.BadParameter(str(error), param_hint="CHECKPOINT") from error
-    except OSError as error:
-        raise typer.BadParameter(str(error), param_hint="OUT") from error
     typer.echo(f"{out}: {recipe['detector']}, {out.stat().st_size / 1e6:.1f} MB")
 
 

@@ -15,17 +15,8 @@ from rich.table import Table
 
 from robosac import attacks
 from robosac.attacks import CAMPAIGN_HELP
-from robosac.cli.options import (
-    DataName,
-    DetectorName,
-    Seed,
-    blaming,
-    check_attack,
-    load_data,
-    load_detector,
-    make_folder,
-    progress,
-)
+from robosac.cli.blame import blaming, make_folder
+from robosac.cli.options import DataName, DetectorName, Seed, check_attack, load_data, load_detector, progress
 from robosac.detectors import DEFAULT_DETECTOR
 from robosac.evaluation import BoundsReport, NoFrames, Sampling, evaluate_bounds
 from robosac.evaluation.frames import evaluation_frames

@@ -3,17 +3,24 @@
 from __future__ import annotations
 
 import shlex
-from collections.abc import Collection, Iterator, Mapping
-from contextlib import contextmanager
-from pathlib import Path
+from collections.abc import Mapping
 from typing import Annotated
 
 import typer
 from rich.console import Console
-from rich.progress import BarColumn, MofNCompleteColumn, Progress, TextColumn, TimeElapsedColumn, TimeRemainingColumn
+from rich.progress import (
+    BarColumn,
+    MofNCompleteColumn,
+    Progress,
+    ProgressColumn,
+    TextColumn,
+    TimeElapsedColumn,
+    TimeRemainingColumn,
+)
 
 from robosac import detectors
 from robosac.attacks import Attack, Campaign, lacking
+from robosac.cli.blame import blaming
 from robosac.detectors import Detector
 from robosac.scenes import DATA_HELP, SOURCES, SceneSource
 
@@ -22,15 +29,6 @@ DetectorName = Annotated[
 ]
 DataName = Annotated[str, typer.Option("--data", help=DATA_HELP)]
 Seed = Annotated[int, typer.Option(min=0, help="Of everything random.")]
-
-
-@contextmanager
-def blaming(option: str, *errors: type[Exception]) -> Iterator[None]:
-    """End the command with a line that says what is wrong with an option, if one of these errors comes up."""
-    try:
-        yield
-    except errors as error:
-        raise typer.BadParameter(str(error), param_hint=option) from error
 
 
 def load_detector(name: str) -> Detector:
@@ -52,23 +50,10 @@ def check_attack(attack: Attack | Campaign, detector: Detector) -> None:
         raise typer.BadParameter(fault, param_hint="--detector")
 
 
-def make_folder(path: Path, option: str) -> None:
-    """Make an output folder."""
-    with blaming(option, OSError):
-        path.mkdir(parents=True, exist_ok=True)
-
-
-def check_known(names: Collection[str], known: Collection[str], option: str) -> None:
-    """Refuse names that are not known."""
-    unknown = sorted(set(names) - set(known))
-    if unknown:
-        raise typer.BadParameter(f"unknown {', '.join(unknown)}; known: {', '.join(known)}", param_hint=option)
-
-
-def progress(console: Console) -> Progress:
-    """A progress bar with a count and times."""
+def progress(console: Console, *more: ProgressColumn) -> Progress:
+    """A progress bar with a count and times, and more columns if wanted."""
     columns = (TextColumn("{task.description}"), BarColumn(), MofNCompleteColumn())
-    return Progress(*columns, TimeElapsedColumn(), TimeRemainingColumn(), console=console)
+    return Progress(*columns, TimeElapsedColumn(), TimeRemainingColumn(), *more, console=console)
 
 
 def command(name: str, given: Mapping[str, object]) -> str:

@@ -11,18 +11,8 @@ import torch
 import typer
 from rich.console import Console
 
-from robosac.cli.options import (
-    DataName,
-    DetectorName,
-    Seed,
-    blaming,
-    check_known,
-    command,
-    load_data,
-    load_detector,
-    make_folder,
-    progress,
-)
+from robosac.cli.blame import blaming, check_known, make_folder
+from robosac.cli.options import DataName, DetectorName, Seed, command, load_data, load_detector, progress
 from robosac.detectors import DEFAULT_DETECTOR, EmbeddedDetector
 from robosac.detectors.embedded import ADVERSARIAL_WEIGHTS
 from robosac.evaluation.experiments import EXPERIMENTS, FULL, HEAD, QUICK, Context

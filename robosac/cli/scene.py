@@ -7,6 +7,7 @@ from typing import Annotated
 
 import typer
 
+from robosac.cli.blame import blaming, check_known
 from robosac.scenes import IntersectionScene
 from robosac.scenes.drawing import draw_view
 
@@ -19,10 +20,7 @@ def run(
 ) -> None:
     """Draw the bird's eye view of one agent: LiDAR returns, true boxes, and which of them are hidden from it."""
     scene = IntersectionScene(seed)
-    if agent not in scene.agents:
-        raise typer.BadParameter(f"no agent {agent!r}; there are {', '.join(scene.agents)}", param_hint="--agent")
-    try:
+    check_known([agent], scene.agents, "--agent")
+    with blaming("--out", OSError, ValueError):  # matplotlib names the formats it knows
         seen, hidden = draw_view(scene.frame(frame), agent, out, f"scene {seed}, ")
-    except (OSError, ValueError) as error:  # matplotlib names the formats it knows
-        raise typer.BadParameter(str(error), param_hint="--out") from error
     typer.echo(f"{out}: {agent} sees {seen} vehicles; {hidden} more are hidden from it and seen by a teammate")

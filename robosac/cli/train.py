@@ -10,16 +10,10 @@ from typing import Annotated
 import torch
 import typer
 from rich.console import Console
-from rich.progress import (
-    BarColumn,
-    MofNCompleteColumn,
-    Progress,
-    TaskID,
-    TextColumn,
-    TimeElapsedColumn,
-    TimeRemainingColumn,
-)
+from rich.progress import TaskID, TextColumn
 
+from robosac.cli.blame import check_known
+from robosac.cli.options import progress
 from robosac.detectors.embedded import ADVERSARIAL_WEIGHTS, SHIPPED_WEIGHTS
 from robosac.detectors.weights_file import WeightsError, read_weights
 from robosac.training.adversary import AdversaryConfig
@@ -43,8 +37,7 @@ def run(
     """Train the embedded detector on generated scenes. Checkpoints come every 50 steps; the same command goes on
     from there.
     """
-    if adversarial not in (None, "pgd"):
-        raise typer.BadParameter(f"unknown attack {adversarial!r}; known: pgd", param_hint="--adversarial")
+    check_known([adversarial or "pgd"], ["pgd"], "--adversarial")
     torch.set_num_threads(threads)
     console = Console()
     try:
@@ -92,29 +85,22 @@ def _hardened(seed: int, steps: int | None, scenes: int) -> _Plan:
 
 
 def _train(console: Console, out: Path, plan: _Plan) -> None:
-    columns = (
-        TextColumn("{task.description:<9}"),
-        BarColumn(),
-        MofNCompleteColumn(),
-        TimeElapsedColumn(),
-        TimeRemainingColumn(),
-    )
     weights = out / plan.weights
-    with Progress(*columns, TextColumn("{task.fields[remark]}"), console=console) as progress:
+    with progress(console, TextColumn("{task.fields[remark]}")) as bar:
         tasks: dict[str, TaskID] = {}
 
         def show(stage: str, done: int, total: int, remark: str) -> None:
             if stage not in tasks:
-                tasks[stage] = progress.add_task(stage, total=total, remark="")
-            progress.update(tasks[stage], completed=done, remark=remark)
+                tasks[stage] = bar.add_task(stage, total=total, remark="")
+            bar.update(tasks[stage], completed=done, remark=remark)
 
         network = train_network(plan.config, weights.with_suffix(".checkpoint"), show, plan.initial)
         rounded = {name: tensor.float() for name, tensor in shipped_tensors(network).items()}
         network.load_state_dict(rounded)  # what is chosen is chosen for the weights that ship
-        validating = progress.add_task("validate", total=len(plan.gains), remark="choosing the operating point")
+        validating = bar.add_task("validate", total=len(plan.gains), remark="choosing the operating point")
         attacked = partial(validation_frames, network)
-        point = choose_operating_point(attacked, lambda: progress.advance(validating), plan.gains, plan.harm)
-        progress.update(validating, completed=len(plan.gains), remark="")
+        point = choose_operating_point(attacked, lambda: bar.advance(validating), plan.gains, plan.harm)
+        bar.update(validating, completed=len(plan.gains), remark="")
     recipe = export_weights(network, plan.config, point, plan.command, weights)
     console.print(f"{weights}: {weights.stat().st_size / 1e6:.2f} MB")
     shown = ("feature_gain", "consensus_score", "validation", "tensors_sha256")

@@ -8,13 +8,10 @@ from itertools import combinations
 
 import numpy as np
 
-from robosac.answers import Verdict
 from robosac.attacks import Attack, Campaign
-from robosac.consensus import compare
 from robosac.defenses import SampleConsensus
 from robosac.evaluation.average_precision import AveragePrecision
 from robosac.evaluation.frames import DecodedOnce, EvaluationFrame
-from robosac.fusion import fuse
 
 ASSUMED_RATIO = 0.2
 
@@ -87,7 +84,7 @@ class Sampling:
         subset is drawn twice in a frame; and one with the gateway's defaults, which choose the hypotheses' size too.
     repeats : int
         Runs of Algorithm 1 on each frame, so that the luck of its draws averages out; the fused passes are shared.
-    seed : int
+    seed, stream : int
         Of the draws.
     """
 
@@ -97,6 +94,7 @@ class Sampling:
     budgets: tuple[int, ...] = (7, 5, 3, 1)
     repeats: int = 10
     seed: int = 0
+    stream: int = 1
 
     def defenses(self) -> dict[str, SampleConsensus]:
         """The defences, by the names of their rows."""
@@ -131,7 +129,9 @@ def evaluate_bounds(
     """
     table = _Table(sampling)
     for index, frame in enumerate(frames):
-        table.add(frame, [sampling.seed, 1, index])  # each row has the same luck, whatever else is evaluated
+        table.add(
+            frame, [sampling.seed, sampling.stream, index]
+        )  # each row has the same luck, whatever else is evaluated
         tick()
     return table.report(attack.epsilon)
 
@@ -160,27 +160,17 @@ class _Table:
         self._ap["all benign"].add(benign.detect(team), frame.truth)
         self._ap["ego only"].add(benign.detect(), frame.truth)
         self._ap["no defence"].add(received.detect(team), frame.truth)
-        self._judge_all(received)
-        for name in self._samplers:
-            for repeat in range(self._repeats):
-                self._sample(received, name, np.random.default_rng([*seed, repeat]))
+        refused, missed = received.judged(self._s)
+        self._refused += refused
+        self._missed += missed
+        for name, sampler in self._samplers.items():
+            for result in received.answers(sampler, seed, self._repeats):
+                self._ap[name].add(result.boxes, frame.truth)
+                infiltrated = not frame.attackers.isdisjoint(result.accepted)
+                self._runs[name].append((result.sampling_steps, bool(result.accepted), infiltrated))
         magnitudes = np.abs(np.concatenate([t.ravel() for m in frame.benign.values() for t in m.tensors.values()]))
         self._magnitudes.append(float(np.percentile(magnitudes, 95)))
         self._frames += 1
-
-    def _judge_all(self, frame: DecodedOnce) -> None:
-        for subset in combinations(frame.benign, self._s):
-            verdict = compare(frame.confident(), frame.confident(subset)).verdict
-            if frame.attackers.isdisjoint(subset):
-                self._refused.append(verdict is Verdict.DISSENSUS)
-            else:
-                self._missed.append(verdict is Verdict.CONSENSUS)
-
-    def _sample(self, frame: DecodedOnce, name: str, rng: np.random.Generator) -> None:
-        result = fuse(frame, self._samplers[name], frame.ego, frame.teammates, rng=rng)
-        self._ap[name].add(result.boxes, frame.truth)
-        infiltrated = not frame.attackers.isdisjoint(result.accepted)
-        self._runs[name].append((result.sampling_steps, bool(result.accepted), infiltrated))
 
     def report(self, epsilon: float) -> BoundsReport:
         if not self._frames:

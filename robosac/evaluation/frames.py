@@ -2,17 +2,21 @@
 
 from __future__ import annotations
 
-from collections.abc import Collection, Iterable, Iterator, Mapping
+from collections.abc import Collection, Iterable, Iterator, Mapping, Sequence
 from dataclasses import dataclass
 from functools import cached_property
+from itertools import combinations
 
 import numpy as np
 
+from robosac.answers import Verdict
 from robosac.attacks import Attack, Campaign
 from robosac.boxes import FloatArray, pose_matrix
-from robosac.consensus import at_least
+from robosac.consensus import DEFAULT_THRESHOLD, at_least, compare
+from robosac.defenses import Defense
 from robosac.detectors import Detector, DetectorInfo, Message, PreparedFrame
 from robosac.detectors.base import for_role
+from robosac.fusion import FusionResult, fuse
 from robosac.scenes import Frame, Scene, SceneError, seconds_apart
 
 YAW_PER_METRE = np.deg2rad(2.0)
@@ -89,6 +93,30 @@ class DecodedOnce(EvaluationFrame):
     def confident(self, teammates: Collection[str] = ()) -> FloatArray:
         """Boxes of a subset that take part in the consensus test."""
         return at_least(self.detect(teammates), self.info.consensus_score)
+
+    def answers(self, defense: Defense, seed: Sequence[int], repeats: int) -> list[FusionResult]:
+        """What a defence answers that has met nobody yet, each time with draws of its own."""
+        return [
+            fuse(self, defense, self.ego, self.teammates, rng=np.random.default_rng([*seed, repeat]))
+            for repeat in range(repeats)
+        ]
+
+    def judged(self, size: int, threshold: float = DEFAULT_THRESHOLD) -> tuple[list[bool], list[bool]]:
+        """The consensus test of all hypotheses of a size.
+
+        Returns
+        -------
+        refused, missed : list of bool
+            Of each without an attacker whether it is in dissensus; of each other one whether it is in consensus.
+        """
+        refused, missed = [], []
+        for subset in combinations(self.team, size):
+            verdict = compare(self.confident(), self.confident(subset), threshold).verdict
+            if self.attackers.isdisjoint(subset):
+                refused.append(verdict is Verdict.DISSENSUS)
+            else:
+                missed.append(verdict is Verdict.CONSENSUS)
+        return refused, missed
 
 
 def encode_all(detector: Detector, frame: Frame) -> dict[str, Message]:

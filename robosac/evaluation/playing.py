@@ -3,16 +3,14 @@
 from __future__ import annotations
 
 import time
-from collections.abc import Mapping, Sequence
+from collections.abc import Sequence
 from dataclasses import dataclass
-from typing import Protocol
 
 import numpy as np
 
-from robosac.boxes import FloatArray
 from robosac.defenses import Defense
-from robosac.detectors import Message
-from robosac.detectors.base import Preparer
+from robosac.evaluation.frames import EvaluationFrame
+from robosac.evaluation.recordings import RecordedFrame
 from robosac.fusion import FusionResult
 from robosac.session import Session
 
@@ -21,33 +19,8 @@ class FaultyDefense(RuntimeError):
     """A defence failed on a frame; an evaluation must not answer over that."""
 
 
-class PlayableFrame(Preparer, Protocol):
-    """A frame that can be played: what was met, posing as the detector that decodes it."""
-
-    @property
-    def ego(self) -> Message:
-        """The ego's message."""
-        ...
-
-    @property
-    def teammates(self) -> Mapping[str, Message]:
-        """The teammates' messages, as received."""
-        ...
-
-    @property
-    def team(self) -> tuple[str, ...]:
-        """Teammates, sorted."""
-        ...
-
-    @property
-    def attackers(self) -> frozenset[str]:
-        """Those whose message of this frame is not honest."""
-        ...
-
-    @property
-    def truth(self) -> FloatArray:
-        """True boxes (G, 5), ego frame."""
-        ...
+PlayableFrame = EvaluationFrame | RecordedFrame
+"""A frame that poses as the detector that decodes it."""
 
 
 @dataclass(frozen=True)

@@ -107,47 +107,26 @@ class Extent:
 NOBODY = Setting(HONEST, 0)
 
 
-def _settings(*numbers: tuple[str, int]) -> tuple[Setting, ...]:
-    return (NOBODY, *(Setting(campaign, attackers) for campaign, attackers in numbers))
+def _settings(text: str) -> tuple[Setting, ...]:
+    each = (setting.rpartition(":") for setting in text.split())
+    return (NOBODY, *(Setting(campaign, int(attackers)) for campaign, _, attackers in each))
 
 
 FULL = Extent(
-    settings=_settings(
-        *((attack, n) for attack in ("pgd", "bim", "cw") for n in (1, 2, 3, 4)),
-        *(("erase", n) for n in (1, 2)),
-        *(("invent", n) for n in (1, 2)),
-        *(("shift", n) for n in (1, 2)),
-        ("erase-still", 1),
-        ("invent-still", 1),
-        ("invent-steady", 1),
-        ("shift-still", 1),
-        ("pgd@asleep", 1),
-        ("erase@asleep", 1),
-        ("erase@asleep", 2),
-        ("invent@asleep", 1),
-        ("pgd@flicker", 1),
-        ("erase@flicker", 1),
-        ("erase@turns", 2),
-        ("pgd@covering", 2),
-        ("pgd@covering@asleep", 2),
-        ("pgd@framing", 1),
-        ("honest@false-pose", 1),
-    ),
+    _settings("""
+        pgd:1 pgd:2 pgd:3 pgd:4 bim:1 bim:2 bim:3 bim:4 cw:1 cw:2 cw:3 cw:4
+        erase:1 erase:2 invent:1 invent:2 shift:1 shift:2 erase-still:1 invent-still:1 invent-steady:1 shift-still:1
+        pgd@asleep:1 erase@asleep:1 erase@asleep:2 invent@asleep:1 pgd@flicker:1 erase@flicker:1 erase@turns:2
+        pgd@covering:2 pgd@covering@asleep:2 pgd@framing:1 honest@false-pose:1
+    """),
     scenes=40,
     frames=25,
 )
 QUICK = Extent(
-    settings=_settings(
-        *(("pgd", n) for n in (1, 2, 3)),
-        ("erase", 1),
-        ("erase", 2),
-        ("invent", 1),
-        ("shift", 1),
-        ("invent-still", 1),
-        ("erase@asleep", 1),
-        ("pgd@covering", 2),
-        ("honest@false-pose", 1),
-    ),
+    _settings("""
+        pgd:1 pgd:2 pgd:3 erase:1 erase:2 invent:1 shift:1 invent-still:1
+        erase@asleep:1 pgd@covering:2 honest@false-pose:1
+    """),
     scenes=2,
     frames=15,
 )

@@ -3,21 +3,21 @@
 from __future__ import annotations
 
 from collections.abc import Iterable
-from itertools import combinations
+from itertools import chain
 
 import numpy as np
 
-from robosac.answers import Verdict
 from robosac.attacks import BIM, PGD, Attack, CarliniWagner, Erase, GaussianNoise
 from robosac.boxes import FloatArray
-from robosac.consensus import at_least, compare
-from robosac.defenses import SampleConsensus
+from robosac.consensus import at_least
+from robosac.defenses import Defense, SampleConsensus
+from robosac.evaluation.bounds import Sampling, evaluate_bounds
 from robosac.evaluation.experiments import paper
-from robosac.evaluation.experiments.common import Context, precision
+from robosac.evaluation.experiments.common import TEAM_SIZE, Context, precision
 from robosac.evaluation.frames import DecodedOnce
 from robosac.evaluation.report import Section, Table
 from robosac.figures import new_figure
-from robosac.fusion import FusionResult, fuse
+from robosac.fusion import fuse
 from robosac.scenes.drawing import FOUND_COLOUR, TRUE_COLOUR, draw_boxes, frame_axes
 
 COLLABORATORS = 3
@@ -25,27 +25,20 @@ BUDGETS = (7, 5, 3, 1)
 THRESHOLDS = (0.1, 0.2, 0.3, 0.4, 0.5)
 EPSILONS = (0.125, 0.25, 0.5, 1.0)
 SHOWN_SCORE = 0.3
+_STREAM = 7
 
 
 def budgets(context: Context) -> Section:
     """Detection with different sampling budgets, between the bounds."""
     frames = context.frames()
-    prepared = [(context.detector.prepare(frame.ego, frame.benign), frame) for frame in frames]
-    subsets = [(p, f, subset) for p, f in prepared for subset in combinations(sorted(f.benign), COLLABORATORS)]
-    rows: dict[str, tuple[float, ...]] = {
-        "all benign": precision((p.detect(sorted(f.benign)), f.truth) for p, f in prepared),
-        "3 benign": precision((p.detect(subset), f.truth) for p, f, subset in subsets),
-        **{f"Algorithm 1, N = {n}": _score(context, frames, _sampling(n)) for n in BUDGETS},
-        "ego only": _alone(frames),
-        "no defence": _undefended(frames),
-    }
-    upper, paper_upper = rows["3 benign"][0], paper.BUDGETS["3 benign"][0]
+    sampling = Sampling(1, TEAM_SIZE, COLLABORATORS, BUDGETS, context.scale.repeats, context.seed, _STREAM)
+    rows = {row.name: row for row in evaluate_bounds(frames, PGD(), sampling).rows}
+    upper, paper_upper = rows["3 benign"].ap50, paper.BUDGETS["3 benign"][0]
     table = []
-    for name, values in rows.items():
-        paper_ap50, paper_ap70, paper_success = paper.BUDGETS[name]
-        steps, success = values[2:] if len(values) > 2 else (None, None)
-        ratios = (round(paper_ap50 / paper_upper, 3), round(values[0] / upper, 3))
-        ours = (*_rounded(values[:2]), *ratios, paper_success, *_rounded((success, steps)))
+    for name, (paper_ap50, paper_ap70, paper_success) in paper.BUDGETS.items():
+        row = rows[name]
+        ratios = (round(paper_ap50 / paper_upper, 3), round(row.ap50 / upper, 3))
+        ours = (*_rounded((row.ap50, row.ap70)), *ratios, paper_success, *_rounded((row.success_rate, row.mean_steps)))
         table.append((name, paper_ap50, paper_ap70, *ours))
     columns: tuple[str, ...] = ("perception", "AP50 %, paper", "AP70 %, paper", "AP50", "AP70")
     columns += ("AP50 / 3 benign, paper", "AP50 / 3 benign", "success, paper", "success", "steps")
@@ -182,16 +175,11 @@ def _sampling(n: int, s: int = COLLABORATORS, threshold: float = 0.3) -> SampleC
     return SampleConsensus.independent(sampling_budget=n, collaborators=s, consensus_threshold=threshold)
 
 
-def _score(context: Context, frames: list[DecodedOnce], defense: SampleConsensus) -> tuple[float, float, float, float]:
+def _score(context: Context, frames: list[DecodedOnce], defense: Defense) -> tuple[float, float, float, float]:
     """AP50, AP70, mean steps and success rate of several runs on each frame; every defence gets the same luck."""
-    results: list[FusionResult] = []
-    truths: list[FloatArray] = []
-    for index, recorded in enumerate(frames):
-        for repeat in range(context.scale.repeats):
-            rng = context.rng(7, index, repeat)
-            results.append(fuse(recorded, defense, recorded.ego, recorded.teammates, rng=rng))
-            truths.append(recorded.truth)
-    ap50, ap70 = precision(zip((result.boxes for result in results), truths, strict=True))
+    found = [(f, f.answers(defense, [context.seed, _STREAM, i], context.scale.repeats)) for i, f in enumerate(frames)]
+    results = [result for _, of_frame in found for result in of_frame]
+    ap50, ap70 = precision((result.boxes, frame.truth) for frame, of_frame in found for result in of_frame)
     steps = float(np.mean([result.sampling_steps for result in results]))
     return ap50, ap70, steps, float(np.mean([bool(result.accepted) for result in results]))
 
@@ -204,17 +192,10 @@ def _alone(frames: Iterable[DecodedOnce]) -> tuple[float, float]:
     return precision((r.detect(), r.truth) for r in frames)
 
 
-def _error_rates(frames: list[DecodedOnce], threshold: float) -> tuple[float, float]:
+def _error_rates(frames: list[DecodedOnce], threshold: float) -> tuple[float, ...]:
     """False alarm and miss rate over all hypotheses of three."""
-    refused, missed = [], []
-    for recorded in frames:
-        for subset in combinations(recorded.team, COLLABORATORS):
-            verdict = compare(recorded.confident(), recorded.confident(subset), threshold).verdict
-            if recorded.attackers.isdisjoint(subset):
-                refused.append(verdict is Verdict.DISSENSUS)
-            else:
-                missed.append(verdict is Verdict.CONSENSUS)
-    return float(np.mean(refused)), float(np.mean(missed))
+    judged = zip(*(frame.judged(COLLABORATORS, threshold) for frame in frames), strict=True)
+    return tuple(float(np.mean(list(chain(*of_frames)))) for of_frames in judged)
 
 
 def _rounded(values: Iterable[float | None]) -> tuple[float | None, ...]:

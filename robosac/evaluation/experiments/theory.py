@@ -14,7 +14,6 @@ from robosac.evaluation.frames import DecodedOnce
 from robosac.evaluation.oracle import converse_with_oracle, simulate_sampling
 from robosac.evaluation.report import Section, Table
 from robosac.figures import new_figure
-from robosac.fusion import fuse
 from robosac.session import Session
 
 MOST_STEPS = 500
@@ -72,12 +71,11 @@ def until_consensus(steps: np.ndarray[Any, np.dtype[np.int64]]) -> tuple[float |
 def _steps_until_consensus(
     context: Context, defense: SampleConsensus, attackers: int, number: int
 ) -> np.ndarray[Any, np.dtype[np.int64]]:
-    steps = []
-    for index, recorded in enumerate(context.frames(attackers, scenes=max(1, context.scale.scenes // 4))):
-        for repeat in range(context.scale.repeats):
-            rng = context.rng(4, number, index, repeat)
-            result = fuse(recorded, defense, recorded.ego, recorded.teammates, rng=rng)
-            steps.append(result.sampling_steps if result.accepted else NEVER)
+    steps = [
+        result.sampling_steps if result.accepted else NEVER
+        for index, frame in enumerate(context.frames(attackers, scenes=max(1, context.scale.scenes // 4)))
+        for result in frame.answers(defense, [context.seed, 4, number, index], context.scale.repeats)
+    ]
     return np.array(steps, dtype=np.int64)
 
 

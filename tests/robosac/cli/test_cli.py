@@ -42,7 +42,7 @@ def test_the_version_is_told():
 @pytest.mark.parametrize(
     ("arguments", "complaint"),
     [
-        (["scene", "--out", "x.png", "--agent", "car-9"], "there are car-1"),
+        (["scene", "--out", "x.png", "--agent", "car-9"], "known: car-1"),
         (["scene", "--out", "x.nonsense"], "nonsense"),
         (["scene", "--out", "x.png", "--seed", "-1"], "--seed"),
         (["evaluate", "--attack", "nonesuch"], "known: pgd"),
