@@ -27,7 +27,7 @@ def classes(package: str) -> Iterator[type[Any]]:
     for entry in pkgutil.iter_modules(import_module(package).__path__):
         module = import_module(f"{package}.{entry.name}")
         for value in vars(module).values():
-            if isinstance(value, type) and value.__module__.startswith(module.__name__):
+            if isinstance(value, type) and f"{value.__module__}.".startswith(f"{module.__name__}."):
                 yield value
 
 

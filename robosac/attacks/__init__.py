@@ -5,7 +5,7 @@ from __future__ import annotations
 from collections.abc import Mapping
 
 from robosac.attacks.adaptive import Erase, Invent, InventSteady, Shift
-from robosac.attacks.base import Attack, IterativeAttack, Knowledge
+from robosac.attacks.base import Attack, IterativeAttack
 from robosac.attacks.campaign import BEHAVIOURS, HONEST, SEPARATOR, Campaign, lacking
 from robosac.attacks.carlini_wagner import CarliniWagner
 from robosac.attacks.geometric import NoGeometry
@@ -82,7 +82,6 @@ __all__ = [
     "InventSteady",
     "InventStill",
     "IterativeAttack",
-    "Knowledge",
     "NoGeometry",
     "Shift",
     "ShiftStill",

@@ -17,20 +17,19 @@ from robosac.detectors.base import AttackSurface
 APART_M = 5.0
 """Invented objects keep this far from one another and from everything seen."""
 SPACING_M = 8.0
-"""Between the points at which steady invented objects are."""
+"""Distance between the points where steady invented objects may stand."""
 CAR = (1.5, 0.64, 1.0, 0.0)
 """Logarithms of length and width, and the yaw's two numbers, of a car of 4.5 m by 1.9 m that heads as the ego does."""
 MAX_PLACES = 5000
-"""Places that are considered for invented objects, best first: bounds the search where there are many anchors."""
+"""So many places, the best, are considered for invented objects. It bounds the search where there are many anchors."""
 
 
 class Erase(BIM):
     """Leave what the ego sees, erase what only its teammates see.
 
-    Descends the cross-entropy between the fusion's class scores and the ego's own. Cells where the ego or the benign
-    fusion sees something count as much together as all others, which are many and empty. The attacked fusion then
-    agrees with the ego more than an honest one does, so a test that asks only whether it contradicts the ego lets it
-    through.
+    Descends the cross-entropy between the fusion's class scores and the ego's own, `balanced` over the cells where the
+    ego or the benign fusion sees something. The attacked fusion then agrees with the ego more than an honest one does.
+    A test that asks only whether it contradicts the ego lets it through.
     """
 
     name: ClassVar[str] = "erase"
@@ -68,7 +67,7 @@ class Invent(BIM):
     objects: int = 12
 
     def aim(self, surface: AttackSurface, attackers: Collection[str]) -> Aim:  # noqa: ARG002
-        """Step 2."""
+        """The loss of step 2."""
         honest = Perception.of(surface, surface.messages)
         with torch.no_grad():
             ego_logits = surface.class_logits({})
@@ -105,9 +104,9 @@ class InventSteady(Invent):
     """`Invent`, with objects that are still there in the next frame.
 
     A defence can compare frames: what is there stays, or drives on. So the places are points of a fixed grid around the
-    ego, 8 m apart, the farthest first, 5 m from everything seen; and what is descended has another term, how far the
-    objects are from cars at these points that head as the ego does. They drive along with it. Steps are smaller and
-    more than elsewhere: a signed step of 0.1 shakes boxes by itself.
+    ego, 8 m apart, the farthest first, and 5 m from everything seen. The loss has another term: how far the objects are
+    from cars at these points that head as the ego does. So they drive along with it. Steps are smaller and more than
+    elsewhere, since a signed step of 0.1 shakes the boxes by itself.
     """
 
     name: ClassVar[str] = "invent-steady"
@@ -116,7 +115,7 @@ class InventSteady(Invent):
     step_size: float = 0.04
 
     def aim(self, surface: AttackSurface, attackers: Collection[str]) -> Aim:
-        """Objects, and these at their points."""
+        """The aim of `Invent`, and the objects at their points."""
         harm, shown = super().aim(surface, attackers), geometric(surface)
         ego, honest = Perception.of(surface, ()), Perception.of(surface, surface.messages)
         seen = torch.maximum(ego.scores, honest.scores) >= SEEN
@@ -175,7 +174,7 @@ class Shift(BIM):
     distance: float = 0.9
 
     def aim(self, surface: AttackSurface, attackers: Collection[str]) -> Aim:  # noqa: ARG002
-        """Moved boxes with unchanged scores."""
+        """Boxes at other places, scores as they were."""
         shown = geometric(surface)
         ego, honest = Perception.of(surface, ()), Perception.of(surface, surface.messages)
         seen = honest.scores >= SEEN

@@ -1,6 +1,7 @@
-"""Fusions in which an attack behaves while it strikes in the whole team's, so that the blame falls elsewhere.
+"""Attacks that look honest in some fusions, so that the blame falls on somebody else.
 
-A message is the same in every fusion; what it does depends on those that it is fused with.
+A message is the same in every fusion. What it does there depends on the messages that it is fused with. So an attack
+can strike in the fusion of the whole team and behave in others.
 """
 
 from __future__ import annotations
@@ -16,7 +17,7 @@ from robosac.attacks.geometric import Perception, unnoticed
 from robosac.detectors.base import AttackSurface
 
 CALM = 0.5
-"""Weight of the fusions that should look honest against the harm in the whole team's."""
+"""Weight of looking honest, where the harm in the fusion of the whole team has the weight 1."""
 
 
 class Alibi(Protocol):
@@ -44,7 +45,7 @@ class Covering:
 
 @dataclass(frozen=True)
 class Framing:
-    """Strike only where a chosen victim is fused too, so that leaving out the victim heals the fusion.
+    """Strike only where a chosen victim is fused too. Leaving out the victim then heals the fusion.
 
     Parameters
     ----------

@@ -170,14 +170,12 @@ class Campaign:
 
         Parameters
         ----------
-        detector : Detector
-        ego : Message
         benign : mapping of teammate to Message
+            What all teammates would send if everybody were honest.
         attackers : collection of str
             All under the adversary's control.
         frame : int
             Its number in the sequence.
-        rng : numpy.random.Generator
 
         Raises
         ------

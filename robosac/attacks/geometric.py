@@ -12,7 +12,7 @@ from robosac.attacks.base import SEEN, Tensors
 from robosac.detectors.base import AttackSurface, GeometricSurface
 
 CERTAIN = 0.5
-"""Places with a score from here on hold a box for certain; these are the ones whose movement a defence can judge."""
+"""Places with a score from here on hold a box for certain. A defence can judge how these boxes move."""
 
 SHOWN = ("class_logits", "perceive")
 """What attacks that look at boxes call of an attack surface."""
@@ -77,20 +77,21 @@ def average(values: torch.Tensor, where: torch.Tensor) -> torch.Tensor:
 
 
 def displacement(geometry: torch.Tensor, wanted: torch.Tensor, where: torch.Tensor) -> torch.Tensor:
-    """How far boxes are from where they should be: mean over the places of a mask of the summed differences.
+    """How far boxes are from where they should be: the summed differences, averaged over the places of a mask.
 
-    Metres of the centre, logarithms of the sides and the two numbers of the yaw are summed as they are: for a car each
-    unit of any of them is about as bad for the overlap as that of another.
+    Metres of the centre, logarithms of the sides and the two numbers of the yaw are summed as they are. A unit of any
+    of them costs a car about as much overlap.
     """
     return average((geometry - wanted).abs().sum(dim=-1), where)
 
 
 def unnoticed(surface: AttackSurface, team: Collection[str], sent: Tensors, honest: Perception) -> torch.Tensor:
-    """How far a fusion is from what it would be if all were honest (0 at best, but for the scores' own entropy).
+    """How far a fusion is from the one in which all are honest. At best it is the entropy of the honest scores.
 
     Parameters
     ----------
     surface : AttackSurface
+        The frame.
     team : collection of str
         Who is fused.
     sent : mapping of attacker to tensor

@@ -1,4 +1,4 @@
-"""The same attacks holding still: boxes that they have no use for stay where they are."""
+"""Attacks that know the defence, and move no boxes but those that they have to."""
 
 from __future__ import annotations
 
@@ -14,17 +14,17 @@ from robosac.attacks.geometric import CERTAIN, SHOWN, Perception, displacement, 
 from robosac.detectors.base import AttackSurface
 
 STILLNESS = 2.0
-"""Weight of the boxes that should not move against the attack's own aim."""
+"""Weight of the boxes that should not move, where the attack's own aim has the weight 1."""
 
 
 @dataclass(frozen=True)
 class HoldingStill(IterativeAttack):
-    """Add to an attack's aim how far it moves the boxes that it has no use for.
+    """Add to an attack's aim how far it moves boxes that it could leave alone.
 
-    An adversarial map shakes all boxes a little, and a defence can compare where the boxes of a subset T lie with where
-    they lie once a teammate has joined. The term added is the mean `displacement` of the certain boxes of T in the
-    fusion with the attackers, for T everybody honest and for T nobody (the ego alone), times `STILLNESS`. Steps are
-    smaller and more than elsewhere: a signed step of 0.1 shakes the boxes by itself.
+    An adversarial map shakes all boxes a little. A defence can notice: it compares where the boxes of a subset T lie
+    before and after a teammate joins. So this adds, times `STILLNESS`, the mean `displacement` of the certain boxes of
+    T in the fusion with the attackers: for T all honest teammates, and for T nobody (the ego alone). Steps are smaller
+    and more than elsewhere, since a signed step of 0.1 shakes the boxes by itself.
     """
 
     needs: ClassVar[tuple[str, ...]] = SHOWN
@@ -33,7 +33,7 @@ class HoldingStill(IterativeAttack):
     step_size: float = 0.04
 
     everything: ClassVar[bool]
-    """Whether also boxes that only teammates see should stay."""
+    """Whether boxes that only teammates see should stay, too."""
 
     def aim(self, surface: AttackSurface, attackers: Collection[str]) -> Aim:
         """The attack's own aim and the term that holds still."""

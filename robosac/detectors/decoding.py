@@ -38,9 +38,9 @@ def box_codes(box: FloatArray, xs: FloatArray, ys: FloatArray) -> FloatArray:
 def decode_boxes(logits: torch.Tensor, codes: torch.Tensor, score_threshold: float) -> FloatArray:
     """Boxes of one ego.
 
-    Peaks of the heatmap (3 x 3 maxima) from the score threshold on, at most 200 of the best; of these, boxes centred
-    within the area and not on the ego itself; then greedy non-maximum suppression at IoU 0.1. The yaw is known up to
-    half a turn.
+    1. Candidates are the peaks of the heatmap (3 x 3 maxima) from the score threshold on, at most 200 of the best.
+    2. Of their boxes those remain that are centred within the area and not on the ego itself.
+    3. Non-maximum suppression at IoU 0.1 is greedy. The yaw is known up to half a turn.
 
     Parameters
     ----------

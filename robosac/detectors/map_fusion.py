@@ -15,7 +15,7 @@ import torch
 
 from robosac.boxes import FloatArray
 from robosac.detectors.base import DetectorInfo, Message
-from robosac.detectors.warp import sampling_matrix, warp
+from robosac.detectors.warp import warp
 
 FEATURES = "features"
 """The tensor of a message that holds its map."""
@@ -36,18 +36,7 @@ class MapFusionDetector(ABC):
 
     @abstractmethod
     def decoder(self, ego: Message, own: torch.Tensor) -> Decode:
-        """Do once what all fusions of a frame share.
-
-        Parameters
-        ----------
-        ego : Message
-        own : (C, H, W) tensor
-            The ego's map.
-
-        Returns
-        -------
-        Decode
-        """
+        """Do once what all fusions of a frame share. ``own`` (C, H, W) is the ego's map."""
 
     @abstractmethod
     def boxes(self, logits: torch.Tensor, codes: torch.Tensor) -> FloatArray:
@@ -61,9 +50,10 @@ class MapFusionDetector(ABC):
         """What is fused of maps as they are sent; by default all of it."""
         return sent
 
-    def sampling_matrix(self, ego_pose: FloatArray, pose: FloatArray) -> FloatArray:
-        """`robosac.detectors.warp.sampling_matrix` (2, 3) for maps whose columns run along +x."""
-        return sampling_matrix(ego_pose, pose, self.info.area_m[2])
+    @staticmethod
+    @abstractmethod
+    def sampling_matrix(ego_pose: FloatArray, pose: FloatArray) -> FloatArray:
+        """Where to look in a teammate's map: (2, 3), as `robosac.detectors.warp.sampling_matrix` gives it."""
 
     def matrices(self, ego: Message, teammates: Collection[Message]) -> torch.Tensor:
         """Where in each teammate's map to look for the places of the ego's: (n, 2, 3), as `warp` takes them."""

@@ -51,15 +51,12 @@ def add_adversary(
 
     Parameters
     ----------
-    network : MeanFusionNetwork
     fused : (n, 64, 32, 32) tensor
         Benign fused maps.
     matrices : n sequences of (2, 3) ndarray
         `sampling_matrix` of each teammate of each ego.
     goal : four tensors
         `robosac.training.loss.targets`, stacked over n.
-    config : AdversaryConfig
-    rng : numpy.random.Generator
 
     Returns
     -------

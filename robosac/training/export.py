@@ -31,12 +31,8 @@ def export_weights(
 
     Parameters
     ----------
-    network : MeanFusionNetwork
-    config : TrainingConfig
-    point : OperatingPoint
     command : str
         What a user types to make these weights again.
-    path : Path
 
     Returns
     -------

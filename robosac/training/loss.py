@@ -33,8 +33,9 @@ def targets(near: FloatArray, hits: IntArray) -> tuple[FloatArray, FloatArray, F
     Returns
     -------
     heat, weight : (64, 64) float32 ndarray
-        Gaussian heatmap (1 in the cell of a centre), and 0 where the loss looks away, else 1.
+        Gaussian heatmap (1 in the cell of a centre), and its weight in the loss: 0 or 1.
     codes, code_weight : (6, 64, 64), (64, 64) float32 ndarray
+        Box codes, and their weight in the loss: how close the cell is to a centre.
     """
     xs, ys = cell_centres()
     near_distance = np.hypot(xs, ys) < OWN_BODY_M

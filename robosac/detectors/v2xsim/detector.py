@@ -25,6 +25,8 @@ from robosac.detectors.v2xsim.voxels import AREA_M, PACKED_SHAPE, BoolArray, occ
 from robosac.detectors.warp import sampling_matrix
 from robosac.detectors.weights_file import WeightsError, read_weights, save_weights
 
+NAMES = {fusion: f"v2x-sim-{fusion}" for fusion in FUSIONS}
+"""The detectors of this family, by fusion."""
 _GRID = "grid"
 _MIRROR = np.array([[1.0, -1.0, -1.0], [-1.0, 1.0, 1.0]])
 
@@ -36,8 +38,10 @@ def write_weights(state: Mapping[str, object], fusion: str, path: Path) -> dict[
     ----------
     state : mapping of name to tensor
         See `select_published`.
-    fusion : {"mean", "max", "sum"}
+    fusion : str
+        One of `NAMES`.
     path : Path
+        The file to write.
 
     Returns
     -------
@@ -52,26 +56,13 @@ def write_weights(state: Mapping[str, object], fusion: str, path: Path) -> dict[
         If there is no such fusion.
     """
     recipe = {
-        "detector": name_of(fusion),
+        "detector": NAMES[fusion],
         "fusion": fusion,
         "command": f"robosac convert-checkpoint CHECKPOINT.pth OUT.safetensors --fusion {fusion}",
         "score_threshold": SCORE_THRESHOLD,
         "consensus_score": SCORE_THRESHOLD,
     }
     return save_weights(select_published(state), recipe, path)
-
-
-def name_of(fusion: str) -> str:
-    """The name of the detector with a fusion; KeyError if there is no such fusion."""
-    if fusion not in FUSIONS:
-        raise KeyError(f"no fusion {fusion!r}; known: {', '.join(FUSIONS)}")
-    return f"v2x-sim-{fusion}"
-
-
-def mirrored_matrix(ego_pose: FloatArray, pose: FloatArray) -> FloatArray:
-    """`sampling_matrix` (2, 3) for maps whose columns run along *minus* x."""
-    matrix: FloatArray = sampling_matrix(ego_pose, pose, AREA_M) * _MIRROR
-    return matrix
 
 
 class V2XSimDetector(MapFusionDetector):
@@ -91,12 +82,12 @@ class V2XSimDetector(MapFusionDetector):
         If the file is missing, damaged, or of another network.
     """
 
-    opens: ClassVar[tuple[str, ...]] = tuple(map(name_of, FUSIONS))
+    opens: ClassVar[tuple[str, ...]] = tuple(NAMES.values())
 
     def __init__(self, weights: Path) -> None:
         tensors, self.recipe = read_weights(weights)
         fusion = self.recipe.get("fusion", "mean")
-        if fusion not in FUSIONS or self.recipe.get("detector") != name_of(fusion):
+        if fusion not in FUSIONS or self.recipe.get("detector") != NAMES[fusion]:
             raise WeightsError(
                 f"{weights} is for the detector {self.recipe.get('detector')!r} with the fusion {fusion!r}, not one of "
                 f"{', '.join(self.opens)}"
@@ -109,7 +100,7 @@ class V2XSimDetector(MapFusionDetector):
         self._score_threshold = float(self.recipe.get("score_threshold", SCORE_THRESHOLD))
         features = TensorSpec("float32", (CHANNELS, MAP, MAP))
         self.info = DetectorInfo(
-            name=name_of(fusion),
+            name=NAMES[fusion],
             tensors={
                 "ego": {FEATURES: features, _GRID: TensorSpec("uint8", PACKED_SHAPE)},
                 "teammate": {FEATURES: features},
@@ -157,9 +148,11 @@ class V2XSimDetector(MapFusionDetector):
         """Boxes (393216, 6) of all anchors."""
         return geometry(codes)
 
-    def sampling_matrix(self, ego_pose: FloatArray, pose: FloatArray) -> FloatArray:
-        """As `mirrored_matrix` makes it."""
-        return mirrored_matrix(ego_pose, pose)
+    @staticmethod
+    def sampling_matrix(ego_pose: FloatArray, pose: FloatArray) -> FloatArray:
+        """`robosac.detectors.warp.sampling_matrix` (2, 3) for maps whose columns run along *minus* x."""
+        matrix: FloatArray = sampling_matrix(ego_pose, pose, AREA_M) * _MIRROR
+        return matrix
 
 
 def _as_maps(grid: BoolArray) -> torch.Tensor:

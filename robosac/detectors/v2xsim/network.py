@@ -96,10 +96,7 @@ _ALL = (*(layer for level in (*_ENCODER, _DEEPEST, *_DECODER) for layer in level
 
 def published_shapes() -> dict[str, tuple[int, ...]]:
     """Names and shapes of the tensors of a published checkpoint that are used, without the prefix ``module.``."""
-    shapes: dict[str, tuple[int, ...]] = {}
-    for layer in _ALL:
-        shapes |= layer.shapes()
-    return shapes
+    return {name: shape for layer in _ALL for name, shape in layer.shapes().items()}
 
 
 def select_published(state: Mapping[str, object]) -> dict[str, torch.Tensor]:

@@ -45,7 +45,7 @@ def test_the_version_is_told():
         (["scene", "--out", "x.png", "--agent", "car-9"], "known: car-1"),
         (["scene", "--out", "x.nonsense"], "nonsense"),
         (["scene", "--out", "x.png", "--seed", "-1"], "--seed"),
-        (["evaluate", "--attack", "nonesuch"], "known: pgd"),
+        (["evaluate", "--attack", "nonesuch"], "no attack 'nonesuch'"),
         (["evaluate", "--attackers", "3", "--collaborators", "3"], "free of 3 attackers"),
         (["evaluate", "--weights", "/nowhere"], "no detector '/nowhere': give one of"),
         (["evaluate", "--weights", "."], "not a readable"),

@@ -1,15 +1,12 @@
 import subprocess
 import sys
 import tomllib
-from importlib.metadata import EntryPoint
 from pathlib import Path
 
 import pytest
-import typer
 from typer.testing import CliRunner
 
 from robosac.cli import app, commands
-from robosac.extras import MissingExtra
 
 runner = CliRunner()
 PROJECT = tomllib.loads((Path(__file__).parents[3] / "pyproject.toml").read_text())["project"]
@@ -17,12 +14,16 @@ BROUGHT = PROJECT["entry-points"][commands.GROUP]
 
 
 @pytest.fixture
-def brought(monkeypatch):
-    """Entry points of other packages, whatever is installed; by default those that this project declares."""
+def brought(monkeypatch, tmp_path):
+    """Commands of other packages instead of those that are installed; by default those that this project declares."""
+    info = tmp_path / "robosac-0.dist-info"  # found first, it stands for the installed package of that name
+    info.mkdir()
+    (info / "METADATA").write_text("Metadata-Version: 2.1\nName: robosac\nVersion: 0\n")
+    monkeypatch.syspath_prepend(tmp_path)
 
     def bring(points):
-        found = [EntryPoint(name, place, commands.GROUP) for name, place in points.items()]
-        monkeypatch.setattr(commands, "entry_points", lambda group: found if group == commands.GROUP else [])
+        lines = [f"[{commands.GROUP}]", *(f"{name} = {place}" for name, place in points.items())]
+        (info / "entry_points.txt").write_text("\n".join(lines))
 
     bring(BROUGHT)
     return bring
@@ -66,11 +67,10 @@ assert not names, names
     subprocess.run([sys.executable, "-c", code], check=True, stdout=subprocess.DEVNULL)
 
 
-def test_a_command_that_another_package_brings_is_run(brought, tmp_path, monkeypatch):
+def test_a_command_that_another_package_brings_is_run(brought, tmp_path):
     (tmp_path / "other_package.py").write_text(
         'def greet(name: str) -> None:\n    """Greet.\n\n    Further words.\n    """\n    print(f"Hello {name}")\n'
     )
-    monkeypatch.syspath_prepend(tmp_path)
     brought({"greet": "other_package:greet", "scene": "other_package:greet"})
     assert commands.places()["scene"] == commands.OWN["scene"]
     listed = runner.invoke(app, ["--help"]).output
@@ -81,9 +81,8 @@ def test_a_command_that_another_package_brings_is_run(brought, tmp_path, monkeyp
 
 
 @pytest.mark.parametrize("place", ["nonesuch_package.sub:main", "broken_package:main", "sys:exit"])
-def test_a_command_that_cannot_be_read_is_listed_without_words(place, brought, tmp_path, monkeypatch):
+def test_a_command_that_cannot_be_read_is_listed_without_words(place, brought, tmp_path):
     (tmp_path / "broken_package.py").write_text("def main(:")
-    monkeypatch.syspath_prepend(tmp_path)
     brought({"odd-one": place})
     result = runner.invoke(app, ["--help"])
     assert result.exit_code == 0, result.output
@@ -96,16 +95,12 @@ def test_commands_are_completed_by_name(brought):
     assert result.output.split() == ["fleet", "flood"]
 
 
-def test_a_missing_extra_ends_a_command_in_one_line(monkeypatch):
-    def load(name, place):
-        def needing() -> None:
-            raise MissingExtra("matplotlib is not installed")
-
-        alone = typer.Typer()
-        alone.command(name)(needing)
-        return typer.main.get_command(alone)
-
-    monkeypatch.setattr(commands, "load", load)
-    result = runner.invoke(app, ["scene"])
+def test_a_missing_extra_ends_a_command_in_one_line(brought, tmp_path):
+    (tmp_path / "needing_package.py").write_text(
+        "from robosac.extras import MissingExtra\n"
+        "def main() -> None:\n    raise MissingExtra('matplotlib is not installed')\n"
+    )
+    brought({"need": "needing_package:main"})
+    result = runner.invoke(app, ["need"])
     assert result.exit_code == 1
     assert result.output == "Error: matplotlib is not installed\n"

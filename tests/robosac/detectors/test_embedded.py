@@ -1,4 +1,6 @@
 import json
+import sys
+from types import SimpleNamespace
 
 import numpy as np
 import pytest
@@ -30,6 +32,14 @@ def test_the_registry_loads_it(detector):
     assert load().info == detector.info
     with pytest.raises(ValueError, match="give one of intersection-mean"):
         load("nonesuch")
+
+
+def test_what_is_only_served_needs_to_prepare_frames_and_no_more(detector, monkeypatch):
+    served = SimpleNamespace(info=detector.info, prepare=detector.prepare)
+    monkeypatch.setitem(sys.modules, "own", SimpleNamespace(whole=lambda: served, bare=object))
+    assert load("own:whole") is served
+    with pytest.raises(ValueError, match=r"own:bare made no detector but <.*lacks info \(Name.* prepare \(Do"):
+        load("own:bare")
 
 
 def test_a_message_is_what_the_detector_declares(detector, benign, ego_message):

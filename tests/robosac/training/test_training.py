@@ -43,7 +43,11 @@ def test_training_learns_and_resumes_where_it_stopped(tmp_path):
 
     with pytest.raises(Stop):
         train_network(TINY, tmp_path / "parts.pt", interrupt, checkpoint_every=8)
-    resumed = train_network(TINY, tmp_path / "parts.pt", silent)
+    steps = []
+    resumed = train_network(
+        TINY, tmp_path / "parts.pt", lambda stage, done, *_: steps.append(done) if stage == "train" else None
+    )
+    assert steps == list(range(25, 41))
     for name, tensor in whole.state_dict().items():
         torch.testing.assert_close(resumed.state_dict()[name], tensor)
 

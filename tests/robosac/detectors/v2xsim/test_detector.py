@@ -12,7 +12,6 @@ from robosac.detectors import EmbeddedDetector, Message, V2XSimDetector, Weights
 from robosac.detectors.base import for_role
 from robosac.detectors.embedded import SHIPPED_WEIGHTS
 from robosac.detectors.v2xsim import write_weights
-from robosac.detectors.v2xsim.detector import mirrored_matrix
 from robosac.detectors.v2xsim.fusions import FUSIONS
 from robosac.detectors.warp import warp
 from robosac.detectors.weights_file import read_weights, tensors_digest
@@ -123,7 +122,7 @@ def test_a_thing_lands_where_the_ego_has_it():
     thing = np.array([[1.0, 4.0, 1.0, 1.0, 0.0]])
     seen, expected = from_world(thing, there)[0], from_world(thing, here)[0]
     bump = torch.from_numpy(np.exp(-((xs - seen[0]) ** 2 + (ys - seen[1]) ** 2) / 18.0))[None, None]
-    moved = warp(bump, torch.from_numpy(mirrored_matrix(here, there))[None])[0, 0].numpy()
+    moved = warp(bump, torch.from_numpy(V2XSimDetector.sampling_matrix(here, there))[None])[0, 0].numpy()
     centre = [(moved * xs).sum() / moved.sum(), (moved * ys).sum() / moved.sum()]
     np.testing.assert_allclose(centre, expected[:2], atol=0.15)
 

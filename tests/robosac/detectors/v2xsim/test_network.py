@@ -3,7 +3,7 @@ import pytest
 import torch
 
 from robosac.detectors import Message, WeightsError
-from robosac.detectors.v2xsim.detector import mirrored_matrix
+from robosac.detectors.v2xsim import V2XSimDetector
 from robosac.detectors.v2xsim.network import V2XSimNetwork, published_shapes, select_published
 from robosac.detectors.v2xsim.voxels import from_indices, unpack
 from robosac.detectors.warp import warp
@@ -35,7 +35,7 @@ def warped(team):
 
 
 def moved(ego: Message, teammate: Message) -> torch.Tensor:
-    matrix = torch.from_numpy(mirrored_matrix(ego.pose, teammate.pose)).float()
+    matrix = torch.from_numpy(V2XSimDetector.sampling_matrix(ego.pose, teammate.pose)).float()
     return warp(torch.from_numpy(teammate.tensors["features"])[None], matrix[None])[0]
 
 
@@ -73,7 +73,7 @@ def test_messages_are_the_published_feature_maps(team, parity):
 
 def test_the_sampling_matrix_is_the_published_one_seen_unflipped(team, parity):
     flip = np.array([[1, -1, 1], [-1, 1, -1]])
-    ours = mirrored_matrix(team[EGO].pose, team[0].pose)
+    ours = V2XSimDetector.sampling_matrix(team[EGO].pose, team[0].pose)
     np.testing.assert_allclose(ours * flip, parity["theta_0_to_1"], atol=1e-6)
 
 
