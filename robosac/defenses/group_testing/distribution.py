@@ -18,8 +18,10 @@ _LIMITS = ((BENIGN, BENIGN), (BENIGN, ATTACKS), (ATTACKS, BENIGN), (PLAIN, PLAIN
 
 
 class Distribution:
-    """Probabilities over kinds of attack k, "nobody attacks" being k = 0, and states z of the teammates: plain,
-    complementary (benign, and it sees much of what the others do not) or attacking.
+    """Probabilities over kinds of attack k and states z of the teammates.
+
+    k = 0 means that nobody attacks. A teammate is plain, complementary (benign, and it sees much of what the others do
+    not), or attacking.
 
     ``P(z, k) = q_k * prod over blocks b of P_b(z within b | k)``: inside a block all states are held, between blocks
     (given the kind) independence is assumed.

@@ -223,8 +223,8 @@ class Posterior(Distribution):
         return [block.table[:1] for block in self._blocks], [block.table[1:] for block in self._blocks]
 
     def _mix(self, after: list[FloatArray], awakened: list[FloatArray]) -> None:
-        """Attacked teams go on as in ``after`` (K, 3 ** n), and "nobody attacks" turns into what is in ``awakened``
-        (1, 3 ** n), some of which is still nobody.
+        """Let attacked teams go on as in ``after`` (K, 3 ** n), and a benign team as in ``awakened`` (1, 3 ** n), in
+        which attackers may have awoken or not.
         """
         new = self._weights[0] / self._kinds
         old = self._weights[1:]
