@@ -72,7 +72,7 @@ class Distribution:
             starts = np.cumsum([0, *map(len, self._blocks)])
             place = np.arange(starts[-1])[:, None] - starts[:-1]
             inside = (place >= 0) & (place < np.diff(starts))
-            self._powers = np.where(inside, 2.0**place, 0.0)
+            self._powers = inside * 2.0 ** (place * inside)
         return (subsets.astype(np.float64) @ self._powers).astype(np.int64).T
 
     def rows(self, which: IntArray, masks: IntArray) -> BoolArray:

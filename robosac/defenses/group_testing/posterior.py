@@ -76,10 +76,8 @@ class Posterior(Distribution):
         self._attacker_prior = attacker_prior
         self._exact, self._most = limits
         prior = np.array([1 - attack_prior, *[attack_prior / kinds] * kinds])
-        parts = []
-        for part in np.array_split(
-            np.arange(len(team)), 1 if len(team) <= self._exact else -(-len(team) // self._most)
-        ):
+        parts, count = [], 1 if len(team) <= self._exact else -(-len(team) // self._most)
+        for part in np.array_split(np.arange(len(team)), count):
             attacked = np.repeat(sets.prior(len(part), attacker_prior), kinds, axis=0)
             table = np.concatenate([sets.prior(len(part), 0.0), attacked])
             parts.append(Block([team[i] for i in part], table))
