@@ -16,7 +16,10 @@ _PART_OF_A_WORD = re.compile(r"[\w.~+/=-]*+$")
 
 
 def in_short(text: str) -> str:
-    """At most `MESSAGE_CHARS` of a text, without long words, bytes and rows of numbers; of such a text again itself."""
+    """At most `MESSAGE_CHARS` of a text, without long words, bytes and rows of numbers.
+
+    To shorten a text again changes nothing.
+    """
     text = _cut(text, _LOOKED_AT_CHARS)
     for unkept in _UNKEPT:
         text = unkept.sub("<...>", text)
@@ -24,7 +27,7 @@ def in_short(text: str) -> str:
 
 
 def _cut(text: str, most: int) -> str:
-    """At most so many characters; no part of a word is left, since by its part a secret would not be known."""
+    """At most so many characters, never a part of a word: half a secret would not be recognised as one."""
     return text if len(text) <= most else _PART_OF_A_WORD.sub("", text[: most - 3]) + "..."
 
 

@@ -11,7 +11,7 @@ if TYPE_CHECKING:
 
 
 def need_figures() -> None:
-    """See to it before long work that its pictures can be drawn.
+    """Refuse before long work if its pictures cannot be drawn.
 
     Raises
     ------
@@ -22,7 +22,7 @@ def need_figures() -> None:
 
 
 def new_figure(width: float, height: float) -> Figure:
-    """An empty figure of so many inches, whose parts make room for one another.
+    """An empty figure of so many inches; its parts are laid out so that they do not overlap.
 
     Raises
     ------

@@ -12,7 +12,7 @@ from robosac.defenses import trusted_in
 def contradictions(
     answer: FrameAnswered, *, ego_id: str | None, threshold: float | None, trusted: Collection[str] | None
 ) -> Iterator[str]:
-    """Everything that cannot be true together in a record.
+    """Everything that cannot be true together in a record. What needs an argument that is None is not checked.
 
     Parameters
     ----------
@@ -21,7 +21,7 @@ def contradictions(
     threshold : float or None
         Jaccard index from which on a hypothesis is in consensus.
     trusted : collection of str or None
-        The trust list before the frame. What is None is not known, and what needs it not checked.
+        The trust list before the frame.
     """
     yield from _of_answer(answer, trusted)
     yield from _of_hypotheses(answer, threshold)

@@ -44,7 +44,7 @@ class Proof(Typed):
 
 
 class _Event(Typed):
-    """What all have."""
+    """What all events have."""
 
     time: str = Field(default_factory=now)
 
@@ -92,9 +92,9 @@ class FrameAnswered(_Event, FrameAnswer):
     """A frame is decided: the answer, and all that it takes to recompute it.
 
     ``seed`` is that of the frame's draws, committed to in an earlier record. ``messages`` are those in the frame, the
-    ego's among them. ``previous_frame`` is that of the previous answer which the fusion was given. Of refusals that
-    were too many to get a record each, ``unlogged_refusals`` has the number by vehicle, and under ``?`` those of
-    callers without a token that counts.
+    ego's among them. ``previous_frame`` is the frame of the previous answer that the fusion was given. Refusals that
+    were too many to get a record each are counted in ``unlogged_refusals``, by vehicle; ``?`` stands for callers
+    without a valid token.
     """
 
     event: Literal["frame_answered"] = "frame_answered"
@@ -128,7 +128,7 @@ class MessageRefused(_Event):
 
 
 class AccessRefused(_Event):
-    """Somebody came without a token that counts; ``vehicle_id`` is whose it was, None if it is none of ours."""
+    """Somebody came without a valid token; ``vehicle_id`` is whose it was, None if it was nobody's."""
 
     event: Literal["access_refused"] = "access_refused"
     vehicle_id: str | None
@@ -145,7 +145,7 @@ class TokenRenewed(_Event):
 
 
 class Equivocation(_Event):
-    """A vehicle said two different things about one frame. What the ego said first is signed in its frame's record."""
+    """A vehicle sent two different messages for one frame. The ego's first is signed in its frame's record."""
 
     event: Literal["equivocation"] = "equivocation"
     vehicle_id: str

@@ -5,18 +5,19 @@ from __future__ import annotations
 import json
 import math
 from collections import deque
-from collections.abc import Iterable, Mapping
+from collections.abc import Iterable, Iterator, Mapping
 from dataclasses import dataclass
 from typing import Any
 
 import numpy as np
 
 from robosac import wire
+from robosac.answers import TestedHypothesis
 from robosac.audit.events import FrameAnswered, RecordError, SessionOpened, TeamChanged, event_on
 from robosac.budget import DomainError
 from robosac.calibration import calibration_digest, calibration_of
 from robosac.deadline import Recorded
-from robosac.defenses import Defense, Kinds, State, build, read_settings
+from robosac.defenses import Defense, Kinds, Outcome, State, build, read_settings
 from robosac.detectors import Message, Preparer
 from robosac.faults import in_short
 from robosac.fusion import FusionResult, fuse
@@ -150,10 +151,8 @@ def replay(decision: LoggedDecision, body: bytes, detector: Preparer, kinds: Kin
     except DomainError as error:
         raise ReplayError(f"the log's settings make no defence: {error}") from error
     messages = _read_messages(decision, body, detector)
-    wrong = _compare_digests(logged, messages)
-    if wrong:
-        return wrong
-    return _compare(logged, _fuse(decision, defense, messages, detector))
+    wrong = list(_compare_digests(logged, messages))
+    return wrong or list(_compare(logged, _fuse(decision, defense, messages, detector)))
 
 
 def _before(answer: FrameAnswered, recent: Iterable[FrameAnswered]) -> PreviousAnswer | None:
@@ -183,16 +182,14 @@ def _read_messages(decision: LoggedDecision, body: bytes, detector: Preparer) ->
     return messages
 
 
-def _compare_digests(logged: FrameAnswered, messages: dict[str, Message]) -> list[Difference]:
-    wrong = []
+def _compare_digests(logged: FrameAnswered, messages: dict[str, Message]) -> Iterator[Difference]:
     for name in sorted(logged.messages.keys() | messages.keys()):
         if name not in messages:
-            wrong.append(Difference("messages", f"that of {name} is missing"))
+            yield Difference("messages", f"that of {name} is missing")
         elif name not in logged.messages:
-            wrong.append(Difference("messages", f"that of {name} is not in the log"))
+            yield Difference("messages", f"that of {name} is not in the log")
         elif wire.content_digest(logged.frame, name, messages[name]) != logged.messages[name].digest:
-            wrong.append(Difference("messages", f"that of {name} is not the one in the log"))
-    return wrong
+            yield Difference("messages", f"that of {name} is not the one in the log")
 
 
 def _fuse(decision: LoggedDecision, defense: Defense, messages: dict[str, Message], detector: Preparer) -> FusionResult:
@@ -210,49 +207,39 @@ def _fuse(decision: LoggedDecision, defense: Defense, messages: dict[str, Messag
     )
 
 
-def _compare(logged: FrameAnswered, made: FusionResult) -> list[Difference]:
-    differences = [
-        Difference(what, f"{_shown(now)}, logged {_shown(then)}")
-        for what, now, then in (
-            ("fault", made.fault, None if logged.fault is None else in_short(logged.fault)),
-            ("out_of_time", made.out_of_time, logged.out_of_time),
-            ("source", made.source.value, logged.source.value),
-            ("accepted", list(made.accepted), list(logged.accepted)),
-            *(
-                ("rejected", f"{name} {now.reason.value}", f"{name} {_reason(logged, name)}")
-                for name, now in made.rejected.items()
-            ),
-            ("state", dict(made.state), dict(logged.state)),
-        )
-        if not _agree(now, then)
+def _compare(logged: FrameAnswered, made: FusionResult) -> Iterator[Difference]:
+    reasons = {name: why.reason.value for name, why in logged.rejected.items()}
+    compared: list[tuple[str, Any, Any]] = [
+        ("fault", made.fault, None if logged.fault is None else in_short(logged.fault)),
+        ("out_of_time", made.out_of_time, logged.out_of_time),
+        ("source", made.source.value, logged.source.value),
+        ("accepted", list(made.accepted), list(logged.accepted)),
     ]
-    return [*differences, *_compare_hypotheses(logged, made), *_compare_boxes(logged, made)]
-
-
-def _reason(logged: FrameAnswered, name: str) -> str | None:
-    return logged.rejected[name].reason.value if name in logged.rejected else None
-
-
-def _compare_hypotheses(logged: FrameAnswered, made: FusionResult) -> list[Difference]:
-    if len(made.hypotheses) != len(logged.hypotheses):
-        return [Difference("hypotheses", f"{len(made.hypotheses)} of them, logged {len(logged.hypotheses)}")]
-    return [
-        Difference(
-            "hypotheses",
-            f"{i}: {', '.join(now.teammates)}: {now.jaccard_index:.9g} ({now.verdict}), "
-            f"logged {', '.join(then.teammates)}: {then.jaccard_index:.9g} ({then.verdict})",
-        )
-        for i, (now, then) in enumerate(zip(made.hypotheses, logged.hypotheses, strict=True))
-        if (now.teammates, now.verdict) != (then.teammates, then.verdict)
-        or abs(now.jaccard_index - then.jaccard_index) > JACCARD_TOLERANCE
-    ]
-
-
-def _compare_boxes(logged: FrameAnswered, made: FusionResult) -> list[Difference]:
+    for name, why in made.rejected.items():
+        compared.append(("rejected", f"{name} {why.reason.value}", f"{name} {reasons.get(name)}"))
+    compared.append(("state", dict(made.state), dict(logged.state)))
+    for what, now, then in compared:
+        if not _agree(now, then):
+            yield Difference(what, f"{_shown(now)}, logged {_shown(then)}")
+    yield from _compare_hypotheses(logged, made)
     if made.boxes.shape != logged.boxes.shape:
-        return [Difference("boxes", f"{len(made.boxes)} of them, logged {len(logged.boxes)}")]
-    farthest = float(np.abs(made.boxes - logged.boxes).max(initial=0.0))
-    return [] if farthest <= BOX_TOLERANCE else [Difference("boxes", f"up to {farthest:.3g} from those logged")]
+        yield Difference("boxes", f"{len(made.boxes)} of them, logged {len(logged.boxes)}")
+    elif (farthest := float(np.abs(made.boxes - logged.boxes).max(initial=0.0))) > BOX_TOLERANCE:
+        yield Difference("boxes", f"up to {farthest:.3g} from those logged")
+
+
+def _compare_hypotheses(logged: FrameAnswered, made: FusionResult) -> Iterator[Difference]:
+    if len(made.hypotheses) != len(logged.hypotheses):
+        yield Difference("hypotheses", f"{len(made.hypotheses)} of them, logged {len(logged.hypotheses)}")
+        return
+    for i, (now, then) in enumerate(zip(made.hypotheses, logged.hypotheses, strict=True)):
+        apart = abs(now.jaccard_index - then.jaccard_index) > JACCARD_TOLERANCE
+        if apart or (now.teammates, now.verdict) != (then.teammates, then.verdict):
+            yield Difference("hypotheses", f"{i}: {_told(now)}, logged {_told(then)}")
+
+
+def _told(tested: Outcome | TestedHypothesis) -> str:
+    return f"{', '.join(tested.teammates)}: {tested.jaccard_index:.9g} ({tested.verdict})"
 
 
 def _agree(now: Any, then: Any) -> bool:

@@ -76,8 +76,8 @@ class Finding:
 def verify(lines: Iterable[bytes], head: str | None = None) -> list[Finding]:
     """Check an audit log.
 
-    A line is read only once, and no more is kept than what the next has to agree with. What is broken is reported once:
-    a record is held against earlier ones only as far as an unbroken chain leads back to them.
+    A line is read only once, and no more is kept than what the next has to agree with. Each fault is reported once: a
+    record is compared with earlier ones only if an unbroken chain leads back to them.
 
     Parameters
     ----------
@@ -101,7 +101,7 @@ def verify(lines: Iterable[bytes], head: str | None = None) -> list[Finding]:
 
 @dataclass
 class _History:
-    """What records must agree with; None or absent where it is not known."""
+    """What the next record must agree with; None or absent if it is not known."""
 
     ego_id: str | None = None
     threshold: float | None = None
@@ -112,7 +112,7 @@ class _History:
     doubtful: set[str] = field(default_factory=set)
 
     def doubt(self) -> None:
-        """Forget what a record that is missing or changed may have settled otherwise."""
+        """Forget all that a missing or changed record may have changed."""
         self.commitment = self.frame = self.trusted = None
         self.doubtful = set(self.keys)
 

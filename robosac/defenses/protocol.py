@@ -5,8 +5,8 @@ for each that was tested, and returns a `Decision`. It knows nothing of detector
 outcomes than it proposed hypotheses, the time is up: it must return its decision from what it knows.
 
 What a defence remembers between frames is its *state*, a plain dict of JSON values that the caller keeps per session.
-Most of it is the defence's own business. What others read of it too, whom it trusts, names and suspects, is put in by
-`remembered` and read by `trusted_in`, `named_in` and `suspicion_in`; nobody else knows under which names it is kept.
+Most of it only the defence reads. Others read whom it trusts, names and suspects: `remembered` writes that, and
+`trusted_in`, `named_in` and `suspicion_in` read it. No other code knows its keys.
 """
 
 from __future__ import annotations
@@ -129,7 +129,7 @@ class Rejection:
         JSON values; for ``dissensus`` the indices of the hypotheses that speak against the teammate and their lowest
         Jaccard index.
     distrust : Distrust or None
-        Why, for ``distrusted``. Whoever the state names need not be said here.
+        Why, if the reason is ``distrusted``; may be left out of a teammate that the state names.
     """
 
     reason: Reason

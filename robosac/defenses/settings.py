@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import inspect
-from typing import TYPE_CHECKING, ClassVar, Self, cast, get_args
+from typing import TYPE_CHECKING, Any, ClassVar, Self, cast, get_args
 
 from pydantic import BaseModel, ConfigDict, Field
 
@@ -14,6 +14,12 @@ if TYPE_CHECKING:
     from robosac.defenses.group_testing import Calibration
 
 
+def _say_in_short(schema: dict[str, Any], model: type[DefenseSettings]) -> None:
+    """In the API's description a line says what a defence does, and sessions have to say which one they want."""
+    schema["description"] = model.summary()
+    schema["required"] = ["kind", *(name for name in schema.get("required", ()) if name != "kind")]
+
+
 class DefenseSettings(BaseModel):
     """Settings of a defence, as sessions and audit logs keep them.
 
@@ -22,7 +28,7 @@ class DefenseSettings(BaseModel):
     a setting ``attacker_ratio``. The class ``makes`` the defence, or has the methods of `Defense` itself.
     """
 
-    model_config = ConfigDict(extra="forbid", frozen=True, allow_inf_nan=False)
+    model_config = ConfigDict(extra="forbid", frozen=True, allow_inf_nan=False, json_schema_extra=_say_in_short)
 
     makes: ClassVar[type[Defense] | None] = None
     """Class of the defence, which takes the settings as its arguments; None where these settings are the defence."""

@@ -60,30 +60,18 @@ class StaticTeam(Sampling):
         trusted: Sequence[str] = trusted_in(state)
         present: Hypothesis = tuple(name for name in team if name in trusted)
         waited = int(state["frames_since_check"]) + 1
-        if present:
-            if self.recheck_every is None or waited < self.recheck_every:
-                return self._decide(team, present, Source.TRUSTED, outcomes, trusted, waited)
-            tested = yield [present]
-            outcomes.extend(tested)
-            if not tested or tested[0].verdict is Verdict.NO_EVIDENCE:
-                return self._decide(team, present, Source.TRUSTED, outcomes, trusted, waited)
-            if tested[0].verdict is Verdict.CONSENSUS:
-                return self._decide(team, present, Source.CONSENSUS, outcomes, trusted, 0)
-            trusted = []
-        accepted = yield from self.search(team, rng, outcomes, spent=len(outcomes))
-        source = Source.CONSENSUS if accepted else Source.EGO_ONLY
-        kept = [*trusted, *(name for name in accepted if name not in trusted)]
-        return self._decide(team, accepted, source, outcomes, kept, 0)
-
-    def _decide(
-        self,
-        team: Sequence[str],
-        accepted: Hypothesis,
-        source: Source,
-        outcomes: Sequence[Outcome],
-        trusted: Sequence[str],
-        waited: int,
-    ) -> Decision:
+        if present and self.recheck_every is not None and waited >= self.recheck_every:
+            outcomes.extend((yield [present]))
+        verdict = outcomes[0].verdict if outcomes else Verdict.NO_EVIDENCE
+        if present and verdict is Verdict.NO_EVIDENCE:
+            accepted, source = present, Source.TRUSTED
+        elif present and verdict is Verdict.CONSENSUS:
+            accepted, source, waited = present, Source.CONSENSUS, 0
+        else:
+            kept = [] if present else trusted
+            accepted = yield from self.search(team, rng, outcomes, spent=len(outcomes))
+            trusted = [*kept, *(name for name in accepted if name not in kept)]
+            source, waited = Source.CONSENSUS if accepted else Source.EGO_ONLY, 0
         untrusted = Rejection(Reason.DISTRUSTED, distrust=Distrust.UNTRUSTED)
         otherwise = untrusted if source is Source.TRUSTED else Rejection(Reason.NOT_SAMPLED)
         return Decision(

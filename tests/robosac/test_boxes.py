@@ -4,7 +4,8 @@ import shapely
 from hypothesis import given
 from hypothesis import strategies as st
 
-from robosac.boxes import corners, from_corners, from_world, nms, pairwise_iou, pose_matrix
+from robosac.boxes import corners, from_world, nms, pairwise_iou, pose_matrix
+from tests.robosac.rectangles import from_corners
 
 coordinate = st.floats(-20, 20)
 side = st.floats(0.05, 12)

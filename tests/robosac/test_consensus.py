@@ -2,9 +2,10 @@ import numpy as np
 import pytest
 
 from robosac.answers import Verdict
-from robosac.boxes import from_corners, pairwise_iou
+from robosac.boxes import pairwise_iou
 from robosac.consensus import compare, match
 from tests.conftest import GOLDEN
+from tests.robosac.rectangles import from_corners
 
 EMPTY = np.empty((0, 5))
 ROW = np.array([[10.0 * i, 0.0, 4.0, 2.0, 0.0] for i in range(10)])

@@ -29,8 +29,10 @@ _CERTAIN = 1e-12
 
 
 def candidates(posterior: Posterior, present: BoolArray, decoded: BoolArray) -> BoolArray:
-    """Subsets worth considering, without those decoded: all in a small team; in a larger one the best answers, and up
-    to four unresolved teammates of one block, alone or beside trusted ones.
+    """Subsets worth considering, without those decoded.
+
+    In a small team these are all. In a larger one they are the best answers, and groups of up to four unresolved
+    teammates of one block, alone or beside trusted ones.
 
     Parameters
     ----------

@@ -20,7 +20,7 @@ INFORMATION_VALUE = 0.06
 TEST_COST = 0.004
 """What a pass must bring, in the unit of utility."""
 DEPENDENCE = 0.85
-"""What a comparison within a frame counts: what makes one outcome odd, a crossing or a crowd, makes others odd too."""
+"""Weight of a comparison within a frame: what makes one outcome odd, a crossing or a crowd, makes others odd too."""
 UNDILUTED_SIZE = 8
 """Largest subset whose evidence counts in full."""
 
@@ -90,7 +90,7 @@ def _of_pairs(known: Knowledge, subsets: BoolArray, decoded: BoolArray) -> Float
 
 
 def dilution(sizes: IntArray) -> FloatArray:
-    """What evidence of subsets of these sizes (n,) is worth: among more than were calibrated, an attacker is one voice
-    among more, and shows less.
+    """Weight (n,) of evidence from subsets of these sizes (n,): in larger ones than were calibrated, an attacker shows
+    less.
     """
     return np.minimum(1.0, UNDILUTED_SIZE / sizes)

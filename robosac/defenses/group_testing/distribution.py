@@ -18,8 +18,10 @@ _LIMITS = ((BENIGN, BENIGN), (BENIGN, ATTACKS), (ATTACKS, BENIGN), (PLAIN, PLAIN
 
 
 class Distribution:
-    """Probabilities over kinds of attack k, "nobody attacks" being k = 0, and states z of the teammates: plain,
-    complementary (benign, and it sees much of what the others do not) or attacking.
+    """Probabilities over kinds of attack k and states z of the teammates.
+
+    k = 0 means that nobody attacks. A teammate is plain, complementary (benign, and it sees much of what the others do
+    not), or attacking.
 
     ``P(z, k) = q_k * prod over blocks b of P_b(z within b | k)``: inside a block all states are held, between blocks
     (given the kind) independence is assumed.
@@ -70,7 +72,7 @@ class Distribution:
             starts = np.cumsum([0, *map(len, self._blocks)])
             place = np.arange(starts[-1])[:, None] - starts[:-1]
             inside = (place >= 0) & (place < np.diff(starts))
-            self._powers = np.where(inside, 2.0**place, 0.0)
+            self._powers = inside * 2.0 ** (place * inside)
         return (subsets.astype(np.float64) @ self._powers).astype(np.int64).T
 
     def rows(self, which: IntArray, masks: IntArray) -> BoolArray:

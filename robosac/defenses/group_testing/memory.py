@@ -72,7 +72,7 @@ class Memory:
     shown_in: int = 0
 
     def weights(self, tests: KeyArray, rho: float) -> FloatArray:
-        """What tests (n,) are expected to be worth: one made k frames ago ``1 - rho ** k``, others 1."""
+        """Expected weights of tests (n,): ``1 - rho ** k`` if a test was made k frames ago already, else 1."""
         worth = np.ones(len(tests))
         for index, key in enumerate(tests.tolist()):
             if key in self.tests:
@@ -80,7 +80,7 @@ class Memory:
         return worth
 
     def weigh(self, test: int, rho: float, sign: int) -> float:
-        """What a test is worth that was made now: a repetition little, a surprise everything.
+        """Note a test, and give its weight: 1, or less if it repeats an earlier test and speaks for the same side.
 
         Parameters
         ----------

@@ -76,10 +76,8 @@ class Posterior(Distribution):
         self._attacker_prior = attacker_prior
         self._exact, self._most = limits
         prior = np.array([1 - attack_prior, *[attack_prior / kinds] * kinds])
-        parts = []
-        for part in np.array_split(
-            np.arange(len(team)), 1 if len(team) <= self._exact else -(-len(team) // self._most)
-        ):
+        parts, count = [], 1 if len(team) <= self._exact else -(-len(team) // self._most)
+        for part in np.array_split(np.arange(len(team)), count):
             attacked = np.repeat(sets.prior(len(part), attacker_prior), kinds, axis=0)
             table = np.concatenate([sets.prior(len(part), 0.0), attacked])
             parts.append(Block([team[i] for i in part], table))
@@ -223,8 +221,8 @@ class Posterior(Distribution):
         return [block.table[:1] for block in self._blocks], [block.table[1:] for block in self._blocks]
 
     def _mix(self, after: list[FloatArray], awakened: list[FloatArray]) -> None:
-        """Attacked teams go on as in ``after`` (K, 3 ** n), and "nobody attacks" turns into what is in ``awakened``
-        (1, 3 ** n), some of which is still nobody.
+        """Let attacked teams go on as in ``after`` (K, 3 ** n), and a benign team as in ``awakened`` (1, 3 ** n), in
+        which attackers may have awoken or not.
         """
         new = self._weights[0] / self._kinds
         old = self._weights[1:]

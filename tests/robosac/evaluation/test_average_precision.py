@@ -3,9 +3,9 @@ import math
 import numpy as np
 import pytest
 
-from robosac.boxes import from_corners
 from robosac.evaluation import AveragePrecision
 from tests.conftest import GOLDEN
+from tests.robosac.rectangles import from_corners
 
 TRUTH = np.array([[10.0 * i, 0.0, 4.0, 2.0, 0.0] for i in range(4)])
 NONE = np.empty((0, 6))

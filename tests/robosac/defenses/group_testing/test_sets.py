@@ -2,7 +2,6 @@ import numpy as np
 import pytest
 
 from robosac.defenses.group_testing import sets
-from robosac.defenses.group_testing.blocks import packed
 from robosac.defenses.group_testing.sets import ATTACKS, COMPLEMENTARY, PLAIN
 
 
@@ -73,13 +72,6 @@ def test_who_awakes_was_benign(rng):
     assert after.sum() == pytest.approx(1)
     assert after[sets.attacking(2)[0] > sets.attacking(2)[1]].sum() == pytest.approx((alone + together) / 2)
     assert after[sets.unattacked(2) == 1].sum() == pytest.approx(0.9**2)
-
-
-def test_packing_fills_bins_without_splitting():
-    bins = packed([2, 5, 1, 3, 4], 6)
-    assert [sum([2, 5, 1, 3, 4][i] for i in b) for b in bins] == [6, 6, 3]
-    assert sorted(i for b in bins for i in b) == list(range(5))
-    assert packed([], 6) == []
 
 
 def test_products_of_all_others():
