@@ -1,3 +1,4 @@
+import asyncio
 import csv
 import itertools
 import json
@@ -9,6 +10,7 @@ import pytest
 from typer.testing import CliRunner
 
 import robosac
+from clients.local_gateway import local_gateway
 from clients.simulation import Fleet
 from robosac import attacks, defenses, detectors, plugins
 from robosac.cli import app
@@ -41,6 +43,11 @@ def test_links_between_pages_lead_somewhere():
     for page in [ROOT / "README.md", *(ROOT / "docs").glob("*.md")]:
         for target in re.findall(r"\]\(([^)#]+)\)", page.read_text()):
             assert (page.parent / target).exists(), f"{page.name}: {target}"
+
+
+def test_the_library_page_knows_every_name_that_a_newcomer_imports():
+    text = (ROOT / "docs" / "library" / "index.md").read_text()
+    assert not {name for name in robosac.__all__ if f"`robosac.{name}`" not in text}
 
 
 def test_every_problem_and_reason_is_documented():
@@ -85,6 +92,19 @@ def test_the_examples_of_the_pages_can_be_evaluated():
     for option in (["--detector", "my_detector:build"], ["--attack", "my_attack:Suppress"]):
         result = CliRunner().invoke(app, [*common, *option])
         assert result.exit_code == 0, result.output
+
+
+async def test_the_programs_of_the_readme_run(tmp_path, capsys):
+    client, library = re.findall(r"```python\n(.*?)```", (ROOT / "README.md").read_text(), re.DOTALL)
+    async with local_gateway(tmp_path / "gateway.log") as url:
+        await asyncio.to_thread(exec, client.replace("http://127.0.0.1:8000", url), {"__name__": "client"})
+    answer, *events = capsys.readouterr().out.splitlines()
+    assert answer.startswith("consensus ('car-2', 'car-3', 'car-4', 'car-5', 'rsu') ")
+    assert events == ["1 session_opened", "2 frame_answered"]
+    exec(library.replace("Session(detector, team)", "Session(detector, team, rng=np.random.default_rng(0))"), {})
+    lines = capsys.readouterr().out.splitlines()
+    assert len(lines) == 5
+    assert lines[-1].endswith("accepted ('car-3', 'car-4', 'car-5', 'rsu') named ('car-2',)")
 
 
 def test_the_first_half_hour_goes_as_told(tmp_path, monkeypatch, capsys):
