@@ -32,31 +32,7 @@ RECENT = 12
 
 @dataclass(frozen=True)
 class FleetOptions:
-    """What a run does.
-
-    Attributes
-    ----------
-    url : str
-    scenes, frames : int
-        Sequences, and frames of each at 5 Hz of simulated time.
-    first_scene : int
-        Seed of the first scene; the others follow.
-    egos, attackers : int
-    attack, detector : str
-        As `robosac.attacks.load_campaign` and `robosac.detectors.load` take them.
-    defense : mapping or None
-        The ``defense`` of the sessions; None leaves it to the gateway.
-    seed : int
-        Of the choice of attackers and of their random starts.
-    budget_ms : float or None
-        Latency budget of the sessions; None leaves it to the gateway.
-    real_time : bool
-        Hold the frames to 5 Hz of the clock, where the machine can keep up.
-    report : Path or None
-        Folder for the summary and the picture.
-    api_key : str or None
-        To open sessions, where the gateway asks for one.
-    """
+    """What a run does: `main` says of each option what it means. None leaves a choice to the gateway."""
 
     url: str
     scenes: int

@@ -22,7 +22,6 @@ from pydantic import (
 )
 
 from robosac.defenses import DefenseSettings, Kinds, shipped
-from robosac.detectors import DetectorInfo
 from robosac.signatures import read_public_key
 
 MAX_KEYS = 1025
@@ -131,14 +130,20 @@ class SessionRequest(_Request):
         return keys
 
 
-class TensorEntry(BaseModel):
+class _Shown(BaseModel):
+    """Read from the object that is shown; what is not declared here is not shown."""
+
+    model_config = ConfigDict(from_attributes=True)
+
+
+class TensorEntry(_Shown):
     """Type and shape of one tensor."""
 
     dtype: str
     shape: list[int]
 
 
-class DetectorEntry(BaseModel):
+class DetectorEntry(_Shown):
     """What a detector wants to be sent."""
 
     name: str
@@ -147,21 +152,6 @@ class DetectorEntry(BaseModel):
     cell_m: float
     weights_digest: str = Field(description="SHA-256 of the weights file")
     consensus_score: float = Field(description="boxes from this score on take part in the consensus test")
-
-    @classmethod
-    def of(cls, info: DetectorInfo) -> DetectorEntry:
-        """The entry of a detector."""
-        return cls(
-            name=info.name,
-            tensors={
-                role: {name: TensorEntry(dtype=spec.dtype, shape=list(spec.shape)) for name, spec in specs.items()}
-                for role, specs in info.tensors.items()
-            },
-            area_m=info.area_m,
-            cell_m=info.cell_m,
-            weights_digest=info.weights_digest,
-            consensus_score=info.consensus_score,
-        )
 
 
 class DetectorList(BaseModel):
