@@ -287,7 +287,13 @@ def _answer(response: httpx.Response) -> FrameAnswer:
 
 
 def _told(response: httpx.Response, kind: type[T]) -> T:
-    """What a response says, as a type."""
+    """Read a response's JSON as a type.
+
+    Raises
+    ------
+    ProtocolError
+        If it is something else.
+    """
     try:
         return TypeAdapter(kind).validate_json(response.content)
     except ValidationError as error:

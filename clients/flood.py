@@ -65,7 +65,7 @@ class Refusals:
     sent: int = 0
     """Requests."""
     taken_bytes: int = 0
-    """Of bodies, that the gateway's side took off the strangers' hands."""
+    """Bytes of bodies that the gateway's side took."""
     refused_ms: list[float] = field(default_factory=list)
     """From a connection's beginning to its 401, or 503 where the gateway is busy."""
     hung_up: int = 0

@@ -52,7 +52,7 @@ class OverloadFigures:
     refused_ms: list[float] = field(default_factory=list)
     """From the connection's beginning to the refusal."""
     deadline_met: int = 0
-    """Of the answered, by the gateway's own clock."""
+    """Answers that were in time by the gateway's own clock."""
     others: Counter[str] = field(default_factory=Counter)
     """What was neither answered nor refused with 503."""
 

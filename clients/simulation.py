@@ -19,7 +19,7 @@ class EgoFrame:
     """One frame from one ego's side."""
 
     scene: int
-    """Its seed."""
+    """The scene's seed."""
     ego_id: str
     attackers: frozenset[str]
     """Those whose message of this frame is not what an honest one would send."""
@@ -27,7 +27,7 @@ class EgoFrame:
     sent: Mapping[str, Message]
     """What each teammate really sends to this ego."""
     message: Message
-    """The ego's own."""
+    """The ego's own message."""
     truth: FloatArray
     """(G, 5); ego frame."""
     points: FloatArray

@@ -27,11 +27,11 @@ class Driven:
     seq: int = 0
     head: str = GENESIS
     commitment: str = ""
-    """Of the log as far as it was checked: number and digest of the last line, commitment to the next seed."""
+    """These three are of the last line that was checked: its number, its digest, its commitment to the next seed."""
     answered: int = 0
     last_frame: int = -1
     state: Mapping[str, Any] = field(default_factory=dict)
-    """As the log says."""
+    """These three are what the log says."""
 
     def ego(self, gateway: GatewayClient) -> VehicleClient:
         """The session's ego at a gateway."""

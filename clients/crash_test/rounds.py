@@ -26,7 +26,7 @@ DEFENSES: Sequence[Mapping[str, Any]] = (
     {"kind": "group_testing"},
     {"kind": "none"},
 )
-"""Of the sessions, one after another."""
+"""The sessions get these, one after another."""
 LOADED_S = (0.05, 1.2)
 """How long the gateways are loaded before what happens next, at random."""
 BUDGET_MS = 5000.0

@@ -45,11 +45,11 @@ class Asked:
     arrived: float
     """When its last byte was in (`time.perf_counter`); its budget runs from then."""
     messages: dict[str, Received] = field(default_factory=dict)
-    """Those of teammates, whoever is in the team by now."""
+    """What teammates sent; whether they are still in the team is looked at later."""
     unusable: dict[str, Rejection] = field(default_factory=dict)
-    """Why other parts of the body are not among them."""
+    """Why a part of the body is not among the messages."""
     absences: dict[str, Rejection] = field(default_factory=dict)
-    """Why others sent none; kept for another attempt, since the gathering forgets it once the frame is closed."""
+    """Why a teammate sent nothing; noted for another attempt, as the gathering forgets it when the frame is closed."""
     timings: dict[str, float] = field(default_factory=dict)
     """Milliseconds."""
 

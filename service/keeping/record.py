@@ -28,9 +28,9 @@ class SessionRecord:
     created_at: str
     """RFC 3339, UTC."""
     seed: str
-    """Of the next frame's draws, hexadecimal. A secret until that frame is decided."""
+    """Seed of the next frame's draws, hexadecimal; a secret until that frame is decided."""
     public_keys: Mapping[str, str] = field(default_factory=dict)
-    """Of the vehicles that sign, base64 (`robosac.signatures`)."""
+    """Keys of the vehicles that sign, base64 (`robosac.signatures`)."""
     last_frame: int | None = None
     """The highest frame that was answered."""
     frames_answered: int = 0
