@@ -287,7 +287,7 @@ def _answer(response: httpx.Response) -> FrameAnswer:
 
 
 def _told(response: httpx.Response, kind: type[T]) -> T:
-    """What a response says, as a type."""
+    """Read a response's JSON as a type; a `ProtocolError` if it is something else."""
     try:
         return TypeAdapter(kind).validate_json(response.content)
     except ValidationError as error:

@@ -32,31 +32,7 @@ RECENT = 12
 
 @dataclass(frozen=True)
 class FleetOptions:
-    """What a run does.
-
-    Attributes
-    ----------
-    url : str
-    scenes, frames : int
-        Test sequences, and frames of each.
-    first_scene : int
-        How many scenes are left out before.
-    egos, attackers : int
-    attack, detector, data : str
-        As `robosac.attacks.load_campaign`, `robosac.detectors.load` and `robosac.scenes.SOURCES` take them.
-    defense : mapping or None
-        The ``defense`` of the sessions; None leaves it to the gateway.
-    seed : int
-        Of the choice of attackers and of their random starts.
-    budget_ms : float or None
-        Latency budget of the sessions; None leaves it to the gateway.
-    real_time : bool
-        Hold the frames to the clock, where the machine can keep up.
-    report : Path or None
-        Folder for the summary and the picture.
-    api_key : str or None
-        To open sessions, where the gateway asks for one.
-    """
+    """What a run does: `main` says of each option what it means. None leaves a choice to the gateway."""
 
     url: str
     scenes: int

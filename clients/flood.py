@@ -60,27 +60,18 @@ class Strangers(StrEnum):
 
 @dataclass
 class Refusals:
-    """What strangers were answered.
-
-    Attributes
-    ----------
-    sent : int
-        Requests.
-    taken_bytes : int
-        Of bodies, that the gateway's side took off the strangers' hands.
-    refused_ms : list of float
-        From a connection's beginning to its 401, or 503 where the gateway is busy.
-    hung_up : int
-        Requests whose connection was closed while their bodies were on the way, before the answer was read.
-    others : mapping of str to int
-        What came instead: a status, or what went wrong.
-    """
+    """What strangers were answered."""
 
     sent: int = 0
+    """Requests."""
     taken_bytes: int = 0
+    """Bytes of bodies that the gateway's side took."""
     refused_ms: list[float] = field(default_factory=list)
+    """From a connection's beginning to its 401, or 503 where the gateway is busy."""
     hung_up: int = 0
+    """Requests whose connection was closed while their bodies were on the way, before the answer was read."""
     others: dict[str, int] = field(default_factory=dict)
+    """What came instead: a status, or what went wrong."""
 
     def answered(self, status: int, milliseconds: float) -> None:
         """Count an answer."""

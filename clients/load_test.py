@@ -44,23 +44,15 @@ EGO, *TEAM = IntersectionScene(0).agents
 
 @dataclass(frozen=True)
 class Load:
-    """One way of loading the gateway.
-
-    Attributes
-    ----------
-    loop : str
-        ``closed`` or ``open``.
-    egos : int
-    attacked : bool
-        Whether one of the five teammates is a PGD attacker.
-    rate_hz : float or None
-        Frames a second of each ego, open loop only.
-    """
+    """One way of loading the gateway."""
 
     loop: str
+    """``closed`` or ``open``."""
     egos: int
     attacked: bool
+    """Whether one of the five teammates is a PGD attacker."""
     rate_hz: float | None = None
+    """Frames a second of each ego, open loop only."""
 
 
 @dataclass

@@ -22,42 +22,8 @@ STOP_TIMEOUT_S = 20.0
 KEY_SETTINGS = ("ROBOSAC_API_KEYS", "ROBOSAC_API_KEYS_FILE")
 
 
-@contextlib.asynccontextmanager
-async def local_gateway(log: Path, api_key: str | None = None) -> AsyncIterator[str]:
-    """Start ``uvicorn service.app:app``, wait until it is ready, yield its URL, and stop it.
-
-    It keeps its sessions where ``ROBOSAC_DATABASE_URL`` says, else in a temporary folder that is removed afterwards.
-
-    Parameters
-    ----------
-    log : Path
-        Takes what the gateway prints.
-    api_key : str, optional
-        As for `start_gateway`.
-
-    Raises
-    ------
-    GatewayUnreachable
-        If it ends or is not ready in time; the message holds the end of its log.
-    """
-    with tempfile.TemporaryDirectory(prefix="robosac-") as folder:
-        database_url = os.environ.get("ROBOSAC_DATABASE_URL", f"sqlite:///{folder}/robosac.db")
-        process, url = start_gateway(log, database_url, api_key)
-        try:
-            with _cancelled_by_sigterm():
-                await until_ready(url, process, log)
-                yield url
-        finally:
-            process.terminate()
-            try:
-                await asyncio.to_thread(process.wait, STOP_TIMEOUT_S)
-            except subprocess.TimeoutExpired:
-                process.kill()
-                process.wait()
-
-
-def start_gateway(log: Path, database_url: str, api_key: str | None = None) -> tuple[subprocess.Popen[bytes], str]:
-    """Start a gateway on a free loopback port; its process and its URL.
+class GatewayProcess:
+    """A gateway in a child process, on a free loopback port.
 
     Parameters
     ----------
@@ -67,39 +33,79 @@ def start_gateway(log: Path, database_url: str, api_key: str | None = None) -> t
     api_key : str, optional
         The one that it asks for; by default it asks for none, whatever the environment says, and serves loopback only.
     """
-    with socket.socket() as probe:
-        probe.bind(("127.0.0.1", 0))
-        port = probe.getsockname()[1]
-    command = [sys.executable, "-m", "uvicorn", "service.app:app", "--host", "127.0.0.1", "--port", str(port)]
-    environment = {name: value for name, value in os.environ.items() if name not in KEY_SETTINGS}
-    if api_key is not None:
-        environment["ROBOSAC_API_KEYS"] = api_key
-    log.parent.mkdir(parents=True, exist_ok=True)
-    with log.open("ab") as output:
-        process = subprocess.Popen(
-            [*command, "--log-level", "warning", "--timeout-graceful-shutdown", "5"],
-            stdout=output,
-            stderr=subprocess.STDOUT,
-            env=environment | {"ROBOSAC_DATABASE_URL": database_url},
-        )
-    return process, f"http://127.0.0.1:{port}"
+
+    def __init__(self, log: Path, database_url: str, api_key: str | None = None) -> None:
+        with socket.socket() as probe:
+            probe.bind(("127.0.0.1", 0))
+            port = probe.getsockname()[1]
+        self.url = f"http://127.0.0.1:{port}"
+        self._log = log
+        command = [sys.executable, "-m", "uvicorn", "service.app:app", "--host", "127.0.0.1", "--port", str(port)]
+        environment = {name: value for name, value in os.environ.items() if name not in KEY_SETTINGS}
+        if api_key is not None:
+            environment["ROBOSAC_API_KEYS"] = api_key
+        log.parent.mkdir(parents=True, exist_ok=True)
+        with log.open("ab") as output:
+            self._process = subprocess.Popen(
+                [*command, "--log-level", "warning", "--timeout-graceful-shutdown", "5"],
+                stdout=output,
+                stderr=subprocess.STDOUT,
+                env=environment | {"ROBOSAC_DATABASE_URL": database_url},
+            )
+
+    async def ready(self) -> None:
+        """Wait until the gateway serves.
+
+        Raises
+        ------
+        GatewayUnreachable
+            If it ends or is not ready in time; the message holds the end of its log.
+        """
+        end = time.monotonic() + START_TIMEOUT_S
+        async with GatewayClient(self.url, timeout_s=2.0) as gateway:
+            while not await gateway.ready():
+                status = self._process.poll()
+                if status is not None or time.monotonic() > end:
+                    why = "was not ready in time" if status is None else f"ended with status {status}"
+                    raise GatewayUnreachable(f"the gateway {why}; its log ends:\n{self._log.read_text()[-2000:]}")
+                await asyncio.sleep(0.05)
+
+    async def stop(self) -> bool:
+        """Terminate the gateway, and kill it if it does not end; whether it ended by itself."""
+        self._process.terminate()
+        try:
+            await asyncio.to_thread(self._process.wait, STOP_TIMEOUT_S)
+        except subprocess.TimeoutExpired:
+            await self.kill()
+            return False
+        return True
+
+    async def kill(self) -> None:
+        """Let the gateway end at once."""
+        self._process.kill()
+        await asyncio.to_thread(self._process.wait)
 
 
-async def until_ready(url: str, process: subprocess.Popen[bytes], log: Path) -> None:
-    """Wait until a gateway that was started is ready.
+@contextlib.asynccontextmanager
+async def local_gateway(log: Path, api_key: str | None = None) -> AsyncIterator[str]:
+    """The URL of a gateway that runs for the length of a block, with a log and a key as `GatewayProcess`.
+
+    It keeps its sessions where ``ROBOSAC_DATABASE_URL`` says, else in a temporary folder that is removed afterwards.
 
     Raises
     ------
     GatewayUnreachable
-        If it ends or is not ready in time; the message holds the end of its log.
+        As `GatewayProcess.ready`.
     """
-    end = time.monotonic() + START_TIMEOUT_S
-    async with GatewayClient(url, timeout_s=2.0) as gateway:
-        while not await gateway.ready():
-            if process.poll() is not None or time.monotonic() > end:
-                why = f"ended with status {process.poll()}" if process.poll() is not None else "was not ready in time"
-                raise GatewayUnreachable(f"the gateway {why}; its log ends:\n{log.read_text()[-2000:]}")
-            await asyncio.sleep(0.05)
+    with tempfile.TemporaryDirectory(prefix="robosac-") as folder:
+        database_url = os.environ.get("ROBOSAC_DATABASE_URL", f"sqlite:///{folder}/robosac.db")
+        process = GatewayProcess(log, database_url, api_key)
+        try:
+            with _cancelled_by_sigterm():
+                await process.ready()
+                yield process.url
+        finally:
+            await process.stop()
 
 
 @contextlib.contextmanager

@@ -40,32 +40,21 @@ class Plan:
 
 @dataclass
 class OverloadFigures:
-    """What came of the frames that were due.
-
-    Attributes
-    ----------
-    budget_ms : float
-    capacity_fps : float
-        Measured before, one frame after the other.
-    offered, seconds : int, float
-    answered_ms : list of float
-        From the request's last byte, where the budget begins, to the answer's.
-    refused_ms : list of float
-        From the connection's beginning to the refusal.
-    deadline_met : int
-        Of the answered, by the gateway's own clock.
-    others : Counter
-        What was neither answered nor refused with 503.
-    """
+    """What came of the frames that were due."""
 
     budget_ms: float
     capacity_fps: float
+    """Measured before, one frame after the other."""
     offered: int = 0
     seconds: float = 0.0
     answered_ms: list[float] = field(default_factory=list)
+    """From the request's last byte, where the budget begins, to the answer's."""
     refused_ms: list[float] = field(default_factory=list)
+    """From the connection's beginning to the refusal."""
     deadline_met: int = 0
+    """Answers that were in time by the gateway's own clock."""
     others: Counter[str] = field(default_factory=Counter)
+    """What was neither answered nor refused with 503."""
 
     def as_dict(self) -> dict[str, Any]:
         """Plain values for JSON."""

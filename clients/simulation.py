@@ -16,34 +16,22 @@ from robosac.scenes import Frame, Scene
 
 @dataclass(frozen=True)
 class EgoFrame:
-    """One frame from one ego's side.
-
-    Attributes
-    ----------
-    scene : int
-        Its number.
-    ego_id : str
-    attackers : frozenset of str
-        Those whose message of this frame is not what an honest one would send.
-    benign : mapping of teammate to Message
-    sent : mapping of teammate to Message
-        What each teammate really sends to this ego.
-    message : Message
-        The ego's own.
-    truth : (G, 5) ndarray
-        Ego frame.
-    points : (P, 3) ndarray
-        The ego's LiDAR returns.
-    """
+    """One frame from one ego's side."""
 
     scene: int
+    """The scene's number."""
     ego_id: str
     attackers: frozenset[str]
+    """Those whose message of this frame is not what an honest one would send."""
     benign: Mapping[str, Message]
     sent: Mapping[str, Message]
+    """What each teammate really sends to this ego."""
     message: Message
+    """The ego's own message."""
     truth: FloatArray
+    """(G, 5); ego frame."""
     points: FloatArray
+    """(P, 3); the ego's LiDAR returns."""
 
 
 class Fleet:

@@ -10,8 +10,8 @@ from typing import Any
 
 import numpy as np
 from rich.console import Console
-from rich.table import Table
 
+from clients import trial
 from clients.simulation import EgoFrame
 from robosac.answers import FrameAnswer
 from robosac.boxes import FloatArray
@@ -121,7 +121,6 @@ class FleetSummary:
 
     def as_dict(self) -> dict[str, Any]:
         """Plain values for JSON."""
-        p50, p95, p99 = np.percentile(self.latencies_ms, [50, 95, 99])
         return {
             "frames": self.frames,
             "average_precision": {name: {"ap50": ap.at(0.5), "ap70": ap.at(0.7)} for name, ap in self.ap.items()},
@@ -131,16 +130,15 @@ class FleetSummary:
             "participation": {role: dict(tally) for role, tally in self.participation.items()},
             "naming": self.naming,
             "sampling_steps": {"mean": float(np.mean(self.steps)), "max": int(np.max(self.steps))},
-            "latency_ms": {"p50": float(p50), "p95": float(p95), "p99": float(p99)},
+            "latency_ms": trial.percentiles(self.latencies_ms),
             "deadline_met_share": self.in_time / self.frames,
         }
 
     def print(self, console: Console) -> None:
         """The closing summary."""
         values = self.as_dict()
-        table = Table(title=f"Average precision on the same {self.frames} frames", title_justify="left")
-        for heading in ("perception", "AP at IoU 0.5", "AP at IoU 0.7"):
-            table.add_column(heading, justify="left" if heading == "perception" else "right")
+        title = f"Average precision on the same {self.frames} frames"
+        table = trial.a_table(title, ["perception", "AP at IoU 0.5", "AP at IoU 0.7"])
         labels = {
             "all benign": "all teammates benign (the ideal)",
             GATEWAY: "[bold]what the gateway answered[/bold]",
@@ -151,10 +149,9 @@ class FleetSummary:
             ap = values["average_precision"][name]
             table.add_row(label, f"{ap['ap50']:.3f}", f"{ap['ap70']:.3f}")
         console.print(table)
-        table = Table(title="Who was accepted, and why not (vehicle-frames)", title_justify="left")
         reasons = sorted({reason for tally in self.participation.values() for reason in tally} - {"accepted"})
-        for heading in ("", "accepted", *reasons):
-            table.add_column(heading.replace("_", " "), justify="right" if heading else "left")
+        headings = [heading.replace("_", " ") for heading in ("", "accepted", *reasons)]
+        table = trial.a_table("Who was accepted, and why not (vehicle-frames)", headings)
         for role, tally in self.participation.items():
             if tally:
                 table.add_row(role, *(str(tally[column]) for column in ("accepted", *reasons)))

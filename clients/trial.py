@@ -84,7 +84,7 @@ def write(report: Any, out: Path | None, name: str, console: Console) -> None:
 
 
 def percentiles(values: Sequence[float]) -> dict[str, float | None]:
-    """Of figures that were measured: the median, 95 % and 99 %; None without any."""
+    """The median, 95 % and 99 % of measured figures; None without any."""
     found = np.percentile(values, [50, 95, 99]).tolist() if values else [None] * 3
     return dict(zip(("p50", "p95", "p99"), found, strict=True))
 

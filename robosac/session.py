@@ -119,7 +119,10 @@ class Session:
         deadline: Deadline | None = None,
         detector: Preparer | None = None,
     ) -> FusionResult:
-        """As `answer`, with draws of one's own, and nothing is remembered yet: for who must keep the decision first."""
+        """Decide as `answer` does, but remember nothing yet: for a caller that has to store the decision first.
+
+        The draws come from ``rng``.
+        """
         return fuse(
             detector or self.detector,
             self.defense,
@@ -147,7 +150,10 @@ class Session:
         self.state = self.defense.change_team(self.state, list(team))
 
     def save(self) -> dict[str, Any]:
-        """What the session remembers, JSON values: with it, another one goes on from here."""
+        """What the session remembers, JSON values: with it, another one goes on from here.
+
+        The generator of the draws is not part of it: whoever knew it could foresee them.
+        """
         return {"state": dict(self.state), "previous": None if self.previous is None else self.previous.as_json()}
 
 

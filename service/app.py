@@ -65,7 +65,7 @@ def create_app(
     """
     settings = settings or Settings()
     keys = ApiKeys.read(settings)
-    tokens = Tokens.configured(settings, clock)
+    tokens = Tokens(settings, clock)
     tracing = Tracing(provider_from_environment() if spans is None else spans)
     gateway = _built(settings, ApiKeys(keys), tokens, seeds, tracing)
     secrets = [*keys, *(secret.get_secret_value() for secret in settings.token_secrets)]
@@ -104,7 +104,7 @@ def _built(
     engine, metrics, admission = Engine(settings.torch_threads, settings.extra_detectors), Metrics(), Admission()
     store = Store(settings.database_url)
     sessions = Sessions(settings, store, engine, metrics, tokens, seeds)
-    deciding = Deciding(sessions, engine, metrics, admission, tracing)
+    deciding = Deciding(sessions, store, engine, metrics, admission, tracing, settings.keep_frames)
     return Gateway(
         admission=admission,
         engine=engine,

@@ -76,8 +76,9 @@ class Engine:
         seed: int,
         deadline: Deadline,
     ) -> tuple[FusionResult, float]:
-        """`robosac.Session.decide` on the engine's thread, from what the session remembers at this moment; also the
-        milliseconds that the frame waited for it.
+        """Decide a frame on the engine's thread, from what the session remembers at this moment.
+
+        Returns the result, and for how many milliseconds the frame waited for the thread.
         """
         submitted, asked = time.perf_counter(), copy(session)
 

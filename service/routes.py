@@ -13,7 +13,7 @@ from robosac import wire
 from robosac.answers import FrameAnswer
 from service.arriving.bodies import MSGPACK, MSGPACK_TYPES, check_type, described, read_json
 from service.arriving.limits import read_bounded
-from service.errors import Refused
+from service.errors import Kind, Refused
 from service.gateway import Gateway
 from service.problems import documented
 from service.schemas import (
@@ -41,7 +41,13 @@ def _gateway(request: Request) -> Gateway:
 
 
 GatewayDep = Annotated[Gateway, Depends(_gateway)]
-Credentials = Annotated[HTTPAuthorizationCredentials | None, Depends(_bearer)]
+
+
+def _token(credentials: Annotated[HTTPAuthorizationCredentials | None, Depends(_bearer)]) -> str | None:
+    return credentials.credentials if credentials else None
+
+
+Token = Annotated[str | None, Depends(_token)]
 
 
 async def _opener(
@@ -50,12 +56,12 @@ async def _opener(
     gateway.api_keys.check(credentials.credentials if credentials else None)
 
 
-async def _vehicle(sid: str, gateway: GatewayDep, credentials: Credentials) -> Caller:
-    return await gateway.sessions.authenticate(sid, credentials.credentials if credentials else None)
+async def _vehicle(sid: str, gateway: GatewayDep, token: Token) -> Caller:
+    return await gateway.sessions.authenticate(sid, token)
 
 
-async def _ego(sid: str, gateway: GatewayDep, credentials: Credentials) -> Caller:
-    return await gateway.sessions.authenticate_ego(sid, credentials.credentials if credentials else None)
+async def _ego(sid: str, gateway: GatewayDep, token: Token) -> Caller:
+    return await gateway.sessions.authenticate_ego(sid, token)
 
 
 Vehicle = Annotated[Caller, Depends(_vehicle)]
@@ -90,7 +96,8 @@ _FRAME_RESPONSES: dict[int | str, dict[str, Any]] = {
 @v1.get("/detectors")
 async def list_detectors(gateway: GatewayDep) -> DetectorList:
     """What each detector wants to be sent."""
-    return DetectorList(detectors=[DetectorEntry.of(detector.info) for detector in gateway.engine.detectors.values()])
+    infos = [detector.info for detector in gateway.engine.detectors.values()]
+    return DetectorList(detectors=[DetectorEntry.model_validate(info) for info in infos])
 
 
 @v1.post(
@@ -149,10 +156,10 @@ async def dismiss_teammate(vehicle_id: str, caller: Ego, gateway: GatewayDep) ->
     responses={**_EGO_PROBLEMS, 200: {"content": {"application/jsonl": {}}}},
 )
 async def get_audit(
-    sid: str, gateway: GatewayDep, credentials: Credentials, after: Annotated[int, Query(ge=0, le=2**53)] = 0
+    sid: str, gateway: GatewayDep, token: Token, after: Annotated[int, Query(ge=0, le=2**53)] = 0
 ) -> Response:
     """The audit log as JSON Lines: records with a number above `after`; of an ended session, too."""
-    lines = await gateway.sessions.audit_log(sid, credentials.credentials if credentials else None, after)
+    lines = await gateway.sessions.audit_log(sid, token, after)
     return Response("".join(line + "\n" for line in lines), media_type="application/jsonl")
 
 
@@ -192,7 +199,10 @@ async def get_messages(
     caller: Ego, gateway: GatewayDep, frame: Annotated[int, Path(ge=0, le=wire.MAX_FRAME)]
 ) -> Response:
     """The messages of a decided frame as a whole frame, where the gateway keeps them, to replay the decision."""
-    return Response(await gateway.frames.kept_messages(caller, frame), media_type=MSGPACK)
+    kept = await gateway.store.messages(caller.record.session_id, frame)
+    if kept is None:
+        raise Refused(Kind.MESSAGES_NOT_KEPT, "no messages of that frame are kept", "frame")
+    return Response(kept, media_type=MSGPACK)
 
 
 @operations.get("/healthz")

@@ -19,6 +19,7 @@ from pydantic import (
     WrapSerializer,
     WrapValidator,
     field_validator,
+    model_validator,
 )
 
 from robosac.calibrated import calibration_digest, calibration_of
@@ -133,7 +134,13 @@ class SessionRequest(_Request):
         return keys
 
 
-class TensorEntry(BaseModel):
+class _Shown(BaseModel):
+    """Read from the object that is shown; what is not declared here is not shown."""
+
+    model_config = ConfigDict(from_attributes=True)
+
+
+class TensorEntry(_Shown):
     """Type and shape of one tensor."""
 
     dtype: str
@@ -158,7 +165,7 @@ class CalibrationEntry(BaseModel):
         return cls(kinds=list(levels[0].kinds), pose_errors_m=errors, digest=calibration_digest(info) or "")
 
 
-class DetectorEntry(BaseModel):
+class DetectorEntry(_Shown):
     """What a detector wants to be sent."""
 
     name: str
@@ -169,21 +176,11 @@ class DetectorEntry(BaseModel):
     consensus_score: float = Field(description="boxes from this score on take part in the consensus test")
     calibration: CalibrationEntry | None
 
+    @model_validator(mode="before")
     @classmethod
-    def of(cls, info: DetectorInfo) -> DetectorEntry:
-        """The entry of a detector."""
-        return cls(
-            name=info.name,
-            tensors={
-                role: {name: TensorEntry(dtype=spec.dtype, shape=list(spec.shape)) for name, spec in specs.items()}
-                for role, specs in info.tensors.items()
-            },
-            area_m=info.area_m,
-            cell_m=info.cell_m,
-            weights_digest=info.weights_digest,
-            consensus_score=info.consensus_score,
-            calibration=CalibrationEntry.of(info),
-        )
+    def _with_calibration(cls, shown: object) -> object:
+        """A detector says only where the file of its calibration is."""
+        return {**vars(shown), "calibration": CalibrationEntry.of(shown)} if isinstance(shown, DetectorInfo) else shown
 
 
 class DetectorList(BaseModel):

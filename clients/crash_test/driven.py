@@ -16,32 +16,22 @@ from robosac.audit import GENESIS, commitment, digest, seal
 
 @dataclass
 class Driven:
-    """A session, and what is known of it.
-
-    Attributes
-    ----------
-    defense : str
-    opened : OpenedSession
-    next_frame : int
-        The first that was never sent.
-    acknowledged : mapping of frame to FrameAnswer
-        Since the last check.
-    seq, head, commitment
-        Of the log as far as it was checked: number and digest of the last line, commitment to the next seed.
-    answered, last_frame, state
-        As the log says.
-    """
+    """A session, and what is known of it."""
 
     defense: str
     opened: OpenedSession
     next_frame: int = 0
+    """The first that was never sent."""
     acknowledged: dict[int, FrameAnswer] = field(default_factory=dict)
+    """Since the last check."""
     seq: int = 0
     head: str = GENESIS
     commitment: str = ""
+    """These three are of the last line that was checked: its number, its digest, its commitment to the next seed."""
     answered: int = 0
     last_frame: int = -1
     state: Mapping[str, Any] = field(default_factory=dict)
+    """These three are what the log says."""
 
     def ego(self, gateway: GatewayClient) -> VehicleClient:
         """The session's ego at a gateway."""

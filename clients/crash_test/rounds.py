@@ -8,7 +8,6 @@ from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, field
 from enum import StrEnum
 from pathlib import Path
-from subprocess import Popen, TimeoutExpired
 from typing import Any
 
 import numpy as np
@@ -18,7 +17,7 @@ from clients.crash_test import sqlite
 from clients.crash_test.driven import Driven
 from clients.errors import GatewayError, GatewayUnavailable, GatewayUnreachable
 from clients.load_test import DEFENSE, EGO, REFUSED_WAIT_S, TEAM, Bodies
-from clients.local_gateway import STOP_TIMEOUT_S, start_gateway, until_ready
+from clients.local_gateway import GatewayProcess
 
 DEFENSES: Sequence[Mapping[str, Any]] = (
     DEFENSE,
@@ -27,7 +26,7 @@ DEFENSES: Sequence[Mapping[str, Any]] = (
     {"kind": "group_testing"},
     {"kind": "none"},
 )
-"""Of the sessions, one after another."""
+"""The sessions get these, one after another."""
 LOADED_S = (0.05, 1.2)
 """How long the gateways are loaded before what happens next, at random."""
 BUDGET_MS = 5000.0
@@ -54,39 +53,27 @@ def possible(database_url: str) -> list[Incident]:
 
 @dataclass
 class Kill:
-    """What one round showed.
-
-    Attributes
-    ----------
-    incident : str
-    loaded_s : float
-        From the start of the load to the kill.
-    acknowledged : int
-        Frames acknowledged since the kill before.
-    unacknowledged : int
-        Frames that were decided, but whose answer was lost with the gateway.
-    refused : int
-        Frames that a gateway could not serve just then (503).
-    restart_s : float
-        From the start of the process to its readiness.
-    first_answer_s : float
-        From the start of the process until every session had been checked and had its next frame answered.
-    wrong : list of str
-    """
+    """What one round showed."""
 
     incident: Incident
     loaded_s: float = 0.0
+    """From the start of the load to the kill."""
     acknowledged: int = 0
+    """Frames acknowledged since the kill before."""
     unacknowledged: int = 0
+    """Frames that were decided, but whose answer was lost with the gateway."""
     refused: int = 0
+    """Frames that a gateway could not serve just then (503)."""
     restart_s: float = 0.0
+    """From the start of the process to its readiness."""
     first_answer_s: float = 0.0
+    """From the start of the process until every session had been checked and had its next frame answered."""
     wrong: list[str] = field(default_factory=list)
 
 
 @dataclass(frozen=True)
 class _Running:
-    process: Popen[bytes]
+    process: GatewayProcess
     client: GatewayClient
 
 
@@ -161,10 +148,9 @@ class Rounds:
 
     async def stop(self) -> None:
         """Kill all gateways at once."""
-        for gateway in self._up:
-            gateway.process.kill()
+        await asyncio.gather(*(gateway.process.kill() for gateway in self._up))
         while self._up:
-            await self._stop(self._up[0], gently=False)
+            await self._up.pop().client.aclose()
 
     async def _drive(self, number: int, kill: Kill) -> None:
         """Post frames of a session, to one gateway or another, until none is left."""
@@ -183,24 +169,18 @@ class Rounds:
         await asyncio.sleep(float(self._rng.uniform(*LOADED_S)))
 
     async def _start(self) -> None:
-        process, url = start_gateway(self._log, self._database_url)
-        gateway = _Running(process, GatewayClient(url))
+        process = GatewayProcess(self._log, self._database_url)
         try:
-            await until_ready(url, process, self._log)
+            await process.ready()
         except BaseException:
-            await self._stop(gateway, gently=False)
+            await process.kill()
             raise
-        self._up.append(gateway)
+        self._up.append(_Running(process, GatewayClient(process.url)))
 
     async def _stop(self, gateway: _Running, *, gently: bool) -> None:
-        if gently:
-            gateway.process.terminate()
-            try:
-                await asyncio.to_thread(gateway.process.wait, STOP_TIMEOUT_S)
-            except TimeoutExpired as error:
-                raise GatewayUnreachable("a gateway did not end on SIGTERM") from error
-        gateway.process.kill()
-        await asyncio.to_thread(gateway.process.wait)
-        if gateway in self._up:
-            self._up.remove(gateway)
+        if not gently:
+            await gateway.process.kill()
+        elif not await gateway.process.stop():
+            raise GatewayUnreachable("a gateway did not end on SIGTERM")
+        self._up.remove(gateway)
         await gateway.client.aclose()

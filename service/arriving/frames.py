@@ -98,13 +98,6 @@ class Frames:
             caller.live.gathering.refuse(caller.vehicle_id, frame, reason, error.detail)
         await self.sessions.journal.refusal(caller, reason, error.detail, frame, error.field or "")
 
-    async def kept_messages(self, caller: Caller, frame: int) -> bytes:
-        """The messages kept of a decided frame, as a whole frame (`robosac.wire.read_frame`)."""
-        kept = await self.sessions.messages(caller, frame)
-        if kept is None:
-            raise Refused(Kind.MESSAGES_NOT_KEPT, "no messages of that frame are kept", "frame")
-        return kept
-
     async def _answer(self, asked: Asked, *, gather: bool) -> FrameAnswer:
         caller, frame = asked.caller, asked.frame
         with self.admission.frame(caller.record.session_id, caller.live.budget_s):

@@ -62,7 +62,7 @@ class Admission:
                 del self._by_session[session_id]
 
     def deadline(self, arrived: float, budget_s: float) -> Deadline:
-        """Of a frame that arrived then (`time.perf_counter`), with time left for keeping its decision."""
+        """The deadline of a frame that arrived then (`time.perf_counter`); time to keep its decision is reserved."""
         return Deadline(arrived + budget_s, self._store_s)
 
     def learn(self, start: float, end: float, store_s: float) -> None:

@@ -18,8 +18,9 @@ from robosac.defenses import Rejection
 from robosac.fusion import FusionResult
 from service.deciding.admission import Admission
 from service.engine import Engine
-from service.errors import SessionChanged
+from service.errors import SessionChanged, StoreUnavailable
 from service.keeping.record import SessionRecord
+from service.keeping.store import Store
 from service.sessions.gathering import Received
 from service.sessions.live import Caller
 from service.sessions.sessions import Sessions
@@ -34,35 +35,23 @@ ATTEMPTS = 3
 
 @dataclass
 class Asked:
-    """A frame that an ego asks about, on its way to an answer.
-
-    Attributes
-    ----------
-    caller : Caller
-        The ego.
-    frame : int
-    ego : Received
-        Its own message.
-    arrived : float
-        When its last byte was in (`time.perf_counter`); its budget runs from then.
-    messages : mapping of vehicle id to Received
-        Those of teammates, whoever is in the team by now.
-    unusable : mapping of vehicle id to Rejection
-        Why other parts of the body are not among them.
-    absences : mapping of vehicle id to Rejection
-        Why others sent none; kept for another attempt, since the gathering forgets it once the frame is closed.
-    timings : mapping of stage to float
-        Milliseconds.
-    """
+    """A frame that an ego asks about, on its way to an answer."""
 
     caller: Caller
+    """The ego."""
     frame: int
     ego: Received
+    """Its own message."""
     arrived: float
+    """When its last byte was in (`time.perf_counter`); its budget runs from then."""
     messages: dict[str, Received] = field(default_factory=dict)
+    """What teammates sent; whether they are still in the team is looked at later."""
     unusable: dict[str, Rejection] = field(default_factory=dict)
+    """Why a part of the body is not among the messages."""
     absences: dict[str, Rejection] = field(default_factory=dict)
+    """Why a teammate sent nothing; noted for another attempt, as the gathering forgets it when the frame is closed."""
     timings: dict[str, float] = field(default_factory=dict)
+    """Milliseconds."""
 
     def spent(self, stage: str, since: float) -> None:
         """Note how long a stage took, until now."""
@@ -74,10 +63,13 @@ class Deciding:
     """Answers frames."""
 
     sessions: Sessions
+    store: Store
     engine: Engine
     metrics: Metrics
     admission: Admission
     tracing: Tracing
+    keep_frames: int
+    """Latest frames of a session whose messages are kept, to replay decisions."""
 
     async def answer(self, asked: Asked) -> FrameAnswer:
         """Decide a frame and keep the decision. The session's lock is held.
@@ -89,7 +81,7 @@ class Deciding:
         SessionChanged
             If the session keeps being changed.
         FrameDecided, SessionOver
-            As `Sessions.decide`.
+            As `service.keeping.store.Store.decide`.
         """
         for _ in range(ATTEMPTS):
             with contextlib.suppress(SessionChanged):
@@ -162,8 +154,11 @@ class Deciding:
                 unlogged_refusals=unlogged,
                 next_seed_commitment=commitment(next_seed),
             )
-            body = _whole_frame(asked, present) if self.sessions.keeps_messages else None
-            await self.sessions.decide(record, event, next_seed, body)
+            body = _whole_frame(asked, present) if self.keep_frames else None
+            await self.store.decide(record, event, next_seed, body)
+        if body is not None:
+            with contextlib.suppress(StoreUnavailable):  # the decision is kept; the next one forgets these as well
+                await self.store.forget_messages(record.session_id, asked.frame - self.keep_frames + 1)
         asked.spent("store", decided)
         could_begin = asked.arrived + asked.timings.get("gather", 0.0) / 1e3
         self.admission.learn(could_begin, time.perf_counter(), asked.timings["store"] / 1e3)

@@ -12,58 +12,38 @@ from robosac.audit import GENESIS
 
 @dataclass(frozen=True)
 class SessionRecord:
-    """All of a session that outlives a frame; JSON values throughout.
-
-    Attributes
-    ----------
-    session_id, ego_id : str
-    teammates : tuple of str
-    detector : str
-    defense : mapping
-        Settings as the API gives them.
-    latency_budget_ms, gather_ms, frame_period_ms : float
-    token_ids : mapping of vehicle id to str
-        The id of the one token of each vehicle that counts.
-    public_keys : mapping of vehicle id to str
-        Of the vehicles that sign, base64 (`robosac.signatures`).
-    created_at : str
-        RFC 3339, UTC.
-    seed : str
-        Of the next frame's draws, hexadecimal. A secret until that frame is decided.
-    last_frame : int or None
-        The highest frame that was answered.
-    frames_answered : int
-    state : mapping
-        What the defence remembers.
-    ended_at : str or None
-        RFC 3339, UTC; the log of an ended session can still be read.
-    audit_seq : int
-        Number of the latest audit record; the first is 1.
-    audit_head : str
-        `robosac.audit.digest` of the latest record.
-    revision : int
-        Changes to the session so far, other than to its log.
-    """
+    """All of a session that outlives a frame; JSON values throughout."""
 
     session_id: str
     ego_id: str
     teammates: tuple[str, ...]
     detector: str
     defense: Mapping[str, Any]
+    """Settings as the API gives them."""
     latency_budget_ms: float
     gather_ms: float
     frame_period_ms: float
     token_ids: Mapping[str, str]
+    """The id of the one token of each vehicle that counts."""
     created_at: str
+    """RFC 3339, UTC."""
     seed: str
+    """Seed of the next frame's draws, hexadecimal; a secret until that frame is decided."""
     public_keys: Mapping[str, str] = field(default_factory=dict)
+    """Keys of the vehicles that sign, base64 (`robosac.signatures`)."""
     last_frame: int | None = None
+    """The highest frame that was answered."""
     frames_answered: int = 0
     state: Mapping[str, Any] = field(default_factory=dict)
+    """What the defence remembers."""
     ended_at: str | None = None
+    """RFC 3339, UTC; the log of an ended session can still be read."""
     audit_seq: int = 0
+    """Number of the latest audit record; the first is 1."""
     audit_head: str = GENESIS
+    """`robosac.audit.digest` of the latest record."""
     revision: int = 0
+    """Changes to the session so far, other than to its log."""
 
 
 def new_seed() -> str:

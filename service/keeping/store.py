@@ -29,25 +29,7 @@ _OPEN = sessions.c.ended_at.is_(None)
 _GET = select(*(sessions.c[name] for name in _FIELDS)).where(_THIS)
 _GET_TO_CHANGE = _GET.with_for_update()  # SQLite, which knows no such clause, has locked everything by then
 _CHANGE = update(sessions).where(_THIS)
-_LINES = (
-    select(audit_lines.c.line)
-    .where(audit_lines.c.session_id == bindparam("this"), audit_lines.c.seq > bindparam("after"))
-    .order_by(audit_lines.c.seq)
-)
-_MESSAGES = select(kept_messages.c.body).where(
-    kept_messages.c.session_id == bindparam("this"), kept_messages.c.frame == bindparam("number")
-)
-_FORGET_MESSAGES = delete(kept_messages).where(
-    kept_messages.c.session_id == bindparam("this"), kept_messages.c.frame < bindparam("before")
-)
-_FORGET = delete(sessions).where(_THIS)
-_UNUSED = select(sessions.c.session_id).where(_OPEN, sessions.c.touched_at < bindparam("moment"))
-_ENDED = select(sessions.c.session_id).where(
-    sessions.c.ended_at.is_not(None), sessions.c.touched_at < bindparam("moment")
-)
-_COUNT = select(func.count()).select_from(sessions).where(_OPEN)
-_KEEP_SECRET = text("INSERT INTO secrets (name, value) VALUES (:name, :value) ON CONFLICT DO NOTHING")
-_SECRET = select(secrets.c.value).where(secrets.c.name == bindparam("this"))
+_ENDED = sessions.c.ended_at.is_not(None)
 
 Change = Callable[[SessionRecord], Mapping[str, Any]]
 
@@ -175,16 +157,20 @@ class Store:
 
     async def audit(self, session_id: str, after: int) -> list[str]:
         """Lines with a number above ``after``, in order."""
-        return await self._column(_LINES, this=session_id, after=after)
+        of_session = (audit_lines.c.session_id == session_id, audit_lines.c.seq > after)
+        return await self._column(select(audit_lines.c.line).where(*of_session).order_by(audit_lines.c.seq))
 
     async def messages(self, session_id: str, frame: int) -> bytes | None:
         """The messages kept of a decided frame."""
-        asked = {"this": session_id, "number": frame}
-        return await self._database.read(lambda connection: connection.execute(_MESSAGES, asked).scalar())
+        query = select(kept_messages.c.body).where(
+            kept_messages.c.session_id == session_id, kept_messages.c.frame == frame
+        )
+        return await self._database.read(lambda connection: connection.execute(query).scalar())
 
     async def forget_messages(self, session_id: str, before: int) -> None:
         """Forget the messages kept of the frames below ``before``."""
-        await self._execute(_FORGET_MESSAGES, this=session_id, before=before)
+        old = (kept_messages.c.session_id == session_id, kept_messages.c.frame < before)
+        await self._execute(delete(kept_messages).where(*old))
 
     async def end(self, session_id: str, event: SessionEnded) -> None:
         """End a session; its log stays until it is purged."""
@@ -192,24 +178,27 @@ class Store:
 
     async def unused_since(self, moment: float) -> list[str]:
         """Open sessions to which nothing was added since then (Unix time)."""
-        return await self._column(_UNUSED, moment=moment)
+        return await self._column(select(sessions.c.session_id).where(_OPEN, sessions.c.touched_at < moment))
 
     async def purge(self, moment: float) -> None:
         """Forget the sessions that ended before then (Unix time), with their logs and messages."""
-        for session_id in await self._column(_ENDED, moment=moment):  # one by one, so that frames need not wait for all
-            await self._execute(_FORGET, this=session_id)
+        ended = select(sessions.c.session_id).where(_ENDED, sessions.c.touched_at < moment)
+        for session_id in await self._column(ended):  # one by one, so that frames need not wait for all
+            await self._execute(delete(sessions).where(sessions.c.session_id == session_id))
             self._seen.pop(session_id, None)
 
     async def count(self) -> int:
         """Open sessions."""
-        return await self._database.read(lambda connection: connection.execute(_COUNT).scalar_one())
+        query = select(func.count()).select_from(sessions).where(_OPEN)
+        return await self._database.read(lambda connection: connection.execute(query).scalar_one())
 
     async def secret(self, name: str, make: Callable[[], str]) -> str:
         """A secret that outlives the process: what ``make`` gave when it was first asked for."""
 
         def work(connection: Connection) -> str:
-            connection.execute(_KEEP_SECRET, {"name": name, "value": make()})
-            value: str = connection.execute(_SECRET, {"this": name}).scalar_one()
+            keep = text("INSERT INTO secrets (name, value) VALUES (:name, :value) ON CONFLICT DO NOTHING")
+            connection.execute(keep, {"name": name, "value": make()})
+            value: str = connection.execute(select(secrets.c.value).where(secrets.c.name == name)).scalar_one()
             return value
 
         return await self._database.write(work)
@@ -218,11 +207,11 @@ class Store:
         """Let go of files and connections."""
         await self._database.close()
 
-    async def _column(self, query: Select[Any], **asked: Any) -> list[str]:
-        return await self._database.read(lambda connection: list(connection.execute(query, asked).scalars()))
+    async def _column(self, query: Select[Any]) -> list[str]:
+        return await self._database.read(lambda connection: list(connection.execute(query).scalars()))
 
-    async def _execute(self, statement: Delete, **asked: Any) -> None:
-        await self._database.write(lambda connection: connection.execute(statement, asked))
+    async def _execute(self, statement: Delete) -> None:
+        await self._database.write(lambda connection: connection.execute(statement))
 
     async def _append(
         self,

@@ -20,18 +20,11 @@ REMEMBERED_FRAMES = 8
 
 @dataclass(frozen=True)
 class Received:
-    """A message that was checked, and what proves who said it.
-
-    Attributes
-    ----------
-    message : Message
-    digest : str
-        `robosac.wire.content_digest`.
-    signature : bytes or None
-    """
+    """A message that was checked, and what proves who said it."""
 
     message: Message
     digest: str
+    """`robosac.wire.content_digest`."""
     signature: bytes | None = None
 
     @property

@@ -90,58 +90,41 @@ class ApiKeys:
 
 @dataclass(frozen=True)
 class Token:
-    """A new token.
-
-    Attributes
-    ----------
-    text : str
-        What the vehicle sends.
-    token_id : str
-        What the session's record keeps (the claim ``jti``).
-    expires_at : str
-        RFC 3339, UTC.
-    """
+    """A new token."""
 
     text: str = field(repr=False)
+    """What the vehicle sends."""
     token_id: str
+    """What the session's record keeps (the claim ``jti``)."""
     expires_at: str
+    """RFC 3339, UTC."""
 
 
 class Tokens:
-    """Signs and reads the tokens of vehicles.
+    """Signs and reads the tokens of vehicles. The first of the settings' secrets signs, all verify.
 
     Parameters
     ----------
-    signing_secrets : sequence of str
-        The first signs, all verify. With none, `start` takes the one that the store keeps.
-    ttl_s : float
-        How long a token lives.
+    settings : Settings
     clock : callable
         Unix time, seconds.
+
+    Raises
+    ------
+    ValueError
+        If a secret is too short; it is not shown.
     """
 
-    def __init__(self, signing_secrets: Sequence[str], ttl_s: float, clock: Callable[[], float] = time.time) -> None:
+    def __init__(self, settings: Settings, clock: Callable[[], float] = time.time) -> None:
+        self._secrets = tuple(secret.get_secret_value() for secret in settings.token_secrets)
+        self._ttl_s = settings.token_ttl_s
         self._clock = clock
-        self._secrets = tuple(signing_secrets)
-        self._ttl_s = ttl_s
-
-    @classmethod
-    def configured(cls, settings: Settings, clock: Callable[[], float] = time.time) -> Tokens:
-        """Those of the settings.
-
-        Raises
-        ------
-        ValueError
-            If a secret is too short; it is not shown.
-        """
-        own = [secret.get_secret_value() for secret in settings.token_secrets]
-        for number, secret in enumerate(own, 1):
+        for number, secret in enumerate(self._secrets, 1):
             if len(secret) < SECRET_LENGTH:
                 raise ValueError(f"ROBOSAC_TOKEN_SECRETS: secret {number} has fewer than {SECRET_LENGTH} characters")
-        return cls(own, settings.token_ttl_s, clock)
 
     async def start(self, store: Store) -> None:
-        """Make sure that there is a secret, the same after a restart."""
+        """Where the settings name no secret, take the one that the store keeps: the same after a restart."""
         if not self._secrets:
             self._secrets = (await store.secret("token-signing", lambda: secrets.token_urlsafe(48)),)
 

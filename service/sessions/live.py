@@ -55,8 +55,9 @@ class LiveSession:
 
     @contextmanager
     def unlogged(self) -> Iterator[dict[str, int]]:
-        """Refusals by vehicle that got no record since the last decision; all counts begin again, unless the block that
-        keeps the decision fails.
+        """Refusals by vehicle that got no record since the last decision, for the block that keeps the next one.
+
+        After the block all counts begin again. If it fails, they go on.
         """
         counted, self.refusals = self.refusals, Counter()
         try:

@@ -19,7 +19,7 @@ from service.engine import Engine
 from service.errors import Kind, Refused
 from service.keeping.record import SessionRecord
 from service.keeping.store import Store
-from service.schemas import DetectorEntry, SessionCreated, SessionRequest
+from service.schemas import SessionCreated, SessionRequest
 from service.sessions.identity import Tokens
 from service.sessions.sessions import Sessions
 from service.sessions.teams import check_size
@@ -77,17 +77,15 @@ class Opening:
         team = {"ego_id": record.ego_id, "teammates": len(record.teammates)}
         logger.info("session opened", session_id=session_id, **team, detector=info.name, defense=defense.kind)
         own = tokens.pop(record.ego_id)
-        return SessionCreated(
-            session_id=session_id,
-            ego_token=own.text,
-            teammate_tokens={name: token.text for name, token in tokens.items()},
-            tokens_expire_at=own.expires_at,
-            detector=DetectorEntry.of(info),
-            defense=defense,
-            latency_budget_ms=budget_ms,
-            gather_ms=gather_ms,
-            frame_period_ms=record.frame_period_ms,
-        )
+        shown = {
+            **vars(record),  # of which only what `SessionCreated` declares is shown
+            "ego_token": own.text,
+            "teammate_tokens": {name: token.text for name, token in tokens.items()},
+            "tokens_expire_at": own.expires_at,
+            "detector": info,
+            "defense": defense,
+        }
+        return SessionCreated.model_validate(shown)
 
     def _detector(self, name: str) -> DetectorInfo:
         self.engine.check_ready()

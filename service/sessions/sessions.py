@@ -6,17 +6,18 @@ import asyncio
 import contextlib
 import time
 from collections.abc import Callable
+from dataclasses import dataclass
 
 import structlog
 
 from robosac.answers import Reason
 from robosac.audit import commitment
-from robosac.audit.events import FrameAnswered, SessionEnded
+from robosac.audit.events import SessionEnded
 from robosac.budget import DomainError
 from robosac.defenses import known, read_settings, suspicion_in
 from robosac.session import Session, defense_for
 from service.engine import Engine
-from service.errors import Kind, Refused, SessionOver, StoreUnavailable, TokenRefused
+from service.errors import Kind, Refused, SessionOver, TokenRefused
 from service.keeping.record import SessionRecord, new_seed
 from service.keeping.store import Store
 from service.schemas import SessionState
@@ -33,32 +34,26 @@ logger = structlog.stdlib.get_logger(__name__)
 SWEEP_EVERY_S = 30.0
 
 
+@dataclass
 class Sessions:
     """All sessions of this gateway.
 
-    ``seeds`` gives the seed of a frame's draws, hexadecimal; by default from the operating system, so that nobody can
-    foresee them.
+    ``draw_seed`` gives the seed of a frame's draws, hexadecimal; by default from the operating system, so that nobody
+    can foresee them.
     """
 
-    def __init__(
-        self,
-        settings: Settings,
-        store: Store,
-        engine: Engine,
-        metrics: Metrics,
-        tokens: Tokens,
-        seeds: Callable[[], str] = new_seed,
-    ) -> None:
-        self.draw_seed = seeds
-        self._settings = settings
-        self._store = store
-        self._engine = engine
-        self._metrics = metrics
-        self._tokens = tokens
+    settings: Settings
+    store: Store
+    engine: Engine
+    metrics: Metrics
+    tokens: Tokens
+    draw_seed: Callable[[], str] = new_seed
+
+    def __post_init__(self) -> None:
         self._live: dict[str, LiveSession] = {}
-        self.defenses = known(settings.extra_defenses)
-        self.backlog = Backlog(settings.max_pending_bytes)
-        self.journal = Journal(store, metrics)
+        self.defenses = known(self.settings.extra_defenses)
+        self.backlog = Backlog(self.settings.max_pending_bytes)
+        self.journal = Journal(self.store, self.metrics)
 
     def begin(self, record: SessionRecord) -> None:
         """Let a session be used whose record is kept now."""
@@ -73,7 +68,7 @@ class Sessions:
             If the session is unknown or ended, the token is none of it, or its detector or its defence is not served
             any more.
         """
-        record = await self._store.get(session_id)
+        record = await self.store.get(session_id)
         if record is None or record.ended_at is not None:
             self._forget(session_id)
             raise SessionOver("there is no such session; it may have ended or expired")
@@ -99,14 +94,14 @@ class Sessions:
 
     async def audit_log(self, session_id: str, token: str | None, after: int) -> list[str]:
         """Lines of the log with a number above ``after``, for the ego; of a session no longer served, too."""
-        record = await self._store.get(session_id)
+        record = await self.store.get(session_id)
         if record is None:
             raise SessionOver("there is no such session; its log may have been purged")
         if record.ended_at is None and self._is_served(record):
             await self.authenticate_ego(session_id, token)
         elif (vehicle := await self._holder(record, token)) != record.ego_id:
             raise _ego_only(vehicle)
-        return await self._store.audit(session_id, after)
+        return await self.store.audit(session_id, after)
 
     async def describe(self, caller: Caller) -> SessionState:
         """The session's state."""
@@ -123,7 +118,7 @@ class Sessions:
         """End a session, after the frame in hand; the head of its log, which is complete by then."""
         async with caller.live.lock:
             await self._end(caller.record.session_id, "closed")
-        record = await self._store.get(caller.record.session_id)
+        record = await self.store.get(caller.record.session_id)
         if record is None:
             raise SessionOver
         return record.audit_head
@@ -131,56 +126,30 @@ class Sessions:
     async def expire_idle(self) -> None:
         """End, every so often and for ever, the sessions that nobody has used for too long, and purge old logs."""
         while True:
-            await asyncio.sleep(min(SWEEP_EVERY_S, self._settings.session_idle_s / 2))
+            await asyncio.sleep(min(SWEEP_EVERY_S, self.settings.session_idle_s / 2))
             try:
-                for session_id in await self._store.unused_since(time.time() - self._settings.session_idle_s):
+                for session_id in await self.store.unused_since(time.time() - self.settings.session_idle_s):
                     if not self._in_use(session_id):
                         await self._end(session_id, "expired")
                 for session_id in [one for one in self._live if not self._in_use(one)]:
-                    record = await self._store.get(session_id)
+                    record = await self.store.get(session_id)
                     if record is None or record.ended_at is not None:  # by another process
                         self._forget(session_id)
-                await self._store.purge(time.time() - self._settings.audit_retention_s)
+                await self.store.purge(time.time() - self.settings.audit_retention_s)
             except Exception:  # a sweep that fails must not be the last one
                 logger.exception("idle sessions could not be ended")
 
     async def current(self, caller: Caller) -> SessionRecord:
         """The session as it is now; it may have moved on, or ended, since the caller was authenticated.
 
-        What another process changed meanwhile may be missing; `decide` finds out.
+        What another process changed meanwhile may be missing; the store finds out when a change is to be kept.
         """
         session_id = caller.record.session_id
-        record = self._store.seen(session_id) or await self._store.get(session_id)
+        record = self.store.seen(session_id) or await self.store.get(session_id)
         if record is None or record.ended_at is not None:
             raise SessionOver
         caller.live.follow(record)
         return record
-
-    @property
-    def keeps_messages(self) -> bool:
-        """Whether the messages of frames are kept, to replay decisions."""
-        return self._settings.keep_frames > 0
-
-    async def decide(
-        self, record: SessionRecord, event: FrameAnswered, next_seed: str, messages: bytes | None = None
-    ) -> None:
-        """Keep a decision that was worked out from ``record``, and the next seed, which ``event`` commits to.
-
-        Raises
-        ------
-        SessionChanged
-            If the session is another by now: the decision is void, and has to be worked out again.
-        FrameDecided, SessionOver
-            As `service.keeping.store.Store.decide`.
-        """
-        await self._store.decide(record, event, next_seed, messages)
-        if messages is not None:
-            with contextlib.suppress(StoreUnavailable):  # the decision is kept; the next one forgets these as well
-                await self._store.forget_messages(record.session_id, event.frame - self._settings.keep_frames + 1)
-
-    async def messages(self, caller: Caller, frame: int) -> bytes | None:
-        """The messages kept of a decided frame."""
-        return await self._store.messages(caller.record.session_id, frame)
 
     def _revive(self, record: SessionRecord) -> LiveSession:
         """What this process holds of a session.
@@ -192,7 +161,7 @@ class Sessions:
             the defence needs.
         """
         closed = -1 if record.last_frame is None else record.last_frame
-        settings, detector = self._settings, self._engine.detectors.get(record.detector)
+        settings, detector = self.settings, self.engine.detectors.get(record.detector)
         if detector is None:
             detail = f"the session's detector {record.detector} is not served now"
             raise Refused(Kind.DETECTOR_UNAVAILABLE, detail)
@@ -217,7 +186,7 @@ class Sessions:
     def _in_use(self, session_id: str) -> bool:
         """Whether a frame is in hand, or somebody asked for something lately that left no trace in the store."""
         live = self._live.get(session_id)
-        recently = time.monotonic() - self._settings.session_idle_s
+        recently = time.monotonic() - self.settings.session_idle_s
         return live is not None and (live.lock.locked() or live.last_used >= recently)
 
     def _forget(self, session_id: str) -> None:
@@ -230,8 +199,8 @@ class Sessions:
         with contextlib.suppress(SessionOver):
             event = SessionEnded(why=why)
             logger.info("session ended", session_id=session_id, why=why)
-            await self._store.end(session_id, event)
-        self._metrics.sessions.set(await self._store.count())
+            await self.store.end(session_id, event)
+        self.metrics.sessions.set(await self.store.count())
 
     def _is_served(self, record: SessionRecord) -> bool:
         try:
@@ -249,7 +218,7 @@ class Sessions:
     async def _holder(self, record: SessionRecord, token: str | None) -> str:
         """The vehicle of the session that a token belongs to; a refusal goes on record, but only so many of them."""
         try:
-            return self._tokens.holder(record, token)
+            return self.tokens.holder(record, token)
         except TokenRefused as refused:
             live = self._live_session(record) if record.ended_at is None and self._is_served(record) else None
             await self.journal.stranger(record.session_id, live, refused)

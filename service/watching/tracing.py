@@ -51,14 +51,14 @@ class Tracing:
 
     def __init__(self, provider: TracerProvider | None) -> None:
         self._provider = provider
-        self._tracer: Tracer | None = provider.get_tracer("robosac") if provider else None
+        self.tracer: Tracer | None = provider.get_tracer("robosac") if provider else None
 
     def frame(self, session_id: str, answer: FrameAnswer, timings_ms: Mapping[str, float]) -> None:
         """Add the stages of an answered frame to the request's span, one after another.
 
         Decoding and matching of the hypotheses take turns in truth; each is shown as one stretch.
         """
-        if self._tracer is None:
+        if self.tracer is None:
             return
         from opentelemetry import trace  # noqa: PLC0415 (optional)
 
@@ -76,7 +76,7 @@ class Tracing:
         start = time.time_ns() - sum(nanoseconds for _, nanoseconds in spent)
         for stage, nanoseconds in spent:
             if nanoseconds:
-                self._tracer.start_span(stage, start_time=start).end(start + nanoseconds)
+                self.tracer.start_span(stage, start_time=start).end(start + nanoseconds)
             start += nanoseconds
 
     def close(self) -> None:
@@ -84,10 +84,17 @@ class Tracing:
         if self._provider is not None:
             self._provider.shutdown()
 
-    async def request(self, app: ASGIApp, scope: Scope, receive: Receive, send: Send) -> None:
-        """Serve a request within a span of its own, or of the caller's trace where its headers name one."""
+
+class Traced:
+    """Middleware that serves every request within a span, of the caller's trace where its headers name one."""
+
+    def __init__(self, app: ASGIApp, tracing: Tracing) -> None:
+        self._app = app
+        self._tracer = tracing.tracer
+
+    async def __call__(self, scope: Scope, receive: Receive, send: Send) -> None:
         if self._tracer is None or scope["type"] != "http":
-            await app(scope, receive, send)
+            await self._app(scope, receive, send)
             return
         from opentelemetry import propagate, trace  # noqa: PLC0415 (optional)
 
@@ -105,15 +112,4 @@ class Tracing:
                         span.update_name(f"{scope['method']} {route.path}")
                 await send(message)
 
-            await app(scope, receive, noting)
-
-
-class Traced:
-    """Middleware that serves every request through a `Tracing`."""
-
-    def __init__(self, app: ASGIApp, tracing: Tracing) -> None:
-        self._app = app
-        self._tracing = tracing
-
-    async def __call__(self, scope: Scope, receive: Receive, send: Send) -> None:
-        await self._tracing.request(self._app, scope, receive, send)
+            await self._app(scope, receive, noting)

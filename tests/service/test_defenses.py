@@ -203,7 +203,7 @@ async def test_frames_far_apart_are_compared_only_if_asked_for(served, ego_messa
 async def test_a_session_stored_before_frames_were_compared_is_served_by_its_period(served, period_ms, compared):
     session = await served.open(defense={"kind": "group_testing"}, frame_period_ms=period_ms)
     sessions = served.gateway.sessions
-    record = await sessions._store.get(session.session_id)
+    record = await served.gateway.store.get(session.session_id)
     older = {name: value for name, value in record.defense.items() if name != "compare_frames"}
     assert sessions._revive(replace(record, defense=older)).session.defense.settings.compare_frames is compared
 

@@ -107,10 +107,9 @@ async def a_faulty_decision(served, seeds, messages, benign):
 async def a_faulty_opening(served, seeds, messages, benign):
     """A fault with the caller's credential in its message, and causes without end."""
     session = await served.open()
-    error = RuntimeError(f"{KEY}, {OTHER_KEY}, {SECRET} and {session}" + " and so on" * 10_000)
+    seeds.fault = error = RuntimeError(f"{KEY}, {OTHER_KEY}, {SECRET} and {session}" + " and so on" * 10_000)
     for _ in range(50):
-        error.__cause__, error = RuntimeError(bytes(range(256)) * 10), error.__cause__ or error
-    seeds.fault = error
+        error.__cause__ = error = RuntimeError(bytes(range(256)) * 10)
     opening = await served.http.post("/v1/sessions", json={"ego_id": "a", "teammates": []}, headers=bearer(KEY))
     problem(opening, 500, "internal-error")
     return session
