@@ -22,9 +22,11 @@ from robosac.evaluation import BoundsReport, NoFrames, Sampling, evaluate_bounds
 from robosac.evaluation.frames import evaluation_frames
 from robosac.scenes import DEFAULT_DATA, SceneError
 
+DEFAULT_SCENES = 40
+
 
 def run(
-    scenes: Annotated[int, typer.Option(min=1, help="Test scenes, the first so many, or all that there are.")] = 40,
+    scenes: Annotated[int | None, typer.Option(min=1, help="Test scenes; 40, or all if there are fewer.")] = None,
     frames: Annotated[int, typer.Option(min=1, help="Frames of each, 1 s apart.")] = 5,
     attackers: Annotated[int, typer.Option(min=0, help="Attackers among the teammates.")] = 1,
     attack: Annotated[str, typer.Option(help=CAMPAIGN_HELP)] = "pgd",
@@ -45,7 +47,9 @@ def run(
     check_attack(chosen_attack, chosen)
     rng = np.random.default_rng([seed, 0])
     with blaming("--data", SceneError, NoFrames), progress(console) as bar:
-        some = source.scenes("test")[:scenes]
+        some = source.scenes("test")[: scenes or DEFAULT_SCENES]
+        if len(some) < (scenes or 1):
+            raise SceneError(f"{source.name} has {len(some)} test scenes")
         team = max((len(scene.agents) - 1 for scene in some), default=0)
         if attackers + collaborators > team:
             why = f"no {collaborators} of {team} teammates can be free of {attackers} attackers"
@@ -57,7 +61,7 @@ def run(
     _print(console, report, attack, attackers)
     if out is not None:
         settings = {
-            "scenes": scenes,
+            "scenes": len(some),
             "frames": frames,
             "attackers": attackers,
             "attack": attack,
