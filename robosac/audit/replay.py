@@ -20,8 +20,9 @@ from robosac.deadline import Recorded
 from robosac.defenses import Defense, Kinds, Outcome, State, build, read_settings
 from robosac.detectors import Message, Preparer
 from robosac.faults import in_short
-from robosac.fusion import FusionResult, fuse
+from robosac.fusion import FusionResult
 from robosac.previous import PreviousAnswer
+from robosac.session import Session
 
 JACCARD_TOLERANCE = 1e-9
 STATE_TOLERANCE = 2e-6
@@ -193,18 +194,13 @@ def _compare_digests(logged: FrameAnswered, messages: dict[str, Message]) -> Ite
 
 
 def _fuse(decision: LoggedDecision, defense: Defense, messages: dict[str, Message], detector: Preparer) -> FusionResult:
-    logged, ego_id = decision.answer, decision.session.ego_id
-    return fuse(
-        detector,
-        defense,
-        messages[ego_id],
-        {name: message for name, message in messages.items() if name != ego_id},
-        rng=np.random.default_rng(int(logged.seed, 16)),
-        state=decision.state,
-        frame=logged.frame,
-        previous=decision.previous,
-        deadline=Recorded(len(logged.hypotheses)) if logged.out_of_time else None,
-    )
+    logged, previous = decision.answer, decision.previous
+    saved = {"state": decision.state, "previous": None if previous is None else previous.as_json()}
+    session = Session(detector, decision.session.teammates, defense, saved)
+    teammates = dict(messages)
+    ego = teammates.pop(decision.session.ego_id)
+    deadline = Recorded(len(logged.hypotheses)) if logged.out_of_time else None
+    return session.decide(logged.frame, ego, teammates, np.random.default_rng(int(logged.seed, 16)), deadline)
 
 
 def _compare(logged: FrameAnswered, made: FusionResult) -> Iterator[Difference]:
