@@ -15,19 +15,12 @@ DEFAULT_THRESHOLD = 0.3
 
 @dataclass(frozen=True)
 class Comparison:
-    """Result of a consensus test.
-
-    Attributes
-    ----------
-    jaccard_index : float
-        Matched pairs over all distinct boxes, in [0, 1]; 1 for two empty sets.
-    matched : int
-        Pairs matched one to one at IoU 0.5 or more.
-    verdict : Verdict
-    """
+    """Result of a consensus test."""
 
     jaccard_index: float
+    """Matched pairs over all distinct boxes, in [0, 1]; 1 for two empty sets."""
     matched: int
+    """Pairs matched one to one at IoU 0.5 or more."""
     verdict: Verdict
 
 

@@ -42,33 +42,22 @@ class UnverifiedAnswer(Exception):
 
 @dataclass(frozen=True, kw_only=True)
 class FusionResult(Decision):
-    """The answer to one frame: what the defence decided, and what came of it.
-
-    Attributes
-    ----------
-    boxes : (n, 6) float64 ndarray
-        x, y, length, width, yaw, score; ego frame, best first.
-    hypotheses : tuple of Outcome
-        In the order tested.
-    deadline_met : bool
-        Whether the answer was ready in time.
-    out_of_time : bool
-        Whether the defence was cut short to meet the deadline.
-    fault : str or None
-        What went wrong inside (`robosac.faults.describe`), if anything; the boxes are then the ego's own.
-    timings_ms : mapping of stage to float
-        ``prepare``, ``ego_only``, ``hypotheses`` (decoding), ``consensus`` (matching).
-    previous : PreviousAnswer or None
-        What the next frame may be compared with; None after an ego-only answer.
-    """
+    """The answer to one frame: what the defence decided, and what came of it."""
 
     boxes: FloatArray
+    """(n, 6) float64: x, y, length, width, yaw, score; ego frame, best first."""
     hypotheses: tuple[Outcome, ...]
+    """In the order tested."""
     deadline_met: bool
+    """Whether the answer was ready in time."""
     out_of_time: bool
+    """Whether the defence was cut short to meet the deadline."""
     fault: str | None
+    """What went wrong inside (`robosac.faults.describe`), if anything; the boxes are then the ego's own."""
     timings_ms: Mapping[str, float]
+    """By stage: ``prepare``, ``ego_only``, ``hypotheses`` (decoding), ``consensus`` (matching)."""
     previous: PreviousAnswer | None
+    """What the next frame may be compared with; None after an ego-only answer."""
 
     @property
     def sampling_steps(self) -> int:

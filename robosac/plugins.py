@@ -39,33 +39,22 @@ def own_name(candidate: type) -> str:
 
 @dataclass(frozen=True)
 class Kind(Generic[T]):
-    """Things of one kind, such as attacks.
-
-    Attributes
-    ----------
-    noun : str
-        What one of them is called in messages.
-    package : str
-        Whose modules hold those that ship. Other packages offer theirs as entry points of the group of that name.
-    contract : type
-        What each has to be: a protocol, or a class to derive from.
-    name_of : callable
-        The name of a class that is found in the package; empty if it is none of this kind.
-    takes_argument : bool
-        Whether ``name:argument`` is a way to ask for one.
-    forms : str
-        Other ways to ask for one than a name, for messages.
-    error : type
-        Raised where one cannot be had.
-    """
+    """Things of one kind, such as attacks."""
 
     noun: str
+    """What one of them is called in messages."""
     package: str
+    """Whose modules hold those that ship. Other packages offer theirs as entry points of the group of that name."""
     contract: type[Any]
+    """What each has to be: a protocol, or a class to derive from."""
     name_of: Callable[[type[Any]], str] = own_name
+    """The name of a class that is found in the package; empty if it is none of this kind."""
     takes_argument: bool = False
+    """Whether ``name:argument`` is a way to ask for one."""
     forms: str = "or module:callable"
+    """Other ways to ask for one than a name, for messages."""
     error: type[ValueError] = ValueError
+    """Raised where one cannot be had."""
 
     @cached_property
     def shipped(self) -> Mapping[str, type[T]]:

@@ -18,20 +18,13 @@ FOLLOWED_M = 3.0
 
 @dataclass(frozen=True)
 class PreviousAnswer:
-    """A collaborative answer, kept as the reference of the next frame.
-
-    Attributes
-    ----------
-    frame : int
-    boxes : (n, 6) float64 ndarray
-        x, y, length, width, yaw, score; world frame.
-    motion : (n, 2) float64 ndarray
-        How far each box moved since the frame before, metres; 0 where that is not known.
-    """
+    """A collaborative answer, kept as the reference of the next frame."""
 
     frame: int
     boxes: FloatArray
+    """(n, 6) float64: x, y, length, width, yaw, score; world frame."""
     motion: FloatArray
+    """(n, 2) float64: how far each box moved since the frame before, metres; 0 where that is not known."""
 
     @classmethod
     def of(

@@ -37,40 +37,25 @@ class ReplayError(ValueError):
 
 @dataclass(frozen=True)
 class LoggedDecision:
-    """A decision, and what the log says it was made from.
-
-    Attributes
-    ----------
-    line : int
-        Of the log, from 1 on.
-    session : SessionOpened
-    state : mapping
-        The defence's, before the frame.
-    previous : PreviousAnswer or None
-    answer : FrameAnswered
-    """
+    """A decision, and what the log says it was made from."""
 
     line: int
+    """Of the log, from 1 on."""
     session: SessionOpened
     state: State
+    """The defence's, before the frame."""
     previous: PreviousAnswer | None
     answer: FrameAnswered
 
 
 @dataclass(frozen=True)
 class Difference:
-    """What came out otherwise.
-
-    Attributes
-    ----------
-    what : str
-        ``detector`` or ``messages``: other inputs, and nothing was recomputed; else the field of the answer.
-    detail : str
-        For a human.
-    """
+    """What came out otherwise."""
 
     what: str
+    """``detector`` or ``messages``: other inputs, and nothing was recomputed; else the field of the answer."""
     detail: str
+    """For a human."""
 
     def __str__(self) -> str:
         return f"{self.what}: {self.detail}"

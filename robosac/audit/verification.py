@@ -50,23 +50,15 @@ class Fault(StrEnum):
 
 @dataclass(frozen=True)
 class Finding:
-    """Something wrong in a log.
-
-    Attributes
-    ----------
-    line : int
-        From 1 on; 0 for an empty log.
-    seq : int or None
-        As the record gives it, where it does.
-    fault : Fault
-    detail : str
-        For a human.
-    """
+    """Something wrong in a log."""
 
     line: int
+    """From 1 on; 0 for an empty log."""
     seq: int | None
+    """As the record gives it, where it does."""
     fault: Fault
     detail: str
+    """For a human."""
 
     def __str__(self) -> str:
         where = f"line {self.line}" if self.seq is None else f"line {self.line} (seq {self.seq})"

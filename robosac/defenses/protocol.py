@@ -91,78 +91,52 @@ class Reference(StrEnum):
 
 @dataclass(frozen=True)
 class Outcome:
-    """A tested hypothesis.
-
-    Attributes
-    ----------
-    teammates : tuple of str
-    jaccard_index : float
-        Against the reference, in [0, 1].
-    verdict : Verdict
-    boxes : (n, 6) ndarray or None
-        All that was decoded, with scores; ego frame. None where only the verdict is known.
-    reference : (m, 6) ndarray or None
-        What took part in the comparison on the reference's side.
-    pose : (4, 4) ndarray or None
-        world_from_sensor of the ego. None where it is not known.
-    frame : int
-        Its number; frames of successive numbers are one frame period apart.
-    """
+    """A tested hypothesis."""
 
     teammates: Hypothesis
     jaccard_index: float
+    """Against the reference, in [0, 1]."""
     verdict: Verdict
     boxes: FloatArray | None = field(default=None, compare=False, repr=False)
+    """(n, 6): all that was decoded, with scores; ego frame. None where only the verdict is known."""
     reference: FloatArray | None = field(default=None, compare=False, repr=False)
+    """(m, 6): what took part in the comparison on the reference's side."""
     pose: FloatArray | None = field(default=None, compare=False, repr=False)
+    """(4, 4): world_from_sensor of the ego. None where it is not known."""
     frame: int = field(default=0, compare=False, repr=False)
+    """Its number; frames of successive numbers are one frame period apart."""
 
 
 @dataclass(frozen=True)
 class Rejection:
-    """Why one teammate was left out.
-
-    Attributes
-    ----------
-    reason : Reason
-    evidence : mapping
-        JSON values; for ``dissensus`` the indices of the hypotheses that speak against the teammate and their lowest
-        Jaccard index.
-    distrust : Distrust or None
-        Why, if the reason is ``distrusted``; may be left out of a teammate that the state names.
-    """
+    """Why one teammate was left out."""
 
     reason: Reason
     evidence: Mapping[str, Any] = field(default_factory=dict)
+    """JSON values; for ``dissensus`` the indices of the hypotheses that speak against the teammate and their lowest
+    Jaccard index.
+    """
     distrust: Distrust | None = None
+    """Why, if the reason is ``distrusted``; may be left out of a teammate that the state names."""
 
 
 @dataclass(frozen=True)
 class Decision:
-    """What a defence concludes about a frame.
-
-    Attributes
-    ----------
-    accepted : tuple of str
-        The subset whose fusion is the answer; empty for ``ego_only``. For ``consensus`` it must be one that was in
-        consensus in this frame, for ``trusted`` all of it must be on the trust list that the frame began with.
-    source : Source
-    rejected : mapping of teammate id to Rejection
-        Every teammate of the frame that is not accepted.
-    attacker_ratio : float or None
-        Assumed or estimated share of attackers in the team.
-    state : mapping
-        To be handed to the next frame's conversation; see `remembered`.
-    suspicion : mapping of teammate id to float, or None
-        Probability that each teammate of the session attacks; None from a defence that knows none.
-    """
+    """What a defence concludes about a frame."""
 
     accepted: Hypothesis
+    """The subset whose fusion is the answer; empty for ``ego_only``. For ``consensus`` it must be one that was in
+    consensus in this frame, for ``trusted`` all of it must be on the trust list that the frame began with.
+    """
     source: Source
     rejected: Mapping[str, Rejection]
+    """By teammate id: every teammate of the frame that is not accepted."""
     attacker_ratio: float | None
+    """Assumed or estimated share of attackers in the team."""
     state: State
+    """To be handed to the next frame's conversation; see `remembered`."""
     suspicion: Mapping[str, float] | None = None
+    """By teammate id: probability that each teammate of the session attacks; None from a defence that knows none."""
 
     @property
     def trusted(self) -> tuple[str, ...]:

@@ -12,17 +12,13 @@ from robosac.defenses.group_testing import sets
 
 @dataclass(frozen=True, eq=False)
 class Block:
-    """Teammates whose states are held together.
-
-    Attributes
-    ----------
-    names : sequence of str
-    table : (1 + K, 3 ** n) ndarray
-        Probability of their states (see `sets`), given each kind of attack; "nobody attacks" is the first.
-    """
+    """Teammates whose states are held together."""
 
     names: Sequence[str]
     table: FloatArray
+    """(1 + K, 3 ** n): probability of their states (see `sets`), given each kind of attack; "nobody attacks" is the
+    first.
+    """
 
     @cached_property
     def below(self) -> FloatArray:

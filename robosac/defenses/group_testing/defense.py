@@ -103,25 +103,20 @@ class GroupTesting:
     An ego that sees fewer than two boxes gives no verdict: its consensus is none, and the answer falls back on the
     trust list (source ``trusted``). Teammates get onto that list by having been in consensus, and stay while their
     suspicion is at most .1. Exact for teams up to 6; see `Posterior` for larger ones.
-
-    Parameters
-    ----------
-    model : EvidenceModel
-        Of the detector it is used with; see `Calibration.at`.
-    settings : GroupTestingSettings
-        Frames are compared (``compare_frames``) unless they say no. What comes and goes from one frame to the next is
-        evidence only for an ego that knows its own pose, at about 5 frames a second: else honest teammates would seem
-        to attack.
-    evidence : class
-        Reads the outcomes; another one than `Evidence` where they are drawn and not decoded.
     """
 
     kind: ClassVar[str] = "group_testing"
     reference: ClassVar[Reference] = Reference.EGO
 
     model: EvidenceModel
+    """Of the detector it is used with; see `Calibration.at`."""
     settings: GroupTestingSettings = field(default_factory=GroupTestingSettings)
+    """Frames are compared (``compare_frames``) unless they say no. What comes and goes from one frame to the next is
+    evidence only for an ego that knows its own pose, at about 5 frames a second: else honest teammates would seem to
+    attack.
+    """
     evidence: type[Evidence] = Evidence
+    """Reads the outcomes; another one than `Evidence` where they are drawn and not decoded."""
 
     @property
     def consensus_threshold(self) -> float:

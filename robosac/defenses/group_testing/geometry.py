@@ -28,18 +28,12 @@ TURN_RAD = 0.4
 
 @dataclass(frozen=True)
 class PairMeasure:
-    """How the fusion of ``a + d`` differs from that of ``a``.
-
-    Attributes
-    ----------
-    loss : float
-        g, geometric preservation loss, in [0, 1].
-    novelty : int
-        v, boxes that overlap nothing of before.
-    """
+    """How the fusion of ``a + d`` differs from that of ``a``."""
 
     loss: float
+    """g, geometric preservation loss, in [0, 1]."""
     novelty: int
+    """v, boxes that overlap nothing of before."""
 
 
 def measure(smaller: FloatArray, larger: FloatArray) -> PairMeasure | None:

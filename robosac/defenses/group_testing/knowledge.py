@@ -16,21 +16,13 @@ from robosac.defenses.protocol import Hypothesis, State, remembered
 
 @dataclass
 class Knowledge:
-    """Posterior and memory change within a frame; who is in the team does not.
-
-    Attributes
-    ----------
-    model : EvidenceModel
-    posterior : Posterior
-    memory : Memory
-    members : list of str
-        The team, in the order of every array over teammates; some may be missing in the frame.
-    """
+    """Posterior and memory change within a frame; who is in the team does not."""
 
     model: EvidenceModel
     posterior: Posterior
     memory: Memory
     members: list[str] = field(init=False)
+    """The team, in the order of every array over teammates; some may be missing in the frame."""
 
     def __post_init__(self) -> None:
         self.members = self.posterior.members

@@ -45,31 +45,22 @@ def keys(a: KeyArray, d: KeyArray) -> KeyArray:
 
 @dataclass
 class Memory:
-    """Mutable while a frame is judged.
-
-    Attributes
-    ----------
-    frame : int
-        Frames judged before this one, in this session.
-    tests : dict of key to (frame, sign)
-        When a test was made last, and whether it spoke for an attacker.
-    evidence : dict of teammate to list of dict
-        What spoke for or against those under suspicion: JSON values.
-    left : dict of teammate to (suspicion, frame)
-        Who left, and when.
-    shown : dict of key to (n, 4) ndarray
-        Of each subset decoded in the latest frame, the sum of its identities, and what it showed, see
-        `geometry.followed`.
-    shown_in : int
-        That frame's number, as its outcomes gave it.
-    """
+    """Mutable while a frame is judged."""
 
     frame: int = 0
+    """Frames judged before this one, in this session."""
     tests: dict[int, tuple[int, int]] = field(default_factory=dict)
+    """By key: (frame, sign). When a test was made last, and whether it spoke for an attacker."""
     evidence: dict[str, list[dict[str, Any]]] = field(default_factory=dict)
+    """By teammate. What spoke for or against those under suspicion: JSON values."""
     left: dict[str, tuple[float, int]] = field(default_factory=dict)
+    """By teammate: (suspicion, frame). Who left, and when."""
     shown: dict[int, FloatArray] = field(default_factory=dict)
+    """By key: (n, 4). Of each subset decoded in the latest frame, the sum of its identities, and what it showed, see
+    `geometry.followed`.
+    """
     shown_in: int = 0
+    """That frame's number, as its outcomes gave it."""
 
     def weights(self, tests: KeyArray, rho: float) -> FloatArray:
         """Expected weights of tests (n,): ``1 - rho ** k`` if a test was made k frames ago already, else 1."""

@@ -76,28 +76,22 @@ class EvidenceModel:
     """Likelihoods at one level of pose error.
 
     Rows of the table stand for what is true: `CLEAN` rows for unattacked pairs, then for each kind of attack `CELLS`.
-
-    Attributes
-    ----------
-    pose_error_m : float
-        Standard deviation of the teammates' positions that it was calibrated at, metres.
-    kinds : tuple of str
-        Kinds of attack, `OPEN` last.
-    pairs : (CLEAN + 3 K, len(SIZES), BINS) ndarray
-        Each last axis sums to 1.
-    changes : (1 + K, CHANGE_SIZES, CROWD_BINS, CHANGE_BINS) ndarray
-        How many boxes come or go from one frame to the next in a fusion with so many boxes: unattacked, and attacked
-        by each kind in both frames. Each last axis sums to 1.
-    coarse : (int, int)
-        Neighbouring bins of loss, and of novelty, that are taken together to reckon what a test promises, which need
-        not be known exactly.
     """
 
     pose_error_m: float
+    """Standard deviation of the teammates' positions that it was calibrated at, metres."""
     kinds: tuple[str, ...]
+    """Kinds of attack, `OPEN` last."""
     pairs: FloatArray
+    """(CLEAN + 3 K, len(SIZES), BINS): each last axis sums to 1."""
     changes: FloatArray
+    """(1 + K, CHANGE_SIZES, CROWD_BINS, CHANGE_BINS): how many boxes come or go from one frame to the next in a fusion
+    with so many boxes: unattacked, and attacked by each kind in both frames. Each last axis sums to 1.
+    """
     coarse: tuple[int, int] = (2, 2)
+    """(int, int): neighbouring bins of loss, and of novelty, that are taken together to reckon what a test promises,
+    which need not be known exactly.
+    """
 
     def __post_init__(self) -> None:
         kinds = len(self.kinds)
@@ -182,23 +176,15 @@ def _entropy(p: FloatArray) -> FloatArray:
 
 @dataclass(frozen=True)
 class Calibration:
-    """The likelihoods of one detector, at several levels of pose error.
-
-    Attributes
-    ----------
-    detector : str
-    weights_digest : str
-        SHA-256 of the weights file that it belongs to, hexadecimal.
-    recipe : mapping
-        How it was made; JSON values.
-    levels : tuple of EvidenceModel
-        Ascending pose error.
-    """
+    """The likelihoods of one detector, at several levels of pose error."""
 
     detector: str
     weights_digest: str
+    """SHA-256 of the weights file that it belongs to, hexadecimal."""
     recipe: Mapping[str, Any]
+    """How it was made; JSON values."""
     levels: tuple[EvidenceModel, ...]
+    """Ascending pose error."""
 
     def at(self, pose_error_m: float) -> EvidenceModel:
         """The level with the least pose error not below this one, metres.

@@ -27,21 +27,14 @@ _TINY = 1e-300
 
 @dataclass(frozen=True)
 class Hazards:
-    """How the truth changes from one frame to the next.
-
-    Attributes
-    ----------
-    hijack : float
-        Probability that a benign teammate becomes an attacker.
-    recovery : float
-        Probability that an attacker becomes benign.
-    change : float
-        Probability that the kind of attack changes.
-    """
+    """How the truth changes from one frame to the next."""
 
     hijack: float
+    """Probability that a benign teammate becomes an attacker."""
     recovery: float
+    """Probability that an attacker becomes benign."""
     change: float
+    """Probability that the kind of attack changes."""
 
 
 class Posterior(Distribution):
