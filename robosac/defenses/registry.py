@@ -63,7 +63,7 @@ def load(name: str) -> DefenseSettings:
     made = shipped()[name](kind=name) if name in shipped() else DEFENSES.make(name)
     if type(made).name() != made.kind:
         raise DomainError(f"{name} made no defence: its kind has to be a Literal of one name")
-    if made.makes is None and type(made).build is DefenseSettings.build:
+    if type(made).build is DefenseSettings.build:
         DEFENSES.check(made, Defense, name)
     return made
 

@@ -25,13 +25,11 @@ class DefenseSettings(BaseModel):
 
     A subclass has ``kind``, a literal of its one name; a field for each setting, with type, bounds, default and
     description; and a docstring whose first line says what the defence does. One that assumes a share of attackers has
-    a setting ``attacker_ratio``. The class ``makes`` the defence, or has the methods of `Defense` itself.
+    a setting ``attacker_ratio``. It has the methods of `Defense`, or a `build` that gives an object that has them.
     """
 
     model_config = ConfigDict(extra="forbid", frozen=True, allow_inf_nan=False, json_schema_extra=_say_in_short)
 
-    makes: ClassVar[type[Defense] | None] = None
-    """Class of the defence, which takes the settings as its arguments; None where these settings are the defence."""
     needs_calibration: ClassVar[bool] = False
     """Whether the defence works only with what ``robosac calibrate`` has made for the detector."""
     kind: str
@@ -56,7 +54,7 @@ class DefenseSettings(BaseModel):
         return self
 
     def build(self, calibration: Calibration | None) -> Defense:  # noqa: ARG002
-        """The defence itself; to be overridden where more is needed than its class and the settings.
+        """The defence: these settings themselves, unless this is overridden.
 
         Parameters
         ----------
@@ -68,9 +66,7 @@ class DefenseSettings(BaseModel):
         robosac.budget.DomainError
             If the settings contradict each other, or the calibration does not do.
         """
-        if self.makes is None:
-            return cast(Defense, self)
-        return self.makes(**self.model_dump(exclude={"kind"}))
+        return cast(Defense, self)
 
 
 class ConsensusSettings(DefenseSettings):

@@ -140,12 +140,10 @@ def test_all_parts_of_a_protocol_are_asked_for_those_inherited_too():
 ADDED = {
     "defenses": """
 from typing import Literal
-from robosac.defenses.settings import ConsensusSettings
 from robosac.defenses.halving import Halving
 
-class Halves(ConsensusSettings):
+class Halves(Halving):
     kind: Literal["halves"] = "halves"
-    makes = Halving
 """,
     "attacks": """
 from robosac.attacks import GaussianNoise
@@ -160,18 +158,25 @@ class Twin(EmbeddedDetector):
     name = "twin"
     opens = ("other-weights",)
 """,
+    "scenes": """
+from robosac.scenes.intersection import Synthetic
+
+class Again(Synthetic):
+    kind = "again"
+""",
 }
 USE = """
 import json
 import sys
 import robosac
 from safetensors.torch import save_file
-from robosac import attacks, defenses, detectors
+from robosac import attacks, defenses, detectors, scenes
 from robosac.detectors.embedded import SHIPPED_WEIGHTS
 from robosac.detectors.weights_file import read_weights
 
 assert robosac.__file__.startswith(sys.argv[1]), robosac.__file__
-assert defenses.build({"kind": "halves", "consensus_threshold": 0.4}) == defenses.Halving(consensus_threshold=0.4)
+assert defenses.build({"kind": "halves", "consensus_threshold": 0.4}).consensus_threshold == 0.4
+assert type(scenes.SOURCES.make("again")).__name__ == "Again"
 assert attacks.load_campaign("louder@asleep").name == "louder"
 assert "louder" in attacks.CAMPAIGN_HELP
 assert set(detectors.available()) == {"twin", "intersection-mean"}
@@ -182,7 +187,7 @@ assert type(detectors.load("w.safetensors")).__name__ == "Twin"
 """
 
 
-def test_one_new_file_is_all_that_a_defence_an_attack_or_a_detector_needs(tmp_path):
+def test_one_new_file_is_all_that_a_defence_an_attack_a_detector_or_a_scene_source_needs(tmp_path):
     """In a copy of the package, and in a process of its own."""
     copy = tmp_path / "robosac"
     shutil.copytree(Path(robosac.__file__).parent, copy, ignore=shutil.ignore_patterns("__pycache__"))

@@ -50,13 +50,13 @@ class Memory:
     frame: int = 0
     """Frames judged before this one, in this session."""
     tests: dict[int, tuple[int, int]] = field(default_factory=dict)
-    """By key: (frame, sign). When a test was made last, and whether it spoke for an attacker."""
+    """By test: when it was made last, as (frame, sign); the sign says whether it spoke for an attacker."""
     evidence: dict[str, list[dict[str, Any]]] = field(default_factory=dict)
-    """By teammate. What spoke for or against those under suspicion: JSON values."""
+    """By teammate: what spoke for or against those under suspicion; JSON values."""
     left: dict[str, tuple[float, int]] = field(default_factory=dict)
-    """By teammate: (suspicion, frame). Who left, and when."""
+    """By teammate: of those who left, their suspicion then and the frame."""
     shown: dict[int, FloatArray] = field(default_factory=dict)
-    """By key: (n, 4). Of each subset decoded in the latest frame, the sum of its identities, and what it showed, see
+    """By the sum of its identities: what each subset decoded in the latest frame showed (n, 4), see
     `geometry.followed`.
     """
     shown_in: int = 0
