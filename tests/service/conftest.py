@@ -30,7 +30,11 @@ class Hooked(EmbeddedDetector):
     def info(self):
         if self.before_info is not None:
             self.before_info()
-        return super().info
+        return self._info
+
+    @info.setter
+    def info(self, info):
+        self._info = info
 
     def prepare(self, ego, teammates):
         if self.before_prepare is not None:

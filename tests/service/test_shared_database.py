@@ -188,7 +188,7 @@ def own(tmp_path, monkeypatch):
 
     def build():
         detector = EmbeddedDetector(weights)
-        detector._info = dataclasses.replace(detector.info, name="own")
+        detector.info = dataclasses.replace(detector.info, name="own")
         return detector
 
     module = types.ModuleType("own")

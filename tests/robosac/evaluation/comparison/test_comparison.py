@@ -232,7 +232,7 @@ def test_the_command_with_all_its_options(tmp_path):
 @pytest.mark.parametrize(
     ("arguments", "complaint"),
     [
-        (["--setting", "nonesuch:1"], "unknown attack"),
+        (["--setting", "nonesuch:1"], "no attack 'nonesuch'"),
         (["--setting", "erase@nonesuch:1"], "unknown behaviour"),
         (["--setting", "erase"], "CAMPAIGN:NUMBER"),
         (["--setting", "erase:6"], "scene 0 has 5 teammates; 6 are wanted"),
