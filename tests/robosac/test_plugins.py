@@ -96,7 +96,7 @@ def test_an_argument_follows_the_name_where_the_kind_takes_one():
 @pytest.mark.parametrize(
     ("text", "complaint"),
     [
-        ("nonesuch", "no shape 'nonesuch': give one of sized, wall, square, or module:callable$"),
+        ("nonesuch", "no shape 'nonesuch': give one of sized, square, wall, or module:callable$"),
         ("wall", r"wall made no shape but <house.* which lacks area \(Square metres.\)$"),
         ("house.others:Wall", r"others:Wall made no shape but .* which lacks area"),
         ("house.others:fail", r"^house.others:fail: KeyError: 'two\\nlines'$"),
