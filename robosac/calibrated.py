@@ -38,10 +38,17 @@ def calibration_of(info: DetectorInfo) -> Calibration:
 
 def calibration_digest(info: DetectorInfo) -> str | None:
     """SHA-256 (hexadecimal) of the file beside a detector's weights; None if there is none to be read."""
+    if info.calibration is None:
+        return None
     try:
-        return None if info.calibration is None else hashlib.sha256(info.calibration.read_bytes()).hexdigest()
+        return _digest(info.calibration, info.calibration.stat().st_mtime_ns)
     except OSError:
         return None
+
+
+@lru_cache(maxsize=16)
+def _digest(path: Path, changed: int) -> str:  # noqa: ARG001 (of a changed file it is another)
+    return hashlib.sha256(path.read_bytes()).hexdigest()
 
 
 @lru_cache(maxsize=16)
