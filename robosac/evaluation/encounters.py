@@ -32,16 +32,14 @@ def acts(campaign: str, attackers: Collection[str], frames: int) -> list[Act]:
     """What a campaign does in each frame of a sequence."""
     schedule = load_campaign(campaign).schedule
     attack = _unscheduled(campaign)
-    acting = (tuple(schedule.acting(index, sorted(attackers))) for index in range(frames))
+    acting = (tuple(schedule(index, sorted(attackers))) for index in range(frames))
     return [Act(attack, names) if names else NOBODY_ACTS for names in acting]
 
 
 def _unscheduled(campaign: str) -> str:
     """The campaign without those behaviours that only say when who acts."""
     attack, *behaviours = campaign.split(SEPARATOR)
-    plain = load_campaign(attack)
-    kept = [name for name in behaviours if BEHAVIOURS[name](plain).schedule is plain.schedule]
-    return SEPARATOR.join([attack, *kept])
+    return SEPARATOR.join([attack, *(name for name in behaviours if "schedule" not in BEHAVIOURS[name])])
 
 
 class Encounters:
