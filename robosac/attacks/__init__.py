@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Mapping
+from dataclasses import replace
 
 from robosac.attacks.adaptive import Erase, Invent, InventSteady, Shift
 from robosac.attacks.base import Attack, IterativeAttack
@@ -61,7 +62,7 @@ def load_campaign(spec: str) -> Campaign:
     for name in behaviours:
         if name not in BEHAVIOURS:
             raise ValueError(f"unknown behaviour {name!r}; known: {', '.join(BEHAVIOURS)}")
-        campaign = BEHAVIOURS[name](campaign)
+        campaign = replace(campaign, **BEHAVIOURS[name])
     return campaign
 
 

@@ -6,9 +6,7 @@ can strike in the fusion of the whole team and behave in others.
 
 from __future__ import annotations
 
-from collections.abc import Collection, Sequence
-from dataclasses import dataclass
-from typing import Protocol
+from collections.abc import Callable, Collection, Sequence
 
 import torch
 
@@ -20,48 +18,29 @@ CALM = 0.5
 """Weight of looking honest, where the harm in the fusion of the whole team has the weight 1."""
 
 
-class Alibi(Protocol):
-    """Chooses the fusions in which to behave."""
-
-    def teams(self, team: Sequence[str], attackers: Collection[str]) -> list[list[str]]:
-        """Parts of the team, attackers in each, whose fusion should look as if all were honest."""
-        ...
+Alibi = Callable[[Sequence[str], Collection[str]], list[list[str]]]
+"""Of a team and its attackers, the parts of the team, attackers in each, whose fusion should look as if all were
+honest.
+"""
 
 
-@dataclass(frozen=True)
-class Covering:
-    """Strike only together: with any one attacker left out, the others behave.
+def covering(team: Sequence[str], attackers: Collection[str]) -> list[list[str]]:
+    """Strike only together: behave in the team without each attacker in turn, and alone.
 
     Whoever looks for a single culprit finds none: each attacker tested without the others is as good as honest, and
     leaving out either heals the fusion. An attacker without accomplices has no cover and simply attacks.
     """
-
-    def teams(self, team: Sequence[str], attackers: Collection[str]) -> list[list[str]]:
-        """The team without each attacker in turn, and each attacker alone."""
-        if len(attackers) < 2:
-            return []
-        return [[name for name in team if name != left_out] for left_out in attackers] + [[name] for name in attackers]
+    if len(attackers) < 2:
+        return []
+    return [[name for name in team if name != left_out] for left_out in attackers] + [[name] for name in attackers]
 
 
-@dataclass(frozen=True)
-class Framing:
-    """Strike only where a chosen victim is fused too. Leaving out the victim then heals the fusion.
-
-    Parameters
-    ----------
-    victim : str, optional
-        An honest teammate; by default the first one by name.
+def framing(team: Sequence[str], attackers: Collection[str]) -> list[list[str]]:
+    """Strike only where the victim is fused too, the first honest teammate by name. Leaving it out then heals the
+    fusion.
     """
-
-    victim: str | None = None
-
-    def teams(self, team: Sequence[str], attackers: Collection[str]) -> list[list[str]]:
-        """The team without the victim, and the attackers alone; none where the victim is not in the team."""
-        honest = sorted(set(team) - set(attackers))
-        victim = honest[0] if self.victim is None and honest else self.victim
-        if victim not in honest:
-            return []
-        return [[name for name in team if name != victim], sorted(attackers)]
+    victim = min(set(team) - set(attackers), default=None)
+    return [] if victim is None else [[name for name in team if name != victim], sorted(attackers)]
 
 
 def with_alibi(attack: IterativeAttack, alibi: Alibi, surface: AttackSurface, attackers: Collection[str]) -> Aim:
@@ -73,7 +52,7 @@ def with_alibi(attack: IterativeAttack, alibi: Alibi, surface: AttackSurface, at
         If there is an alibi to keep, and the surface does not show boxes.
     """
     harm = attack.aim(surface, attackers)
-    parts = [(part, Perception.of(surface, part)) for part in alibi.teams(sorted(surface.messages), attackers)]
+    parts = [(part, Perception.of(surface, part)) for part in alibi(sorted(surface.messages), attackers)]
     if not parts:
         return harm
 

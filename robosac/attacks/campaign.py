@@ -9,11 +9,11 @@ from __future__ import annotations
 from collections.abc import Callable, Collection, Mapping, Sequence
 from dataclasses import dataclass, replace
 from math import radians
-from typing import Protocol
+from typing import Any
 
 import numpy as np
 
-from robosac.attacks.alibi import Alibi, Covering, Framing, with_alibi
+from robosac.attacks.alibi import Alibi, covering, framing, with_alibi
 from robosac.attacks.base import Attack, IterativeAttack
 from robosac.attacks.geometric import SHOWN
 from robosac.boxes import FloatArray, pose_matrix
@@ -25,87 +25,39 @@ HONEST = "honest"
 _FLICKER = 51
 
 
-class Schedule(Protocol):
-    """Which attackers act in a frame; a pure function of its number, so that all egos of a frame meet the same."""
+Schedule = Callable[[int, Sequence[str]], Sequence[str]]
+"""Of the number of a frame and all attackers, those that act; the others send honest messages. All egos of a frame meet
+the same ones.
+"""
+Lie = Callable[[FloatArray], FloatArray]
+"""Of one's true pose, the claimed one: world_from_sensor (4, 4), both."""
 
-    def acting(self, frame: int, attackers: Sequence[str]) -> Sequence[str]:
-        """Those of the attackers that act; the others send honest messages."""
-        ...
 
-
-@dataclass(frozen=True)
-class Always:
+def always(frame: int, attackers: Sequence[str]) -> Sequence[str]:  # noqa: ARG001
     """All attackers in every frame."""
-
-    def acting(self, frame: int, attackers: Sequence[str]) -> Sequence[str]:  # noqa: ARG002
-        """All of them."""
-        return attackers
+    return attackers
 
 
-@dataclass(frozen=True)
-class Asleep:
-    """Honest for the first frames, so as to earn trust; then all attackers in every frame."""
-
-    frames: int = 10
-
-    def acting(self, frame: int, attackers: Sequence[str]) -> Sequence[str]:
-        """Nobody before the frame of that number."""
-        return attackers if frame >= self.frames else ()
+def asleep(frame: int, attackers: Sequence[str], frames: int = 10) -> Sequence[str]:
+    """Nobody in the first frames, so as to earn trust; then all attackers in every frame."""
+    return attackers if frame >= frames else ()
 
 
-@dataclass(frozen=True)
-class Flicker:
-    """All attackers in a random share of the frames; nobody in the others.
-
-    Attributes
-    ----------
-    share : float
-        In [0, 1].
-    seed : int
-        The same seed and frame give the same draw.
-    """
-
-    share: float = 0.2
-    seed: int = 0
-
-    def acting(self, frame: int, attackers: Sequence[str]) -> Sequence[str]:
-        """All or nobody."""
-        struck = np.random.default_rng([_FLICKER, self.seed, frame]).random() < self.share
-        return attackers if struck else ()
+def flicker(frame: int, attackers: Sequence[str], share: float = 0.2, seed: int = 0) -> Sequence[str]:
+    """All attackers in a random share of the frames, in [0, 1]; nobody in the others."""
+    return attackers if np.random.default_rng([_FLICKER, seed, frame]).random() < share else ()
 
 
-@dataclass(frozen=True)
-class Turns:
+def turns(frame: int, attackers: Sequence[str], frames: int = 5) -> Sequence[str]:
     """One attacker at a time, for so many frames each: those that wait behave, and so clear themselves."""
-
-    frames: int = 5
-
-    def acting(self, frame: int, attackers: Sequence[str]) -> Sequence[str]:
-        """The one whose turn it is."""
-        if not attackers:
-            return ()
-        return (attackers[frame // self.frames % len(attackers)],)
+    return (attackers[frame // frames % len(attackers)],) if attackers else ()
 
 
-@dataclass(frozen=True)
-class FalsePose:
-    """A lie about one's own pose: the ego puts the message in a wrong place.
-
-    Attributes
-    ----------
-    forward_m, left_m : float
-        Where the claimed pose lies from the true one, along the sender's axes.
-    turn_deg : float
-        By how much it is turned, counter-clockwise.
+def false_pose(pose: FloatArray, forward_m: float = 0.8, left_m: float = 0.6, turn_deg: float = 3.0) -> FloatArray:
+    """A pose that lies so far from the true one along the sender's axes, turned counter-clockwise: the ego puts the
+    message in a wrong place.
     """
-
-    forward_m: float = 0.8
-    left_m: float = 0.6
-    turn_deg: float = 3.0
-
-    def claimed(self, pose: FloatArray) -> FloatArray:
-        """The claimed world_from_sensor (4, 4) for the true one."""
-        return pose @ pose_matrix(self.forward_m, self.left_m, 0.0, radians(self.turn_deg))
+    return pose @ pose_matrix(forward_m, left_m, 0.0, radians(turn_deg))
 
 
 @dataclass(frozen=True)
@@ -116,9 +68,8 @@ class Campaign:
     ----------
     attack : Attack, optional
         None sends honest tensors: the lie, if any, is in the pose.
-    schedule : Schedule
-    pose : FalsePose, optional
-        Acting attackers claim this pose; the attack is optimised for the fusion that it leads to.
+    pose : Lie, optional
+        Of the acting attackers; the attack is optimised for the fusion that it leads to.
     alibi : Alibi, optional
         Fusions in which the attack behaves; for iterative attacks.
 
@@ -129,8 +80,8 @@ class Campaign:
     """
 
     attack: Attack | None
-    schedule: Schedule = Always()
-    pose: FalsePose | None = None
+    schedule: Schedule = always
+    pose: Lie | None = None
     alibi: Alibi | None = None
 
     def __post_init__(self) -> None:
@@ -184,12 +135,12 @@ class Campaign:
         NoGeometry
             If the attack or its alibi needs boxes that the detector does not show.
         """
-        acting = list(self.schedule.acting(frame, sorted(attackers)))
+        acting = list(self.schedule(frame, sorted(attackers)))
         if not acting or (self.attack is None and self.pose is None):
             return {}
         sent = {name: benign[name] for name in acting}
         if self.pose is not None:
-            sent = {name: replace(message, pose=self.pose.claimed(message.pose)) for name, message in sent.items()}
+            sent = {name: replace(message, pose=self.pose(message.pose)) for name, message in sent.items()}
         if self.attack is None:
             return sent
         surface = detector.attack_surface(ego, {**benign, **sent})
@@ -228,12 +179,12 @@ def lacking(attack: Attack | Campaign | None, detector: Preparer) -> str | None:
     return f"{campaign.name} cannot attack the detector {name}: its attack surface {missing}" if missing else None
 
 
-BEHAVIOURS: dict[str, Callable[[Campaign], Campaign]] = {
-    "asleep": lambda campaign: replace(campaign, schedule=Asleep()),
-    "flicker": lambda campaign: replace(campaign, schedule=Flicker()),
-    "turns": lambda campaign: replace(campaign, schedule=Turns()),
-    "covering": lambda campaign: replace(campaign, alibi=Covering()),
-    "framing": lambda campaign: replace(campaign, alibi=Framing()),
-    "false-pose": lambda campaign: replace(campaign, pose=FalsePose()),
+BEHAVIOURS: Mapping[str, Mapping[str, Any]] = {
+    "asleep": {"schedule": asleep},
+    "flicker": {"schedule": flicker},
+    "turns": {"schedule": turns},
+    "covering": {"alibi": covering},
+    "framing": {"alibi": framing},
+    "false-pose": {"pose": false_pose},
 }
-"""All behaviours by name: each takes a campaign and gives the one that also behaves so."""
+"""All behaviours by name: what each sets of a `Campaign`."""

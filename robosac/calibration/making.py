@@ -14,8 +14,8 @@ from robosac.calibration.fit import TooFewVerdicts, fit
 from robosac.calibration.verdicts import STRETCH, STRETCH_STRIDE, Trial, collect, validation_stretches
 from robosac.defenses.group_testing import Calibration, EvidenceModel, GroupTesting
 from robosac.detectors import Detector
+from robosac.evaluation.frames import DecodedOnce
 from robosac.evaluation.playing import play
-from robosac.evaluation.recordings import RecordedFrame
 from robosac.scenes import DEFAULT_DATA, SOURCES, Scene, first_scenes
 
 RELIABILITY_EDGES = (0.0, 0.01, 0.05, 0.2, 0.5, 0.8, 0.95, 0.99, 1.0)
@@ -130,7 +130,7 @@ def calibrate(
 
         def stretches(
             part: Sequence[Scene], *stream: int, trial: Trial = trial
-        ) -> Iterator[tuple[str | None, list[RecordedFrame]]]:
+        ) -> Iterator[tuple[str | None, list[DecodedOnce]]]:
             rng = np.random.default_rng([recipe.seed, _STREAM, *stream])
             return validation_stretches(detector, part, trial, rng, tick)
 
@@ -159,9 +159,7 @@ def _scenes(recipe: Recipe) -> list[Scene]:
     return first_scenes(source, "validation", count, frames, max(recipe.attackers))
 
 
-def check(
-    model: EvidenceModel, stretches: Iterable[tuple[str | None, Sequence[RecordedFrame]]]
-) -> list[ReliabilityBin]:
+def check(model: EvidenceModel, stretches: Iterable[tuple[str | None, Sequence[DecodedOnce]]]) -> list[ReliabilityBin]:
     """Suspicion after the frames of each stretch against the truth."""
     defense = GroupTesting(model)
     predicted: list[float] = []

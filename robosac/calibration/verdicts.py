@@ -15,8 +15,8 @@ from robosac.consensus import at_least
 from robosac.defenses.group_testing.geometry import changes, crowd, followed, measure
 from robosac.defenses.group_testing.model import CHANGE_SIZES, change_bin, crowd_bin, pair_bin, size_row
 from robosac.detectors import Detector
-from robosac.evaluation.frames import Sensed, under_attack
-from robosac.evaluation.recordings import RecordedFrame, Subset, record, subsets
+from robosac.evaluation.frames import DecodedOnce, Sensed, Subset, under_attack
+from robosac.evaluation.recordings import record, subsets
 from robosac.scenes import Scene
 
 STRETCH_STRIDE = 10
@@ -51,7 +51,7 @@ class Verdicts:
     changes: Counter[ChangeKey] = field(default_factory=Counter)
     team: int = 0
 
-    def add_stretch(self, stretch: Sequence[RecordedFrame], kind: str | None) -> None:
+    def add_stretch(self, stretch: Sequence[DecodedOnce], kind: str | None) -> None:
         """Count what successive frames show, each by itself and from one to the next; the same ones attack in all."""
         for frame in stretch:
             self.add(frame, kind)
@@ -59,11 +59,11 @@ class Verdicts:
             for subset in subsets(frame.team)[1:]:
                 if subset not in before.boxes or (kind is not None and subset.isdisjoint(frame.attackers)):
                     continue
-                then, now = (followed(f.detect(subset), f.pose) for f in (before, frame))
+                then, now = (followed(f.detect(subset), f.ego.pose) for f in (before, frame))
                 which = min(len(subset), CHANGE_SIZES) - 1
                 self.changes[kind, which, crowd_bin(crowd(now)), change_bin(changes(then, now))] += 1
 
-    def add(self, frame: RecordedFrame, kind: str | None) -> None:
+    def add(self, frame: DecodedOnce, kind: str | None) -> None:
         """Count what all pairs of a frame show; of an attacked frame, those that an attacker has a part in."""
         self.team = max(self.team, len(frame.team))
         special = complementary(frame) if kind is None else frame.attackers
@@ -80,7 +80,7 @@ class Verdicts:
                         self.pairs[kind, counted, row, pair_bin(pair)] += 1
 
 
-def complementary(frame: RecordedFrame) -> Subset:
+def complementary(frame: DecodedOnce) -> Subset:
     """Teammates of a frame without attackers that see much of what the others do not: see `ADDED_BOXES`."""
     found = set()
     for name in frame.team:
@@ -93,7 +93,7 @@ def complementary(frame: RecordedFrame) -> Subset:
     return frozenset(found)
 
 
-def _boxes(frame: RecordedFrame, subset: Subset) -> FloatArray:
+def _boxes(frame: DecodedOnce, subset: Subset) -> FloatArray:
     """What a defence sees of a subset; of the ego alone, the boxes that take part in the comparison."""
     boxes = frame.detect(subset)
     return boxes if subset else at_least(boxes, frame.info.consensus_score)
@@ -125,14 +125,14 @@ def validation_stretches(
     trial: Trial,
     rng: np.random.Generator,
     tick: Callable[[], None] = lambda: None,
-) -> Iterator[tuple[str | None, list[RecordedFrame]]]:
+) -> Iterator[tuple[str | None, list[DecodedOnce]]]:
     """Successive frames without an attack, then the same frames under every attack, the vehicles taking turns as ego.
 
     ``tick`` is called after each recorded frame.
 
     Yields
     ------
-    kind, stretch : str or None, list of RecordedFrame
+    kind, stretch : str or None, list of DecodedOnce
     """
     some = next(iter(trial.attacks.values()))
     for turn, (scene, number) in enumerate((s, n) for s in scenes for n in range(trial.stretches_per_scene)):
@@ -141,7 +141,7 @@ def validation_stretches(
         frames = [scene.frame(index) for index in range(start, start + STRETCH)]
         met = [Sensed.of(detector, frame, ego_id, trial.pose_error_m, rng) for frame in frames]
         team = sorted(set(met[0].messages) - {ego_id})
-        honest: list[RecordedFrame] = []
+        honest: list[DecodedOnce] = []
         attacked = [(kind, attack, count) for kind, attack in trial.attacks.items() for count in trial.attackers]
         for kind, attack, count in [(None, some, 0), *attacked]:
             chosen = [team[i] for i in rng.choice(len(team), count, replace=False)]
@@ -154,7 +154,7 @@ def validation_stretches(
             yield kind, stretch
 
 
-def collect(stretches: Iterable[tuple[str | None, Sequence[RecordedFrame]]]) -> Verdicts:
+def collect(stretches: Iterable[tuple[str | None, Sequence[DecodedOnce]]]) -> Verdicts:
     """Count the verdicts of stretches."""
     verdicts = Verdicts()
     for kind, stretch in stretches:

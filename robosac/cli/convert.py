@@ -11,8 +11,7 @@ import torch
 import typer
 
 from robosac.cli.blame import blaming, check_known
-from robosac.detectors.v2xsim import write_weights
-from robosac.detectors.v2xsim.fusions import FUSIONS
+from robosac.detectors.v2xsim.detector import FUSIONS, write_weights
 from robosac.detectors.weights_file import WeightsError
 
 

@@ -16,7 +16,6 @@ from robosac.detectors.decoding import cell_centres, decode_boxes
 from robosac.detectors.map_fusion import FEATURES, Decode, Heads, MapFusionDetector, Maps
 from robosac.detectors.network import CHANNELS, MAP, MeanFusionNetwork, fold_batchnorm
 from robosac.detectors.voxels import AREA_M, occupancy
-from robosac.detectors.warp import sampling_matrix
 from robosac.detectors.weights_file import WeightsError, read_weights
 
 SHIPPED_WEIGHTS = Path(__file__).parent / "weights" / "intersection-mean.safetensors"
@@ -100,11 +99,6 @@ class EmbeddedDetector(MapFusionDetector):
         with torch.inference_mode():
             features = self._network.encode(grid[None])[0] * self._gain
         return Message(np.asarray(pose, dtype=np.float64), {FEATURES: features.numpy().astype(np.float16)})
-
-    @staticmethod
-    def sampling_matrix(ego_pose: FloatArray, pose: FloatArray) -> FloatArray:
-        """As `robosac.detectors.warp.sampling_matrix` gives it, of maps whose columns run along +x."""
-        return sampling_matrix(ego_pose, pose, AREA_M)
 
     def unscaled(self, sent: torch.Tensor) -> torch.Tensor:
         """Maps without the gain."""

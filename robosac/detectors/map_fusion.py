@@ -9,13 +9,14 @@ from __future__ import annotations
 from abc import ABC, abstractmethod
 from collections.abc import Callable, Collection, Mapping, Sequence
 from dataclasses import dataclass
+from typing import ClassVar
 
 import numpy as np
 import torch
 
 from robosac.boxes import FloatArray
 from robosac.detectors.base import DetectorInfo, Message
-from robosac.detectors.warp import warp
+from robosac.detectors.warp import sampling_matrix, warp
 
 FEATURES = "features"
 """The tensor of a message that holds its map."""
@@ -33,6 +34,8 @@ class MapFusionDetector(ABC):
     """
 
     info: DetectorInfo
+    mirrored: ClassVar[bool] = False
+    """Whether columns of the maps run along minus x."""
 
     @abstractmethod
     def decoder(self, ego: Message, own: torch.Tensor) -> Decode:
@@ -50,14 +53,11 @@ class MapFusionDetector(ABC):
         """What is fused of maps as they are sent; by default all of it."""
         return sent
 
-    @staticmethod
-    @abstractmethod
-    def sampling_matrix(ego_pose: FloatArray, pose: FloatArray) -> FloatArray:
-        """Where to look in a teammate's map: (2, 3), as `robosac.detectors.warp.sampling_matrix` gives it."""
-
     def matrices(self, ego: Message, teammates: Collection[Message]) -> torch.Tensor:
         """Where in each teammate's map to look for the places of the ego's: (n, 2, 3), as `warp` takes them."""
-        return torch.from_numpy(np.stack([self.sampling_matrix(ego.pose, each.pose) for each in teammates])).float()
+        half_extent_m = self.info.area_m[2]
+        matrices = [sampling_matrix(ego.pose, each.pose, half_extent_m, self.mirrored) for each in teammates]
+        return torch.from_numpy(np.stack(matrices)).float()
 
     def prepare(self, ego: Message, teammates: Mapping[str, Message]) -> PreparedMaps:
         """Warp every teammate's map into the ego's frame, once."""

@@ -9,7 +9,7 @@ from torch.nn import functional
 from robosac.boxes import FloatArray
 
 
-def sampling_matrix(ego_pose: FloatArray, pose: FloatArray, half_extent_m: float) -> FloatArray:
+def sampling_matrix(ego_pose: FloatArray, pose: FloatArray, half_extent_m: float, mirrored: bool = False) -> FloatArray:
     """Where to look in a teammate's map for each place of the ego's.
 
     Parameters
@@ -18,6 +18,8 @@ def sampling_matrix(ego_pose: FloatArray, pose: FloatArray, half_extent_m: float
         world_from_sensor of the ego and of the teammate; their motion in the plane counts.
     half_extent_m : float
         Maps cover +- this, in metres, in both directions.
+    mirrored : bool
+        Columns of the maps run along *minus* x, not along x; rows run along y.
 
     Returns
     -------
@@ -27,10 +29,12 @@ def sampling_matrix(ego_pose: FloatArray, pose: FloatArray, half_extent_m: float
     relative = np.linalg.inv(pose) @ ego_pose
     matrix = relative[:2, [0, 1, 3]].copy()
     matrix[:, 2] /= half_extent_m
+    if mirrored:
+        matrix[[0, 0, 1], [1, 2, 0]] *= -1.0
     return matrix
 
 
 def warp(features: torch.Tensor, matrices: torch.Tensor) -> torch.Tensor:
-    """Resample maps (n, C, H, W), rows along +y and columns along +x, by matrices (n, 2, 3): bilinear, zero outside."""
+    """Resample maps (n, C, H, W) by matrices (n, 2, 3): bilinear, zero outside."""
     grid = functional.affine_grid(matrices, list(features.shape), align_corners=False)
     return functional.grid_sample(features, grid, mode="bilinear", padding_mode="zeros", align_corners=False)

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import zlib
 from collections.abc import Callable, Collection, Iterator, Sequence
+from dataclasses import dataclass, field
 from typing import NamedTuple
 
 import numpy as np
@@ -31,25 +32,18 @@ NOBODY_ACTS = Act(HONEST, ())
 def acts(campaign: str, attackers: Collection[str], frames: int) -> list[Act]:
     """What a campaign does in each frame of a sequence."""
     schedule = load_campaign(campaign).schedule
-    attack = _unscheduled(campaign)
-    acting = (tuple(schedule.acting(index, sorted(attackers))) for index in range(frames))
+    attack, *behaviours = campaign.split(SEPARATOR)
+    attack = SEPARATOR.join([attack, *(name for name in behaviours if "schedule" not in BEHAVIOURS[name])])
+    acting = (tuple(schedule(index, sorted(attackers))) for index in range(frames))
     return [Act(attack, names) if names else NOBODY_ACTS for names in acting]
 
 
-def _unscheduled(campaign: str) -> str:
-    """The campaign without those behaviours that only say when who acts."""
-    attack, *behaviours = campaign.split(SEPARATOR)
-    plain = load_campaign(attack)
-    kept = [name for name in behaviours if BEHAVIOURS[name](plain).schedule is plain.schedule]
-    return SEPARATOR.join([attack, *kept])
-
-
+@dataclass
 class Encounters:
-    """Frames of sequences as the first ego of a scene meets them.
+    """Frames of a scene as its first ego meets them.
 
-    Parameters
+    Attributes
     ----------
-    detector : Detector
     seed : int
         Of attacks.
     pose_error_m : float
@@ -57,27 +51,23 @@ class Encounters:
         the attack.
     """
 
-    def __init__(self, detector: Detector, *, seed: int = 0, pose_error_m: float = 0.0) -> None:
-        self._detector = detector
-        self._seed = seed
-        self._pose_error_m = pose_error_m
-        self._scene: Scene | None = None
-        self._sensed: list[Sensed] = []
+    detector: Detector
+    scene: Scene
+    seed: int = 0
+    pose_error_m: float = 0.0
+    _sensed: dict[int, Sensed] = field(default_factory=dict, init=False)
 
     def sequence(
         self,
-        scene: Scene,
         frames: int,
         campaign: str = HONEST,
         attackers: Collection[str] = (),
         tick: Callable[[], None] = lambda: None,
     ) -> list[EvaluationFrame]:
-        """A scene's first frames; nothing of them is decoded yet.
+        """The scene's first frames.
 
         Parameters
         ----------
-        scene : Scene
-        frames : int
         campaign : str
             As `robosac.attacks.load_campaign` takes it.
         attackers : collection of str
@@ -89,28 +79,19 @@ class Encounters:
         sequence: dict[int, EvaluationFrame] = {}
         for act in dict.fromkeys(chosen):
             indices = [index for index, other in enumerate(chosen) if other == act]
-            for index, met in zip(indices, self.met(scene, frames, act, indices), strict=True):
+            for index, met in zip(indices, self.met(act, indices), strict=True):
                 sequence[index] = met
                 tick()
         return [sequence[index] for index in range(frames)]
 
-    def met(self, scene: Scene, frames: int, act: Act, indices: Sequence[int]) -> Iterator[EvaluationFrame]:
-        """Those frames of a sequence that have these numbers, if the same is done in all of them.
-
-        What was sensed in a scene is held until the next scene is asked for.
-        """
-        self._sense(scene, frames)
+    def met(self, act: Act, indices: Sequence[int]) -> Iterator[EvaluationFrame]:
+        """The frames of these numbers, if this is done in all of them."""
         campaign = load_campaign(act.attack)
         stream = zlib.crc32(repr(tuple(act)).encode())
         for index in indices:
-            rng = np.random.default_rng([self._seed, _ATTACK, scene.number, index, stream])
-            yield under_attack(self._detector, self._sensed[index], act.acting, campaign, rng)
-
-    def _sense(self, scene: Scene, frames: int) -> None:
-        if scene == self._scene and len(self._sensed) >= frames:
-            return
-        self._scene, self._sensed = scene, []
-        for index in range(frames):
-            rng = np.random.default_rng([scene.number, _POSES, index])
-            frame = scene.frame(index)
-            self._sensed.append(Sensed.of(self._detector, frame, scene.egos[0], self._pose_error_m, rng))
+            if index not in self._sensed:
+                rng = np.random.default_rng([self.scene.number, _POSES, index])
+                frame, ego = self.scene.frame(index), self.scene.egos[0]
+                self._sensed[index] = Sensed.of(self.detector, frame, ego, self.pose_error_m, rng)
+            rng = np.random.default_rng([self.seed, _ATTACK, self.scene.number, index, stream])
+            yield under_attack(self.detector, self._sensed[index], act.acting, campaign, rng)

@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Collection, Iterable, Iterator, Mapping, Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, field
 from functools import cached_property
 from itertools import combinations
 
@@ -19,6 +19,7 @@ from robosac.detectors.base import for_role
 from robosac.fusion import FusionResult, fuse
 from robosac.scenes import Frame, Scene, SceneError, seconds_apart
 
+Subset = frozenset[str]
 YAW_PER_METRE = np.deg2rad(2.0)
 """Standard deviation of the heading's error for each metre of the position's."""
 
@@ -54,6 +55,11 @@ class EvaluationFrame:
         return self.detector.info
 
     @property
+    def honest(self) -> tuple[str, ...]:
+        """Teammates that do not attack in this frame, sorted."""
+        return tuple(name for name in self.team if name not in self.attackers)
+
+    @property
     def team(self) -> tuple[str, ...]:
         """Teammates, sorted."""
         return tuple(sorted(self.teammates))
@@ -63,8 +69,17 @@ class EvaluationFrame:
         return self.detector.prepare(ego, teammates)
 
 
+@dataclass(frozen=True)
 class DecodedOnce(EvaluationFrame):
-    """A frame in which each subset is decoded once, whoever asks."""
+    """A frame in which each subset is decoded once, whoever asks.
+
+    Attributes
+    ----------
+    boxes : dict of subset to (n, 6) ndarray
+        What has been decoded; the empty subset is the ego alone.
+    """
+
+    boxes: dict[Subset, FloatArray] = field(default_factory=dict)
 
     @classmethod
     def of(cls, frame: EvaluationFrame) -> DecodedOnce:
@@ -75,10 +90,6 @@ class DecodedOnce(EvaluationFrame):
     def _prepared(self) -> PreparedFrame:
         return self.detector.prepare(self.ego, self.teammates)
 
-    @cached_property
-    def _boxes(self) -> dict[frozenset[str], FloatArray]:
-        return {}
-
     def prepare(self, ego: Message, teammates: Mapping[str, Message]) -> PreparedFrame:  # noqa: ARG002 (always the same)
         """The frame itself."""
         return self
@@ -86,9 +97,9 @@ class DecodedOnce(EvaluationFrame):
     def detect(self, teammates: Collection[str] = ()) -> FloatArray:
         """Boxes (n, 6) of a subset."""
         key = frozenset(teammates)
-        if key not in self._boxes:
-            self._boxes[key] = self._prepared.detect(teammates)
-        return self._boxes[key]
+        if key not in self.boxes:
+            self.boxes[key] = self._prepared.detect(teammates)
+        return self.boxes[key]
 
     def confident(self, teammates: Collection[str] = ()) -> FloatArray:
         """Boxes of a subset that take part in the consensus test."""

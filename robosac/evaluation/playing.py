@@ -10,17 +10,12 @@ import numpy as np
 
 from robosac.defenses import Defense
 from robosac.evaluation.frames import EvaluationFrame
-from robosac.evaluation.recordings import RecordedFrame
 from robosac.fusion import FusionResult
 from robosac.session import Session
 
 
 class FaultyDefense(RuntimeError):
     """A defence failed on a frame; an evaluation must not answer over that."""
-
-
-PlayableFrame = EvaluationFrame | RecordedFrame
-"""A frame that poses as the detector that decodes it."""
 
 
 @dataclass(frozen=True)
@@ -44,7 +39,7 @@ class Answer:
         return len(decoded - {()})
 
 
-def play(defense: Defense, sequence: Sequence[PlayableFrame], rng: np.random.Generator) -> list[Answer]:
+def play(defense: Defense, sequence: Sequence[EvaluationFrame], rng: np.random.Generator) -> list[Answer]:
     """Answer a sequence frame by frame, the defence remembering what it remembers.
 
     Raises

@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import csv
-from collections.abc import Iterable, Sequence
+from collections.abc import Iterable, Mapping, Sequence
 from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
@@ -29,6 +29,11 @@ class Table:
     columns: Sequence[str]
     rows: Sequence[Sequence[Any]]
 
+    @classmethod
+    def of(cls, lines: Sequence[Mapping[str, Any]], name: str = "", caption: str = "") -> Table:
+        """Of lines that all have the same columns."""
+        return cls(name, caption, list(lines[0]) if lines else [], [list(line.values()) for line in lines])
+
 
 @dataclass(frozen=True)
 class Section:
@@ -49,7 +54,7 @@ def write_report(path: Path, head: str, sections: Iterable[Section]) -> Path:
             parts.append(f"{section.text}\n")
         for table in section.tables:
             if table.name:
-                write_csv(path.with_name(f"{table.name}.csv"), table.columns, table.rows)
+                write_csv(path.with_name(f"{table.name}.csv"), table)
                 parts.append(f"{table.caption} ([{table.name}.csv]({table.name}.csv)):\n")
             parts.append(markdown(table) + "\n")
         parts += [f"![{section.title}]({picture})\n" for picture in section.pictures]
@@ -64,9 +69,9 @@ def markdown(table: Table) -> str:
     return "\n".join([first, "|" + "---|" * len(table.columns), *rest])
 
 
-def write_csv(path: Path, columns: Sequence[str], rows: Iterable[Sequence[Any]]) -> None:
-    """Write a CSV file; None is an empty cell."""
+def write_csv(path: Path, table: Table) -> None:
+    """Write a table as a CSV file; None is an empty cell."""
     with path.open("w", newline="") as file:
         writer = csv.writer(file)
-        writer.writerow(columns)
-        writer.writerows(rows)
+        writer.writerow(table.columns)
+        writer.writerows(table.rows)

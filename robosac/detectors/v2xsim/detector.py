@@ -8,7 +8,7 @@ checkpoint.
 from __future__ import annotations
 
 import hashlib
-from collections.abc import Mapping
+from collections.abc import Callable, Mapping
 from pathlib import Path
 from typing import Any, ClassVar
 
@@ -19,16 +19,15 @@ from robosac.boxes import FloatArray
 from robosac.detectors.base import DetectorInfo, Message, TensorSpec, calibration_beside
 from robosac.detectors.map_fusion import FEATURES, Decode, Heads, MapFusionDetector, Maps
 from robosac.detectors.v2xsim.anchors import SCORE_THRESHOLD, detections, geometry
-from robosac.detectors.v2xsim.fusions import FUSIONS
 from robosac.detectors.v2xsim.network import CHANNELS, MAP, V2XSimNetwork, select_published
 from robosac.detectors.v2xsim.voxels import AREA_M, PACKED_SHAPE, BoolArray, occupancy, pack, unpack
-from robosac.detectors.warp import sampling_matrix
 from robosac.detectors.weights_file import WeightsError, read_weights, save_weights
 
+FUSIONS: Mapping[str, Callable[..., torch.Tensor]] = {"mean": torch.mean, "max": torch.amax, "sum": torch.sum}
+"""How warped maps (n, C, H, W) become one (C, H, W); places that a teammate does not see are zero."""
 NAMES = {fusion: f"v2x-sim-{fusion}" for fusion in FUSIONS}
 """The detectors of this family, by fusion."""
 _GRID = "grid"
-_MIRROR = np.array([[1.0, -1.0, -1.0], [-1.0, 1.0, 1.0]])
 
 
 def write_weights(state: Mapping[str, object], fusion: str, path: Path) -> dict[str, Any]:
@@ -83,6 +82,7 @@ class V2XSimDetector(MapFusionDetector):
     """
 
     opens: ClassVar[tuple[str, ...]] = tuple(NAMES.values())
+    mirrored: ClassVar[bool] = True
 
     def __init__(self, weights: Path) -> None:
         tensors, self.recipe = read_weights(weights)
@@ -135,7 +135,7 @@ class V2XSimDetector(MapFusionDetector):
         context = self._network.context(_as_maps(unpack(ego.tensors[_GRID])), own[None])
 
         def decode(maps: Maps) -> Heads:
-            logits, codes = self._network.decode(self._fusion(maps)[None], context)
+            logits, codes = self._network.decode(self._fusion(torch.stack(list(maps)), dim=0)[None], context)
             return logits[:, 1] - logits[:, 0], codes
 
         return decode
@@ -147,12 +147,6 @@ class V2XSimDetector(MapFusionDetector):
     def places(self, codes: torch.Tensor) -> torch.Tensor:
         """Boxes (393216, 6) of all anchors."""
         return geometry(codes)
-
-    @staticmethod
-    def sampling_matrix(ego_pose: FloatArray, pose: FloatArray) -> FloatArray:
-        """`robosac.detectors.warp.sampling_matrix` (2, 3) for maps whose columns run along *minus* x."""
-        matrix: FloatArray = sampling_matrix(ego_pose, pose, AREA_M) * _MIRROR
-        return matrix
 
 
 def _as_maps(grid: BoolArray) -> torch.Tensor:

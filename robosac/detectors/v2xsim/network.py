@@ -66,10 +66,7 @@ def _pointwise(level: int, channels: int) -> _Layer:
 
 
 _ENCODER = (
-    (
-        _Layer("u_encoder.conv_pre_1", "u_encoder.bn_pre_1", LAYERS, 32),
-        _Layer("u_encoder.conv_pre_2", "u_encoder.bn_pre_2", 32, 32),
-    ),
+    _pair("u_encoder", "_pre", LAYERS, 32),
     (*_pair("u_encoder", "1", 32, 64, stride=2), _pointwise(1, 64)),
     (*_pair("u_encoder", "2", 64, 128, stride=2), _pointwise(2, 128)),
     _pair("u_encoder", "3", 128, CHANNELS, stride=2),
@@ -156,10 +153,7 @@ class _Conv:
     def split(self, channels: int) -> tuple[_Conv, _Conv]:
         """The parts that act on the first ``channels`` and on the others; their sum is the whole."""
         first, rest = self.weight[:, :channels], self.weight[:, channels:]
-        return (
-            _Conv(_channels_last(first), torch.zeros_like(self.bias)),
-            _Conv(_channels_last(rest), self.bias),
-        )
+        return _Conv(_channels_last(first), torch.zeros_like(self.bias)), _Conv(_channels_last(rest), self.bias)
 
 
 @dataclass(frozen=True)
@@ -172,22 +166,6 @@ class _Join:
 
     def __call__(self, below_term: torch.Tensor, skip_term: torch.Tensor) -> torch.Tensor:
         return self.second((below_term + skip_term).relu_()).relu_()
-
-
-@dataclass(frozen=True)
-class Context:
-    """What of the decoder the hypothesis does not change: terms of first convolutions, before their ReLU.
-
-    Attributes
-    ----------
-    deepest : (1, 256, 32, 32) tensor
-        Of x4.
-    skips : tuple of tensors (1, 128, 64, 64), (1, 64, 128, 128), (1, 32, 256, 256)
-        Of x2, x1 and x.
-    """
-
-    deepest: torch.Tensor
-    skips: tuple[torch.Tensor, ...]
 
 
 class V2XSimNetwork:
@@ -224,20 +202,32 @@ class V2XSimNetwork:
         """x3 (n, 256, 32, 32) -> x4 (n, 512, 16, 16)."""
         return _through(self._deepest, features)
 
-    def context(self, grid: torch.Tensor, features: torch.Tensor) -> Context:
-        """The ego's own part of the decoder, from its occupancy (1, 13, 256, 256) and its message (1, 256, 32, 32)."""
+    def context(self, grid: torch.Tensor, features: torch.Tensor) -> tuple[torch.Tensor, ...]:
+        """What of the decoder no hypothesis changes: terms of first convolutions, before their ReLU.
+
+        Parameters
+        ----------
+        grid, features : (1, 13, 256, 256), (1, 256, 32, 32) tensor
+            The ego's occupancy and message.
+
+        Returns
+        -------
+        (1, 256, 32, 32), (1, 128, 64, 64), (1, 64, 128, 128), (1, 32, 256, 256) tensor
+            The terms of x4, x2, x1 and x.
+        """
         x, x1, x2 = self.levels(grid, 3)
         first, *others = self._joins
-        skips = tuple(join.skip(level) for join, level in zip(others, (x2, x1, x), strict=True))
-        return Context(first.below(_doubled(self.deepest(_channels_last(features)))), skips)
+        deepest = first.below(_doubled(self.deepest(_channels_last(features))))
+        return deepest, *(join.skip(level) for join, level in zip(others, (x2, x1, x), strict=True))
 
-    def decode(self, fused: torch.Tensor, context: Context) -> tuple[torch.Tensor, torch.Tensor]:
+    def decode(self, fused: torch.Tensor, context: tuple[torch.Tensor, ...]) -> tuple[torch.Tensor, torch.Tensor]:
         """Fused message -> logits and codes of every anchor.
 
         Parameters
         ----------
         fused : (1, 256, 32, 32) tensor
-        context : Context
+        context : tuple of tensors
+            As `context` returns it.
 
         Returns
         -------
@@ -248,8 +238,9 @@ class V2XSimNetwork:
             See `robosac.detectors.v2xsim.anchors`.
         """
         first, *others = self._joins
-        maps = first(context.deepest, first.skip(_channels_last(fused)))
-        for join, skip_term in zip(others, context.skips, strict=True):
+        deepest, *skips = context
+        maps = first(deepest, first.skip(_channels_last(fused)))
+        for join, skip_term in zip(others, skips, strict=True):
             maps = join(join.below(_doubled(maps)), skip_term)
         logits = self._classes[1](self._classes[0](maps).relu_())
         codes = self._codes[1](self._codes[0](maps).relu_())

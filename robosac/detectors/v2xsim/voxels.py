@@ -21,6 +21,7 @@ BOTTOM_M = -3.0
 ROADSIDE_BOTTOM_M = -8.0
 """Of a roadside unit's grid, whose sensor stands that much higher."""
 DEPTH_M = 5.0
+_CELL_M = np.array([CELL_M, CELL_M, LAYER_M])
 PACKED_SHAPE = (GRID, GRID * LAYERS // 8)
 
 BoolArray = np.ndarray[tuple[Any, ...], np.dtype[np.bool_]]
@@ -41,11 +42,10 @@ def occupancy(points: FloatArray, bottom_m: float = BOTTOM_M) -> BoolArray:
     -------
     (256, 256, 13) bool ndarray
     """
-    low, high = np.array([-AREA_M, -AREA_M, bottom_m]), np.array([AREA_M, AREA_M, bottom_m + DEPTH_M])
+    low, high = _ends(bottom_m)
     xyz = np.asarray(points, dtype=np.float64)[:, :3]
     xyz = xyz[np.all((xyz > low) & (xyz < high), axis=1)]
-    cell = np.array([CELL_M, CELL_M, LAYER_M])
-    return from_indices((np.floor(xyz / cell) - np.floor(low / cell)).astype(np.int64))
+    return from_indices((np.floor(xyz / _CELL_M) - np.floor(low / _CELL_M)).astype(np.int64))
 
 
 def from_indices(indices: np.ndarray[Any, np.dtype[Any]]) -> BoolArray:
@@ -70,11 +70,15 @@ def centres(indices: np.ndarray[Any, np.dtype[Any]], bottom_m: float = BOTTOM_M)
 
     `occupancy` of these points is the grid of these voxels.
     """
-    low, high = np.array([-AREA_M, -AREA_M, bottom_m]), np.array([AREA_M, AREA_M, bottom_m + DEPTH_M])
-    cell = np.array([CELL_M, CELL_M, LAYER_M])
-    begin = (np.floor(low / cell) + indices) * cell
-    middle: FloatArray = (np.maximum(begin, low) + np.minimum(begin + cell, high)) / 2
+    low, high = _ends(bottom_m)
+    begin = (np.floor(low / _CELL_M) + indices) * _CELL_M
+    middle: FloatArray = (np.maximum(begin, low) + np.minimum(begin + _CELL_M, high)) / 2
     return middle
+
+
+def _ends(bottom_m: float) -> tuple[FloatArray, FloatArray]:
+    """Lowest and highest x, y, z of a grid."""
+    return np.array([-AREA_M, -AREA_M, bottom_m]), np.array([AREA_M, AREA_M, bottom_m + DEPTH_M])
 
 
 def pack(grid: BoolArray) -> ByteArray:

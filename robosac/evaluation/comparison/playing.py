@@ -15,7 +15,8 @@ from robosac.detectors import Detector
 from robosac.evaluation.average_precision import Matched, match
 from robosac.evaluation.comparison.settings import Extent, Setting
 from robosac.evaluation.encounters import Encounters
-from robosac.evaluation.playing import FaultyDefense, PlayableFrame, play
+from robosac.evaluation.frames import EvaluationFrame
+from robosac.evaluation.playing import FaultyDefense, play
 from robosac.evaluation.recordings import Recordings
 from robosac.scenes import Scene, SceneError, SceneSource, first_scenes
 from robosac.scenes.intersection import Synthetic
@@ -40,7 +41,7 @@ class Plan:
     recordings : Path, optional
         Folder in which recorded frames are kept and looked for.
     pose_error_m : float
-        Of the teammates, as `Recordings` takes it.
+        Of the teammates, as `Encounters` takes it.
     live : bool
         Record nothing: each defence decodes for itself, and is timed.
     data : SceneSource
@@ -130,13 +131,12 @@ class Played:
     milliseconds: list[float] = field(default_factory=list)
     naming: Naming | None = None
 
-    def add(self, frame: PlayableFrame, matched: Matched, accepted: Collection[str], passes: int) -> None:
+    def add(self, frame: EvaluationFrame, matched: Matched, accepted: Collection[str], passes: int) -> None:
         """Add a frame."""
-        honest = _honest(frame)
         self.matched.append(matched)
         self.infiltrated.append(not frame.attackers.isdisjoint(accepted))
-        self.refused.append(sum(name not in accepted for name in honest))
-        self.honest.append(len(honest))
+        self.refused.append(sum(name not in accepted for name in frame.honest))
+        self.honest.append(len(frame.honest))
         self.passes.append(passes)
 
 
@@ -155,19 +155,14 @@ def play_scene(plan: Plan, scene: Scene, tick: Callable[[], None] = lambda: None
     FaultyDefense
         If a defence fails.
     """
-    source: Encounters | Recordings
-    if plan.live:
-        source = Encounters(plan.detector, seed=plan.seed, pose_error_m=plan.pose_error_m)
-    else:
-        source = Recordings(
-            plan.detector, plan.recordings, seed=plan.seed, pose_error_m=plan.pose_error_m, data=plan.data.name
-        )
+    what = (plan.detector, scene, plan.seed, plan.pose_error_m)
+    source = Encounters(*what) if plan.live else Recordings(*what, plan.recordings, plan.data.name)
     played: dict[tuple[Setting, str], Played] = {}
     for setting in plan.extent.settings:
         chosen = attackers(scene, setting.attackers, plan.seed)
-        sequence = source.sequence(scene, plan.extent.frames, setting.campaign, chosen, tick)
+        sequence = source.sequence(plan.extent.frames, setting.campaign, chosen, tick)
         matcher = _Matcher(sequence)
-        played[setting, ORACLE] = _reference(sequence, matcher, _honest)
+        played[setting, ORACLE] = _reference(sequence, matcher, lambda frame: frame.honest)
         for name, defense in plan.defenses.items():
             rng = np.random.default_rng([plan.seed, scene.number, zlib.crc32(name.encode())])
             try:
@@ -185,14 +180,10 @@ def attackers(scene: Scene, count: int, seed: int) -> list[str]:
     return [team[i] for i in order[:count]]
 
 
-def _honest(frame: PlayableFrame) -> tuple[str, ...]:
-    return tuple(name for name in frame.team if name not in frame.attackers)
-
-
 class _Matcher:
     """Matches each answer to a frame of a sequence once, however many defences give it."""
 
-    def __init__(self, sequence: Sequence[PlayableFrame]) -> None:
+    def __init__(self, sequence: Sequence[EvaluationFrame]) -> None:
         self._sequence = sequence
         self._known: dict[tuple[int, bytes], Matched] = {}
 
@@ -204,7 +195,7 @@ class _Matcher:
 
 
 def _reference(
-    sequence: Sequence[PlayableFrame], matcher: _Matcher, choose: Callable[[PlayableFrame], tuple[str, ...]]
+    sequence: Sequence[EvaluationFrame], matcher: _Matcher, choose: Callable[[EvaluationFrame], tuple[str, ...]]
 ) -> Played:
     """Fuse what is chosen in each frame, whatever it looks like."""
     played = Played()
@@ -217,7 +208,7 @@ def _reference(
 
 def _play(
     defense: Defense,
-    sequence: Sequence[PlayableFrame],
+    sequence: Sequence[EvaluationFrame],
     matcher: _Matcher,
     chosen: Collection[str],
     rng: np.random.Generator,
@@ -235,7 +226,7 @@ def _play(
     return played
 
 
-def _naming(sequence: Sequence[PlayableFrame], named: Sequence[frozenset[str]], chosen: Collection[str]) -> Naming:
+def _naming(sequence: Sequence[EvaluationFrame], named: Sequence[frozenset[str]], chosen: Collection[str]) -> Naming:
     strikes: dict[str, int] = {}
     after: dict[str, int] = {}
     all_after: int | None = None

@@ -9,7 +9,7 @@ from robosac.evaluation.comparison.pictures import draw_passes, draw_precision
 from robosac.evaluation.comparison.playing import Plan
 from robosac.evaluation.comparison.rows import WINDOWS, Estimate, Figures, NamingFigures, Row
 from robosac.evaluation.comparison.tables import sections
-from robosac.evaluation.report import write_csv, write_report
+from robosac.evaluation.report import Table, write_csv, write_report
 
 HEAD = """# Defences against attacks
 
@@ -33,8 +33,7 @@ def write_comparison(rows: Sequence[Row], plan: Plan, out: Path, command: str) -
     Path
         Of the Markdown page.
     """
-    lines = [_flat(row) for row in rows]
-    write_csv(out / "comparison.csv", list(lines[0]), [list(line.values()) for line in lines])
+    write_csv(out / "comparison.csv", Table.of([_flat(row) for row in rows]))
     draw_precision(rows, out / PRECISION)
     draw_passes(rows, out / PASSES)
     scenes = plan.scenes()

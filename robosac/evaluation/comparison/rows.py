@@ -27,13 +27,15 @@ class Estimate:
     error: float | None
 
     @classmethod
-    def of(cls, value: float, left_out: FloatArray) -> Estimate:
+    def of(cls, figure: FloatArray) -> Estimate:
         """By the jackknife: ``sqrt((n - 1) / n * sum((x_i - mean(x))^2))``, x_i the figure without sequence i.
 
-        Source: Efron and Tibshirani, An Introduction to the Bootstrap (1993), chapter 11.
+        ``figure`` (1 + n,) is that of all sequences, and then those without each in turn. Source: Efron and Tibshirani,
+        An Introduction to the Bootstrap (1993), chapter 11.
         """
+        left_out = figure[1:]
         n = len(left_out)
-        return cls(value, float(np.sqrt((n - 1) * left_out.var())) if n > 1 else None)
+        return cls(float(figure[0]), float(np.sqrt((n - 1) * left_out.var())) if n > 1 else None)
 
 
 @dataclass(frozen=True)
@@ -124,32 +126,24 @@ class Row:
         return self.windows[0]
 
 
-@dataclass(frozen=True)
-class Precision:
-    """Average precision at an IoU of 0.5 and 0.7, of all sequences and without each in turn: (2,) and (2, n)."""
+def precisions(sequences: Sequence[Played]) -> dict[int, FloatArray]:
+    """Average precision at an IoU of 0.5 and 0.7, of all sequences and without each in turn: (2, 1 + n) in each window.
 
-    of_all: FloatArray
-    left_out: FloatArray
-
-    @classmethod
-    def over(cls, sequences: Sequence[Played], first: int) -> Precision:
-        """Of the answers from a frame on."""
-        ap = AveragePrecision()
-        for number, played in enumerate(sequences):
-            for frame in played.matched[first:]:
-                ap.add_matched(frame, number)
-        thresholds = (0.5, 0.7)
-        return cls(np.array([ap.at(t) for t in thresholds]), ap.leaving_out(*thresholds))
-
-
-def precisions(sequences: Sequence[Played]) -> dict[int, Precision]:
-    """In each window that there are frames for."""
-    frames = len(sequences[0].matched)
-    return {first: Precision.over(sequences, first) for first in WINDOWS if first < frames}
+    Windows are by their first frame; only those that there are frames for.
+    """
+    found = {}
+    for first in WINDOWS:
+        if first < len(sequences[0].matched):
+            ap = AveragePrecision()
+            for number, played in enumerate(sequences):
+                for frame in played.matched[first:]:
+                    ap.add_matched(frame, number)
+            found[first] = np.column_stack([[ap.at(0.5), ap.at(0.7)], ap.leaving_out(0.5, 0.7)])
+    return found
 
 
 def sum_up(
-    setting: Setting, defense: str, sequences: Sequence[Played], oracle: Mapping[int, Precision], live: bool = False
+    setting: Setting, defense: str, sequences: Sequence[Played], oracle: Mapping[int, FloatArray], live: bool = False
 ) -> Row:
     """The row of a defence.
 
@@ -159,8 +153,8 @@ def sum_up(
     defense : str
     sequences : sequence of Played
         All of the same length.
-    oracle : mapping of first frame to Precision
-        The oracle's, on the same sequences.
+    oracle : mapping of first frame to (2, 1 + n) ndarray
+        `precisions` of the oracle on the same sequences.
     live : bool
         Whether its times mean something.
     """
@@ -182,15 +176,10 @@ def sum_up(
     )
 
 
-def _figures(own: Precision, oracle: Precision, sequences: Sequence[Played], first: int) -> Figures:
-    ap50, ap70 = (Estimate.of(float(own.of_all[i]), own.left_out[i]) for i in (0, 1))
-    lost50, lost70 = (
-        Estimate.of(float(own.of_all[i] - oracle.of_all[i]), own.left_out[i] - oracle.left_out[i]) for i in (0, 1)
-    )
-    ratio = None
-    if oracle.of_all[1] and oracle.left_out[1].all():
-        ratio = Estimate.of(float(own.of_all[1] / oracle.of_all[1]), own.left_out[1] / oracle.left_out[1])
+def _figures(own: FloatArray, oracle: FloatArray, sequences: Sequence[Played], first: int) -> Figures:
+    ratio = Estimate.of(own[1] / oracle[1]) if oracle[1].all() else None
     infiltrated = float(np.mean([played.infiltrated[first:] for played in sequences]))
+    ap50, ap70, lost50, lost70 = (Estimate.of(figure) for figure in (*own, *(own - oracle)))
     return Figures(ap50, ap70, lost50, lost70, ratio, infiltrated)
 
 

@@ -5,7 +5,7 @@ from __future__ import annotations
 from collections.abc import Callable, Sequence
 
 from robosac.evaluation.comparison.playing import EGO_ONLY, ORACLE
-from robosac.evaluation.comparison.rows import EARLY, WINDOWS, Estimate, NamingFigures, Row
+from robosac.evaluation.comparison.rows import EARLY, WINDOWS, Estimate, Figures, NamingFigures, Row
 from robosac.evaluation.comparison.settings import NOBODY
 from robosac.evaluation.report import Section, Table
 
@@ -15,13 +15,9 @@ _, SETTLED, LATE = WINDOWS
 def sections(rows: Sequence[Row], precision_picture: str, passes_picture: str) -> list[Section]:
     """All tables that there is something for."""
     naming = [row for row in rows if row.naming is not None]
+    timed = [row for row in rows if row.milliseconds is not None]
     found = [
-        _pivot(
-            "AP at IoU 0.5 / 0.7",
-            rows,
-            lambda row: f"{row.whole.ap50.value:.3f} / {row.whole.ap70.value:.3f}",
-            precision_picture,
-        ),
+        _pivot("AP at IoU 0.5 / 0.7", rows, lambda row: _precision(row.whole), precision_picture),
         _pivot(
             f"Fused passes a frame: first / 2 to {EARLY} / later",
             rows,
@@ -32,11 +28,7 @@ def sections(rows: Sequence[Row], precision_picture: str, passes_picture: str) -
             "Share of frames with an attacking message in the answer", rows, lambda row: f"{row.whole.infiltrated:.2f}"
         ),
         _pivot("Share of honest messages left out", rows, lambda row: _number(row.honest_refused)),
-        _pivot(
-            "Time of a frame, median, ms",
-            [row for row in rows if row.milliseconds is not None],
-            lambda row: _number(row.milliseconds),
-        ),
+        _pivot("Time of a frame, median, ms", timed, lambda row: _number(row.milliseconds)),
         _quiet([row for row in rows if row.setting == NOBODY]),
         _pivot(
             "Naming: sequences with all attackers named / frames it took / honest teammates named",
@@ -58,55 +50,52 @@ def _pivot(title: str, rows: Sequence[Row], cell: Callable[[Row], str], *picture
 
 
 def _quiet(rows: Sequence[Row]) -> Section:
-    headings = ["defence", "AP50 lost", "AP70 lost", "passes, later frames", "honest messages left out"]
-    lines = []
-    for row in rows:
-        lost = (f"{-d.value + 0.0:.3f}" for d in (row.whole.ap50_difference, row.whole.ap70_difference))
-        lines.append([row.defense, *lost, f"{row.passes_steady:.2f}", _number(row.honest_refused)])
-    return Section("What it costs when nobody attacks", "", [Table("", "", headings, lines)])
+    lines = [
+        {
+            "defence": row.defense,
+            "AP50 lost": f"{-row.whole.ap50_difference.value + 0.0:.3f}",
+            "AP70 lost": f"{-row.whole.ap70_difference.value + 0.0:.3f}",
+            "passes, later frames": f"{row.passes_steady:.2f}",
+            "honest messages left out": _number(row.honest_refused),
+        }
+        for row in rows
+    ]
+    return Section("What it costs when nobody attacks", "", [Table.of(lines)])
 
 
 def _naming(defense: str, rows: Sequence[Row]) -> Section:
     """All about one defence that names attackers, and a line on whom it named wrongly."""
     at = {(row.setting, row.defense): row for row in rows}
     own = [row for row in rows if row.defense == defense]
-    headings = [
-        "attack",
-        f"oracle AP50/AP70 from frame {SETTLED}",
-        f"its AP50/AP70 from frame {SETTLED}",
-        "difference",
-        f"AP70 ratio from frame {LATE}",
-        f"infiltrated from frame {LATE}",
-        "AP70 ratio, all frames",
-        "ego only AP70, all frames",
-        "passes: first / 2 to 5 / later",
-        "attackers named",
-        "frames to name: mean, most",
-        "honest named",
-    ]
     lines = [_line(row, at[row.setting, ORACLE], at[row.setting, EGO_ONLY]) for row in own]
     named, honest = (sum(getattr(row.naming, of, 0) for row in own) for of in ("honest_named", "honest"))
     text = f"Frames are counted from 0. Honest teammates named, over all attacks: {named} of {honest}."
-    return Section(f"{defense} in detail", text, [Table("", "", headings, lines)])
+    return Section(f"{defense} in detail", text, [Table.of(lines)])
 
 
-def _line(row: Row, oracle: Row, alone: Row) -> list[str]:
-    settled, ideal, late = row.windows.get(SETTLED), oracle.windows.get(SETTLED), row.windows.get(LATE)
-    cells = [row.setting.label]
-    if settled is None or ideal is None:
-        cells += ["-"] * 3
-    else:
-        cells += [f"{figures.ap50.value:.3f} / {figures.ap70.value:.3f}" for figures in (ideal, settled)]
-        cells += [f"{_estimate(settled.ap50_difference, '+')} / {_estimate(settled.ap70_difference, '+')}"]
-    cells += ["-", "-"] if late is None else [_estimate(late.ap70_ratio), f"{late.infiltrated:.3f}"]
-    cells += [_estimate(row.whole.ap70_ratio), f"{alone.whole.ap70.value:.3f}"]
-    cells += [f"{row.passes_first:.1f} / {row.passes_early:.1f} / {row.passes_steady:.2f}"]
-    naming = row.naming
-    if naming is None:
-        return [*cells, "-", "-", "-"]
-    cells += [f"{naming.attackers_named} of {naming.attackers_struck}" if naming.attackers_struck else "-"]
-    cells += [f"{naming.frames_to_name_each:.1f}, {naming.frames_to_name_most}" if naming.frames_to_name_each else "-"]
-    return [*cells, f"{naming.honest_named} of {naming.honest}"]
+def _line(row: Row, oracle: Row, alone: Row) -> dict[str, str]:
+    settled, late, naming = row.windows[SETTLED], row.windows.get(LATE), row.naming
+    struck = naming.attackers_struck if naming else 0
+    return {
+        "attack": row.setting.label,
+        f"oracle AP50/AP70 from frame {SETTLED}": _precision(oracle.windows[SETTLED]),
+        f"its AP50/AP70 from frame {SETTLED}": _precision(settled),
+        "difference": f"{_estimate(settled.ap50_difference, '+')} / {_estimate(settled.ap70_difference, '+')}",
+        f"AP70 ratio from frame {LATE}": _estimate(late.ap70_ratio) if late else "-",
+        f"infiltrated from frame {LATE}": f"{late.infiltrated:.3f}" if late else "-",
+        "AP70 ratio, all frames": _estimate(row.whole.ap70_ratio),
+        "ego only AP70, all frames": f"{alone.whole.ap70.value:.3f}",
+        "passes: first / 2 to 5 / later": f"{row.passes_first:.1f} / {row.passes_early:.1f} / {row.passes_steady:.2f}",
+        "attackers named": f"{naming.attackers_named} of {struck}" if naming and struck else "-",
+        "frames to name: mean, most": f"{naming.frames_to_name_each:.1f}, {naming.frames_to_name_most}"
+        if naming and naming.frames_to_name_each
+        else "-",
+        "honest named": f"{naming.honest_named} of {naming.honest}" if naming else "-",
+    }
+
+
+def _precision(figures: Figures) -> str:
+    return f"{figures.ap50.value:.3f} / {figures.ap70.value:.3f}"
 
 
 def _named(naming: NamingFigures | None) -> str:

@@ -1,5 +1,6 @@
 import json
 from dataclasses import replace
+from types import SimpleNamespace
 
 import numpy as np
 import pytest
@@ -14,9 +15,9 @@ from robosac.cli import app
 from robosac.defenses.group_testing import Calibration, CalibrationError, GroupTestingSettings
 from robosac.detectors import DetectorInfo
 from robosac.detectors.embedded import SHIPPED_WEIGHTS, EmbeddedDetector
+from robosac.evaluation import recordings
 from robosac.evaluation.frames import EvaluationFrame
 from robosac.evaluation.playing import play
-from robosac.evaluation.recordings import RecordedFrame
 from robosac.scenes import IntersectionScene
 from tests.robosac.defenses.group_testing.conversing import SEEN, make_model, shifted
 
@@ -27,7 +28,8 @@ def recorded(attackers=()):
     team = ("a", "b", "c")
     subsets = [(), ("a",), ("b",), ("c",), ("a", "b"), ("a", "c"), ("b", "c"), team]
     boxes = {frozenset(s): shifted(s) if set(attackers) & set(s) else SEEN for s in subsets}
-    return RecordedFrame(INFO, pose_matrix(0, 0, 0, 0), team, frozenset(attackers), SEEN[:, :5], boxes)
+    detector = SimpleNamespace(info=INFO)
+    return recordings.recorded(detector, pose_matrix(0, 0, 0, 0), team, attackers, SEEN[:, :5], boxes)
 
 
 def test_verdicts_of_an_honest_frame_are_all_counted():
@@ -63,7 +65,7 @@ def test_a_stretch_is_the_same_ego_and_attackers_in_successive_frames(detector):
     for number, (_, stretch) in enumerate(stretches):
         start, ego = number // 2 * 10, f"car-{number // 2 + 1}"
         for offset, frame in enumerate(stretch):
-            np.testing.assert_array_equal(frame.pose, scene.frame(start + offset).views[ego].pose)
+            np.testing.assert_array_equal(frame.ego.pose, scene.frame(start + offset).views[ego].pose)
             assert frame.attackers == stretch[0].attackers
             assert len(frame.attackers) == (2 if number % 2 else 0)
 

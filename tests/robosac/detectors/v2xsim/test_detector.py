@@ -12,8 +12,8 @@ from robosac.detectors import EmbeddedDetector, Message, V2XSimDetector, Weights
 from robosac.detectors.base import for_role
 from robosac.detectors.embedded import SHIPPED_WEIGHTS
 from robosac.detectors.v2xsim import write_weights
-from robosac.detectors.v2xsim.fusions import FUSIONS
-from robosac.detectors.warp import warp
+from robosac.detectors.v2xsim.detector import FUSIONS
+from robosac.detectors.warp import sampling_matrix, warp
 from robosac.detectors.weights_file import read_weights, tensors_digest
 from robosac.wire import WireError, check_message, pack_message, read_message
 
@@ -122,7 +122,7 @@ def test_a_thing_lands_where_the_ego_has_it():
     thing = np.array([[1.0, 4.0, 1.0, 1.0, 0.0]])
     seen, expected = from_world(thing, there)[0], from_world(thing, here)[0]
     bump = torch.from_numpy(np.exp(-((xs - seen[0]) ** 2 + (ys - seen[1]) ** 2) / 18.0))[None, None]
-    moved = warp(bump, torch.from_numpy(V2XSimDetector.sampling_matrix(here, there))[None])[0, 0].numpy()
+    moved = warp(bump, torch.from_numpy(sampling_matrix(here, there, 32.0, mirrored=True))[None])[0, 0].numpy()
     centre = [(moved * xs).sum() / moved.sum(), (moved * ys).sum() / moved.sum()]
     np.testing.assert_allclose(centre, expected[:2], atol=0.15)
 
@@ -172,7 +172,7 @@ def test_an_attacker_sees_the_boxes_that_are_decoded(sharp, ego, others):
 @pytest.mark.parametrize(("fusion", "expected"), [("mean", [2.0, 0.0]), ("max", [5.0, 1.0]), ("sum", [6.0, 0.0])])
 def test_fusions(fusion, expected):
     maps = [torch.tensor(values).reshape(1, 1, 2) for values in ([1.0, 1.0], [5.0, 0.0], [0.0, -1.0])]
-    assert FUSIONS[fusion](maps).flatten().tolist() == expected
+    assert FUSIONS[fusion](torch.stack(maps), dim=0).flatten().tolist() == expected
 
 
 def test_the_recipe_chooses_the_fusion(published_state, v2xsim, ego, others, tmp_path):

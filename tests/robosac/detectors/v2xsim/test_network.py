@@ -3,10 +3,9 @@ import pytest
 import torch
 
 from robosac.detectors import Message, WeightsError
-from robosac.detectors.v2xsim import V2XSimDetector
 from robosac.detectors.v2xsim.network import V2XSimNetwork, published_shapes, select_published
-from robosac.detectors.v2xsim.voxels import from_indices, unpack
-from robosac.detectors.warp import warp
+from robosac.detectors.v2xsim.voxels import AREA_M, from_indices, unpack
+from robosac.detectors.warp import sampling_matrix, warp
 from tests.robosac.detectors.v2xsim.recipe import made_up, noise, published_keys
 
 EGO = 1
@@ -35,7 +34,7 @@ def warped(team):
 
 
 def moved(ego: Message, teammate: Message) -> torch.Tensor:
-    matrix = torch.from_numpy(V2XSimDetector.sampling_matrix(ego.pose, teammate.pose)).float()
+    matrix = torch.from_numpy(sampling_matrix(ego.pose, teammate.pose, AREA_M, mirrored=True)).float()
     return warp(torch.from_numpy(teammate.tensors["features"])[None], matrix[None])[0]
 
 
@@ -73,7 +72,7 @@ def test_messages_are_the_published_feature_maps(team, parity):
 
 def test_the_sampling_matrix_is_the_published_one_seen_unflipped(team, parity):
     flip = np.array([[1, -1, 1], [-1, 1, -1]])
-    ours = V2XSimDetector.sampling_matrix(team[EGO].pose, team[0].pose)
+    ours = sampling_matrix(team[EGO].pose, team[0].pose, AREA_M, mirrored=True)
     np.testing.assert_allclose(ours * flip, parity["theta_0_to_1"], atol=1e-6)
 
 
@@ -109,7 +108,7 @@ def test_logits_and_codes_are_the_published_ones(case, teammates, attacked, v2xs
     grid = unpack(team[EGO].tensors["grid"]).transpose(2, 0, 1).astype(np.float32)
     with torch.inference_mode():
         context = network.context(torch.from_numpy(grid)[None], own[None])
-        fused = v2xsim._fusion([own, *(maps[k] for k in teammates)])
+        fused = v2xsim._fusion(torch.stack([own, *(maps[k] for k in teammates)]), dim=0)
         logits, codes = network.decode(fused[None], context)
     np.testing.assert_allclose(logits[parity["anchor_idx"]], parity[f"{case}__cls"], atol=TOLERANCE)
     np.testing.assert_allclose(codes[parity["anchor_idx"]], parity[f"{case}__loc"], atol=TOLERANCE)
