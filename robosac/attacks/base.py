@@ -26,28 +26,17 @@ Aim = Callable[[Tensors, Tensors], torch.Tensor]
 
 @dataclass(frozen=True)
 class Knowledge:
-    """What the adversary sees before it begins.
-
-    Attributes
-    ----------
-    ego_logits : tensor
-        Class logits of the ego alone: the paper's pseudo ground truth.
-    benign_logits : tensor
-        Class logits of the fusion in which everybody is honest.
-    """
+    """What the adversary sees before it begins."""
 
     ego_logits: torch.Tensor
+    """Class logits of the ego alone: the paper's pseudo ground truth."""
     benign_logits: torch.Tensor
+    """Class logits of the fusion in which everybody is honest."""
 
 
 @dataclass(frozen=True)
 class Attack(ABC):
     """An adversary in control of some teammates.
-
-    Parameters
-    ----------
-    epsilon : float
-        L-infinity bound on the perturbation, in units of the message.
 
     Raises
     ------
@@ -60,6 +49,7 @@ class Attack(ABC):
     """What the attack calls of an attack surface, besides its ``messages``."""
 
     epsilon: float = 0.5
+    """L-infinity bound on the perturbation, in units of the message."""
 
     def __post_init__(self) -> None:
         for parameter, value in vars(self).items():

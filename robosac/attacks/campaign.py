@@ -64,15 +64,6 @@ def false_pose(pose: FloatArray, forward_m: float = 0.8, left_m: float = 0.6, tu
 class Campaign:
     """An attack over a sequence of frames.
 
-    Parameters
-    ----------
-    attack : Attack, optional
-        None sends honest tensors: the lie, if any, is in the pose.
-    pose : Lie, optional
-        Of the acting attackers; the attack is optimised for the fusion that it leads to.
-    alibi : Alibi, optional
-        Fusions in which the attack behaves; for iterative attacks.
-
     Raises
     ------
     ValueError
@@ -80,9 +71,12 @@ class Campaign:
     """
 
     attack: Attack | None
+    """None sends honest tensors: the lie, if any, is in the pose."""
     schedule: Schedule = always
     pose: Lie | None = None
+    """Of the acting attackers; the attack is optimised for the fusion that it leads to."""
     alibi: Alibi | None = None
+    """Fusions in which the attack behaves; for iterative attacks."""
 
     def __post_init__(self) -> None:
         if self.alibi is not None and not isinstance(self.attack, IterativeAttack):

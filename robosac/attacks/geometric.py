@@ -24,18 +24,12 @@ class NoGeometry(ValueError):
 
 @dataclass(frozen=True)
 class Perception:
-    """What the ego makes of a set of messages.
-
-    Attributes
-    ----------
-    scores : tensor
-        Class scores in [0, 1].
-    geometry : tensor of that shape and (6,)
-        As `robosac.detectors.base.GeometricSurface.perceive` gives it.
-    """
+    """What the ego makes of a set of messages."""
 
     scores: torch.Tensor
+    """Class scores in [0, 1]."""
     geometry: torch.Tensor
+    """Of the same shape and six more, as `robosac.detectors.base.GeometricSurface.perceive` gives it."""
 
     @classmethod
     def of(cls, surface: AttackSurface, team: Collection[str]) -> Perception:

@@ -25,33 +25,22 @@ _CHECK = 1
 
 @dataclass(frozen=True)
 class Recipe:
-    """What a calibration is made from.
-
-    Attributes
-    ----------
-    attacks : tuple of str
-        Names of `robosac.attacks.ATTACKS`, or ``module:callable``; each is a kind.
-    attackers : tuple of int
-        Each attack comes with each of these numbers of attackers; a number from 2 on must be among them.
-    scenes, stretches_per_scene : int
-        The first validation scenes, and stretches of two successive frames of each.
-    check_scenes : int
-        The scenes after them, for the reliability.
-    pose_errors_m : tuple of float
-        Ascending; a level each.
-    seed : int
-    data : str
-        As `robosac.scenes.SOURCES` takes it.
-    """
+    """What a calibration is made from."""
 
     attacks: tuple[str, ...] = ("pgd", "erase", "invent", "shift")
+    """Names of `robosac.attacks.ATTACKS`, or ``module:callable``; each is a kind."""
     attackers: tuple[int, ...] = (1, 2)
+    """Each attack comes with each of these numbers of attackers; a number from 2 on must be among them."""
     scenes: int = 128
     stretches_per_scene: int = 1
+    """The first validation scenes, and stretches of two successive frames of each."""
     check_scenes: int = 12
+    """The scenes after them, for the reliability."""
     pose_errors_m: tuple[float, ...] = (0.0, 0.2, 0.4)
+    """Ascending; a level each."""
     seed: int = 0
     data: str = DEFAULT_DATA
+    """As `robosac.scenes.SOURCES` takes it."""
 
     def __post_init__(self) -> None:
         if not self.attacks or not self.attackers or not self.pose_errors_m:
@@ -72,23 +61,15 @@ class Recipe:
 
 @dataclass(frozen=True)
 class ReliabilityBin:
-    """Teammates whose suspicion after two frames lay between two bounds.
-
-    Attributes
-    ----------
-    low, high : float
-    teammates : int
-    predicted : float
-        Mean suspicion.
-    observed : float
-        Share that did attack.
-    """
+    """Teammates whose suspicion after two frames lay between two bounds."""
 
     low: float
     high: float
     teammates: int
     predicted: float
+    """Mean suspicion."""
     observed: float
+    """Share that did attack."""
 
 
 def calibrate(

@@ -37,19 +37,12 @@ ChangeKey = tuple[str | None, int, int, int]
 
 @dataclass
 class Verdicts:
-    """Counts of what was observed, by what was true.
-
-    Attributes
-    ----------
-    pairs : Counter of PairKey
-    changes : Counter of ChangeKey
-    team : int
-        Teammates of the largest team.
-    """
+    """Counts of what was observed, by what was true."""
 
     pairs: Counter[PairKey] = field(default_factory=Counter)
     changes: Counter[ChangeKey] = field(default_factory=Counter)
     team: int = 0
+    """Teammates of the largest team."""
 
     def add_stretch(self, stretch: Sequence[DecodedOnce], kind: str | None) -> None:
         """Count what successive frames show, each by itself and from one to the next; the same ones attack in all."""
@@ -101,21 +94,13 @@ def _boxes(frame: DecodedOnce, subset: Subset) -> FloatArray:
 
 @dataclass(frozen=True)
 class Trial:
-    """What verdicts are observed under.
-
-    Attributes
-    ----------
-    attacks : mapping of kind to Attack
-    attackers : sequence of int
-        Each attack comes once with each number of attackers, drawn anew.
-    pose_error_m : float
-        Standard deviation of the error of each teammate's position along either axis, metres; each frame has its own.
-    stretches_per_scene : int
-    """
+    """What verdicts are observed under."""
 
     attacks: Mapping[str, Attack]
     attackers: Sequence[int]
+    """Each attack comes once with each number of attackers, drawn anew."""
     pose_error_m: float = 0.0
+    """Standard deviation of the error of each teammate's position along either axis, metres; each frame has its own."""
     stretches_per_scene: int = 1
 
 

@@ -161,33 +161,26 @@ class Defense(Protocol):
     @property
     def kind(self) -> str:
         """Its name in settings and logs."""
-        ...
 
     @property
     def consensus_threshold(self) -> float:
         """Jaccard index from which on a hypothesis is in consensus."""
-        ...
 
     @property
     def reference(self) -> Reference:
         """What hypotheses are compared with."""
-        ...
 
     def initial_state(self, team: Sequence[str]) -> State:
         """State of a session with this team before its first frame."""
-        ...
 
     def change_team(self, state: State, team: Sequence[str]) -> State:
         """State after teammates joined or left; ``team`` is the new one."""
-        ...
 
     def check_team(self, team_size: int) -> None:
         """Raise `robosac.budget.DomainError` if the settings make no sense for a team of this size."""
-        ...
 
     def converse(self, team: Sequence[str], state: State, rng: np.random.Generator) -> Conversation:
         """The conversation about one frame with the teammates present in it."""
-        ...
 
 
 def explain_rejections(

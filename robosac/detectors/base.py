@@ -37,32 +37,21 @@ class TensorSpec:
 
 @dataclass(frozen=True)
 class DetectorInfo:
-    """A detector's public face.
-
-    Attributes
-    ----------
-    name : str
-    tensors : mapping of role to mapping of tensor name to TensorSpec
-        What the ego and a teammate have to send.
-    area_m : (xmin, ymin, xmax, ymax)
-        Where boxes are found, ego frame, metres.
-    cell_m : float
-        Edge of a feature cell, metres.
-    weights_digest : str
-        SHA-256 of the weights file, hexadecimal.
-    consensus_score : float
-        Boxes from this score on take part in the consensus test.
-    calibration : Path or None
-        The file of likelihoods for group testing that lies beside the weights.
-    """
+    """A detector's public face."""
 
     name: str
     tensors: Mapping[Role, Mapping[str, TensorSpec]]
+    """By role: what the ego and a teammate have to send."""
     area_m: tuple[float, float, float, float]
+    """(xmin, ymin, xmax, ymax): where boxes are found, ego frame, metres."""
     cell_m: float
+    """Edge of a feature cell, metres."""
     weights_digest: str
+    """SHA-256 of the weights file, hexadecimal."""
     consensus_score: float
+    """Boxes from this score on take part in the consensus test."""
     calibration: Path | None = None
+    """The file of likelihoods for group testing that lies beside the weights."""
 
 
 def calibration_beside(weights: Path) -> Path | None:
@@ -73,18 +62,12 @@ def calibration_beside(weights: Path) -> Path | None:
 
 @dataclass(frozen=True)
 class Message:
-    """What one vehicle shares in one frame.
-
-    Attributes
-    ----------
-    pose : (4, 4) float64 ndarray
-        world_from_sensor.
-    tensors : mapping of name to ndarray
-        As the detector declares for the sender's role.
-    """
+    """What one vehicle shares in one frame."""
 
     pose: FloatArray
+    """(4, 4) float64: world_from_sensor."""
     tensors: Mapping[str, np.ndarray[Any, np.dtype[Any]]]
+    """By name: as the detector declares for the sender's role."""
 
 
 def for_role(message: Message, info: DetectorInfo, role: Role) -> Message:
@@ -114,7 +97,6 @@ class PreparedFrame(Protocol):
         KeyError
             If a teammate is not in the frame.
         """
-        ...
 
 
 class AttackSurface(Protocol):
@@ -123,11 +105,9 @@ class AttackSurface(Protocol):
     @property
     def messages(self) -> Mapping[str, torch.Tensor]:
         """The benign messages of all teammates, float32, without batch dimension."""
-        ...
 
     def class_logits(self, messages: Mapping[str, torch.Tensor]) -> torch.Tensor:
         """Class logits of the ego fused with these messages; with none, of the ego alone."""
-        ...
 
 
 @runtime_checkable
@@ -147,7 +127,6 @@ class GeometricSurface(AttackSurface, Protocol):
             The box that each logit stands for: x, y (ego frame, metres), log length, log width, cos and sin of twice
             the yaw.
         """
-        ...
 
 
 class Preparer(Protocol):
@@ -156,14 +135,12 @@ class Preparer(Protocol):
     @property
     def info(self) -> DetectorInfo:
         """Name, message layout, area and digest."""
-        ...
 
     def prepare(self, ego: Message, teammates: Mapping[str, Message]) -> PreparedFrame:
         """Do once what all hypotheses of a frame share.
 
         The messages must already be checked against `info`.
         """
-        ...
 
 
 class Encoder(Preparer, Protocol):
@@ -184,7 +161,6 @@ class Encoder(Preparer, Protocol):
         Message
             With all that an ego sends; `for_role` leaves what a teammate sends.
         """
-        ...
 
 
 @runtime_checkable
@@ -196,8 +172,6 @@ class Detector(Encoder, Protocol):
 
     def attack_surface(self, ego: Message, teammates: Mapping[str, Message]) -> AttackSurface:
         """Show a frame to an attacker."""
-        ...
 
     def perturbed(self, message: Message, tensor: torch.Tensor) -> Message:
         """Put an attacker's tensor, as in `AttackSurface.messages`, into a teammate's message."""
-        ...

@@ -15,22 +15,15 @@ IntArray = np.ndarray[Any, np.dtype[np.int64]]
 
 @dataclass(frozen=True)
 class Matched:
-    """A frame's detections, each with the true box that it overlaps most.
-
-    Attributes
-    ----------
-    scores, iou : (n,) ndarray
-        The IoU with that box; 0 where there is none.
-    best : (n,) ndarray
-        Its index; -1 where there is none.
-    truths : int
-        True boxes of the frame.
-    """
+    """A frame's detections, each with the true box that it overlaps most."""
 
     scores: FloatArray
     iou: FloatArray
+    """(n,): the IoU with that box; 0 where there is none."""
     best: IntArray
+    """(n,): its index; -1 where there is none."""
     truths: int
+    """True boxes of the frame."""
 
 
 def match(detections: FloatArray, truth: FloatArray) -> Matched:

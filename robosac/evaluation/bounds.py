@@ -22,79 +22,57 @@ class NoFrames(ValueError):
 
 @dataclass(frozen=True)
 class BoundsRow:
-    """One line of the table.
-
-    Attributes
-    ----------
-    name : str
-    ap50, ap70 : float
-        Average precision at IoU 0.5 and 0.7.
-    mean_steps, success_rate, infiltrated : float or None
-        For sampling rows: hypotheses tested a frame, share of frames with a consensus, and share of frames whose answer
-        holds an attacker's message.
-    """
+    """One line of the table."""
 
     name: str
     ap50: float
     ap70: float
+    """Average precision at IoU 0.5 and 0.7."""
     mean_steps: float | None = None
     success_rate: float | None = None
     infiltrated: float | None = None
+    """For sampling rows: hypotheses tested a frame, share of frames with a consensus, and share of frames whose answer
+    holds an attacker's message.
+    """
 
 
 @dataclass(frozen=True)
 class BoundsReport:
-    """The table and the error rates of the consensus test.
-
-    Attributes
-    ----------
-    rows : list of BoundsRow
-    frames, skipped : int
-    false_alarm_rate, miss_rate : float or None
-        Share of attacker-free hypotheses refused, and of attacked ones let through, over all hypotheses of the size
-        used; None where there is no such hypothesis.
-    benign_hypotheses, attacked_hypotheses : int
-        How many those are.
-    perturbation_to_feature_ratio : float or None
-        The attack's bound over the 95th percentile of the magnitude of benign messages; None where that is 0.
-    """
+    """The table and the error rates of the consensus test."""
 
     rows: list[BoundsRow]
     frames: int
     skipped: int
     false_alarm_rate: float | None
     miss_rate: float | None
+    """Share of attacker-free hypotheses refused, and of attacked ones let through, over all hypotheses of the size
+    used; None where there is no such hypothesis.
+    """
     benign_hypotheses: int
     attacked_hypotheses: int
+    """How many those are."""
     perturbation_to_feature_ratio: float | None
+    """The attack's bound over the 95th percentile of the magnitude of benign messages; None where that is 0."""
 
 
 @dataclass(frozen=True)
 class Sampling:
-    """How Algorithm 1 is run.
-
-    Attributes
-    ----------
-    attackers, team_size : int
-        Their ratio is what the defence assumes; that is `ASSUMED_RATIO` if nobody attacks.
-    collaborators : int
-        s, the size of a hypothesis.
-    budgets : tuple of int
-        One row of Algorithm 1 for each, with independent draws as in the paper; one for the first of them where no
-        subset is drawn twice in a frame; and one with the gateway's defaults, which choose the hypotheses' size too.
-    repeats : int
-        Runs of Algorithm 1 on each frame, so that the luck of its draws averages out; the fused passes are shared.
-    seed, stream : int
-        Of the draws.
-    """
+    """How Algorithm 1 is run."""
 
     attackers: int = 1
     team_size: int = 5
+    """Their ratio is what the defence assumes; that is `ASSUMED_RATIO` if nobody attacks."""
     collaborators: int = 3
+    """s, the size of a hypothesis."""
     budgets: tuple[int, ...] = (7, 5, 3, 1)
+    """One row of Algorithm 1 for each, with independent draws as in the paper; one for the first of them where no
+    subset is drawn twice in a frame; and one with the gateway's defaults, which choose the hypotheses' size too.
+    """
     repeats: int = 10
+    """Runs of Algorithm 1 on each frame, so that the luck of its draws averages out; the fused passes are shared."""
     seed: int = 0
     stream: int = 1
+    """Of the draws."""
 
     def defenses(self) -> dict[str, SampleConsensus]:
         """The defences, by the names of their rows."""

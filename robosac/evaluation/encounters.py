@@ -40,21 +40,16 @@ def acts(campaign: str, attackers: Collection[str], frames: int) -> list[Act]:
 
 @dataclass
 class Encounters:
-    """Frames of a scene as its first ego meets them.
-
-    Attributes
-    ----------
-    seed : int
-        Of attacks.
-    pose_error_m : float
-        Standard deviation of the error of each teammate's position along either axis, metres; the same errors whatever
-        the attack.
-    """
+    """Frames of a scene as its first ego meets them."""
 
     detector: Detector
     scene: Scene
     seed: int = 0
+    """Of attacks."""
     pose_error_m: float = 0.0
+    """Standard deviation of the error of each teammate's position along either axis, metres; the same errors whatever
+    the attack.
+    """
     _sensed: dict[int, Sensed] = field(default_factory=dict, init=False)
 
     def sequence(

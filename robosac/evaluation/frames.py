@@ -26,28 +26,18 @@ YAW_PER_METRE = np.deg2rad(2.0)
 
 @dataclass(frozen=True)
 class EvaluationFrame:
-    """One frame as its ego meets it.
-
-    Attributes
-    ----------
-    detector : Detector
-    ego : Message
-    benign : mapping of teammate to Message
-        What honest teammates would send.
-    teammates : mapping of teammate to Message
-        What is received: the attackers' messages stand in the place of their benign ones.
-    attackers : frozenset of str
-        Those whose message of this frame is not what an honest one would send.
-    truth : (G, 5) ndarray
-        Ego frame.
-    """
+    """One frame as its ego meets it."""
 
     detector: Detector
     ego: Message
     benign: Mapping[str, Message]
+    """By teammate: what honest teammates would send."""
     teammates: Mapping[str, Message]
+    """By teammate: what is received; the attackers' messages stand in the place of their benign ones."""
     attackers: frozenset[str]
+    """Those whose message of this frame is not what an honest one would send."""
     truth: FloatArray
+    """(G, 5): true boxes; ego frame."""
 
     @property
     def info(self) -> DetectorInfo:
@@ -71,15 +61,10 @@ class EvaluationFrame:
 
 @dataclass(frozen=True)
 class DecodedOnce(EvaluationFrame):
-    """A frame in which each subset is decoded once, whoever asks.
-
-    Attributes
-    ----------
-    boxes : dict of subset to (n, 6) ndarray
-        What has been decoded; the empty subset is the ego alone.
-    """
+    """A frame in which each subset is decoded once, whoever asks."""
 
     boxes: dict[Subset, FloatArray] = field(default_factory=dict)
+    """By subset: the boxes (n, 6) that have been decoded; the empty subset is the ego alone."""
 
     @classmethod
     def of(cls, frame: EvaluationFrame) -> DecodedOnce:
@@ -150,23 +135,15 @@ def misplaced(message: Message, pose_error_m: float, rng: np.random.Generator) -
 
 @dataclass(frozen=True)
 class Sensed:
-    """One frame before anybody attacks.
-
-    Attributes
-    ----------
-    index : int
-        Its number in the scene, which a campaign's schedule goes by.
-    ego_id : str
-    messages : mapping of agent to Message
-        Everybody's, the ego's among them, each with all that it would send as an ego.
-    truth : (G, 5) ndarray
-        For that ego, in its frame.
-    """
+    """One frame before anybody attacks."""
 
     index: int
+    """Its number in the scene, which a campaign's schedule goes by."""
     ego_id: str
     messages: Mapping[str, Message]
+    """By agent: everybody's, the ego's among them, each with all that it would send as an ego."""
     truth: FloatArray
+    """(G, 5): true boxes; ego frame."""
 
     @classmethod
     def of(cls, detector: Detector, frame: Frame, ego_id: str, pose_error_m: float, rng: np.random.Generator) -> Sensed:

@@ -20,17 +20,11 @@ class FaultyDefense(RuntimeError):
 
 @dataclass(frozen=True)
 class Answer:
-    """What a defence made of one frame.
-
-    Attributes
-    ----------
-    result : FusionResult
-    milliseconds : float
-        For all of it.
-    """
+    """What a defence made of one frame."""
 
     result: FusionResult
     milliseconds: float
+    """For all of it."""
 
     @property
     def passes(self) -> int:

@@ -61,17 +61,12 @@ class Recordings(Encounters):
 
     A frame is determined by the scene, its number, the attack, who acts in it, and the seed, whatever else is recorded:
     a campaign's schedule only chooses among such frames, so campaigns share them.
-
-    Attributes
-    ----------
-    folder : Path, optional
-        Where they are kept and looked for; by default nowhere.
-    data : str
-        Name of the scenes' source.
     """
 
     folder: Path | None = None
+    """Where they are kept and looked for; by default nowhere."""
     data: str = DEFAULT_DATA
+    """Name of the scenes' source."""
     _recorded: dict[Act, dict[int, DecodedOnce]] = field(default_factory=dict, init=False)
 
     def met(self, act: Act, indices: Sequence[int]) -> Iterator[DecodedOnce]:

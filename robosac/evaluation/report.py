@@ -11,23 +11,15 @@ from typing import Any
 
 @dataclass(frozen=True)
 class Table:
-    """A table of a report.
-
-    Attributes
-    ----------
-    name : str
-        Of the CSV file beside the report that holds the same; none if it is empty.
-    caption : str
-        Stands before the table, with the CSV file's name.
-    columns : sequence of str
-    rows : sequence of sequences
-        Cells are strings or numbers; None is empty.
-    """
+    """A table of a report."""
 
     name: str
+    """Of the CSV file beside the report that holds the same; none if it is empty."""
     caption: str
+    """Stands before the table, with the CSV file's name."""
     columns: Sequence[str]
     rows: Sequence[Sequence[Any]]
+    """Cells are strings or numbers; None is empty."""
 
     @classmethod
     def of(cls, lines: Sequence[Mapping[str, Any]], name: str = "", caption: str = "") -> Table:

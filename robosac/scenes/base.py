@@ -23,18 +23,13 @@ class SceneError(ValueError):
 
 @dataclass(frozen=True)
 class View:
-    """What one agent senses in one frame.
-
-    Attributes
-    ----------
-    pose : (4, 4) ndarray
-        world_from_sensor; all agents of a scene share the world, and it stays where it is from frame to frame.
-    points : (P, 3) ndarray
-        LiDAR returns in the sensor's frame, metres.
-    """
+    """What one agent senses in one frame."""
 
     pose: FloatArray
+    """(4, 4): world_from_sensor; all agents of a scene share the world, and it stays where it is from frame to frame.
+    """
     points: FloatArray
+    """(P, 3): LiDAR returns in the sensor's frame, metres."""
 
 
 class Frame(Protocol):
@@ -43,16 +38,13 @@ class Frame(Protocol):
     @property
     def index(self) -> int:
         """Its number in the scene."""
-        ...
 
     @property
     def views(self) -> Mapping[str, View]:
         """What each agent senses that is present."""
-        ...
 
     def truth(self, ego: str) -> FloatArray:
         """True boxes (G, 5) for an agent: x, y, length, width, yaw in its sensor's frame, metres and radians."""
-        ...
 
 
 class Scene(Protocol):
@@ -61,31 +53,25 @@ class Scene(Protocol):
     @property
     def number(self) -> int:
         """A non-negative number that no other scene of the source has: random draws and recordings go by it."""
-        ...
 
     @property
     def agents(self) -> Sequence[str]:
         """Ids of all agents, those that may be an ego first."""
-        ...
 
     @property
     def egos(self) -> Sequence[str]:
         """Those agents that may be an ego. The first is the ego of sequences, and present in every frame."""
-        ...
 
     @property
     def length(self) -> int | None:
         """Number of frames; None if there is no end."""
-        ...
 
     @property
     def frame_period_s(self) -> float:
         """Time from one frame to the next, seconds."""
-        ...
 
     def frame(self, index: int) -> Frame:
         """The frame of a number from 0 to below ``length``."""
-        ...
 
 
 @runtime_checkable
@@ -95,11 +81,9 @@ class SceneSource(Protocol):
     @property
     def name(self) -> str:
         """Says which data this is; recordings and calibrations are kept under it."""
-        ...
 
     def scenes(self, split: Split) -> Sequence[Scene]:
         """The scenes for a purpose, always in the same order. No frame is made before it is asked for."""
-        ...
 
 
 def first_scenes(source: SceneSource, split: Split, count: int, frames: int = 1, team: int = 1) -> list[Scene]:

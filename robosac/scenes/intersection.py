@@ -21,35 +21,22 @@ TRUTH_RANGE_M = 31.0
 
 @dataclass(frozen=True)
 class AgentView(View):
-    """What one agent senses in one frame; the z of its pose is the sensor's height above ground.
-
-    Attributes
-    ----------
-    hits : (V,) int ndarray
-        Returns from each vehicle of the scene.
-    """
+    """What one agent senses in one frame; the z of its pose is the sensor's height above ground."""
 
     hits: IntArray
+    """(V,) int: returns from each vehicle of the scene."""
 
 
 @dataclass(frozen=True)
 class SceneFrame:
-    """One instant of a scene.
-
-    Attributes
-    ----------
-    index : int
-    vehicles : (V, 5) ndarray
-        x, y, length, width, yaw of every vehicle; world frame.
-    views : mapping of agent id to AgentView
-    carriers : mapping of agent id to int
-        The vehicle that carries the agent's sensor; absent for the roadside unit.
-    """
+    """One instant of a scene."""
 
     index: int
     vehicles: FloatArray
+    """(V, 5): x, y, length, width, yaw of every vehicle; world frame."""
     views: Mapping[str, AgentView]
     carriers: Mapping[str, int]
+    """By agent id: the vehicle that carries the agent's sensor; absent for the roadside unit."""
 
     def truth(self, ego: str) -> FloatArray:
         """True boxes for an ego: every other vehicle within +-31 m that some agent hits at least 6 times.
@@ -83,14 +70,6 @@ class IntersectionScene:
     Any frame can be computed by itself; the same seed and index give the same frame, bit for bit. Agents are named
     ``car-1``, ``car-2``, ... and ``rsu``.
 
-    Parameters
-    ----------
-    seed : int
-        Any non-negative integer.
-    car_agents : int, default 5
-        Cars that carry a sensor.
-    lidar : Lidar
-
     Examples
     --------
     >>> frame = IntersectionScene(seed=8).frame(0)
@@ -99,7 +78,9 @@ class IntersectionScene:
     """
 
     seed: int
+    """Any non-negative integer."""
     car_agents: int = 5
+    """Cars that carry a sensor."""
     lidar: Lidar = field(default_factory=Lidar)
     length = None
     frame_period_s = FRAME_PERIOD_S

@@ -20,29 +20,20 @@ IntArray = np.ndarray[tuple[int, ...], np.dtype[np.int64]]
 
 @dataclass(frozen=True)
 class Lidar:
-    """Geometry and noise of the sensor.
-
-    Attributes
-    ----------
-    azimuths, beams : int
-        Rays per turn and channels.
-    lowest_deg, highest_deg : float
-        Elevation of the outermost channels.
-    range_m : float
-        Returns from beyond this are lost.
-    dropout : float
-        Share of returns lost at random.
-    noise_m : float
-        Standard deviation of the measured range.
-    """
+    """Geometry and noise of the sensor."""
 
     azimuths: int = 900
     beams: int = 28
+    """Rays per turn and channels."""
     lowest_deg: float = -28.0
     highest_deg: float = 4.0
+    """Elevation of the outermost channels."""
     range_m: float = 60.0
+    """Returns from beyond this are lost."""
     dropout: float = 0.05
+    """Share of returns lost at random."""
     noise_m: float = 0.03
+    """Standard deviation of the measured range."""
 
     def scan(
         self, obstacles: FloatArray, origin: tuple[float, float, float, float], rng: np.random.Generator

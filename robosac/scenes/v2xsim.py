@@ -43,47 +43,34 @@ class SampleError(SceneError):
 
 @dataclass(frozen=True)
 class V2XSimSample:
-    """What one agent senses and should find in one frame.
-
-    Attributes
-    ----------
-    voxels : (K, 3) int64 ndarray
-        Occupied cells along +x, +y, +z of the sensor, see `robosac.detectors.v2xsim.voxels`.
-    trans_matrices : (6, 4, 4) float64 ndarray
-        [k] maps agent k's points into this agent's frame; zero for absent agents.
-    truth : (G, 5) float64 ndarray
-        x, y, length, width, yaw; this agent's LiDAR frame. A true box is listed (``gt_max_iou``) by the anchor that
-        fits it best. Its code is taken from ``reg_target_sparse``, assuming that this holds the codes of the anchors of
-        ``allocation_mask`` in C order, and that an anchor outside that mask or ``reg_loss_mask`` stands for the box
-        itself.
-    category : (G,) int64 ndarray
-        Of each true box.
-    """
+    """What one agent senses and should find in one frame."""
 
     voxels: _Indices
+    """(K, 3) int64: occupied cells along +x, +y, +z of the sensor, see `robosac.detectors.v2xsim.voxels`."""
     trans_matrices: FloatArray
+    """(6, 4, 4) float64: [k] maps agent k's points into this agent's frame; zero for absent agents."""
     truth: FloatArray
+    """(G, 5) float64: x, y, length, width, yaw; this agent's LiDAR frame. A true box is listed (``gt_max_iou``) by the
+    anchor that fits it best. Its code is taken from ``reg_target_sparse``, assuming that this holds the codes of the
+    anchors of ``allocation_mask`` in C order, and that an anchor outside that mask or ``reg_loss_mask`` stands for the
+    box itself.
+    """
     category: _Indices
+    """(G,) int64: of each true box."""
 
 
 @dataclass(frozen=True)
 class V2XSimFrame:
-    """One instant of a scene; the world is the frame of the first agent present.
-
-    Attributes
-    ----------
-    index : int
-        As its folder says.
-    views : mapping of agent id to View
-        Those present. Points are the centres of occupied voxels. The roadside unit's are moved down with its pose, by
-        5 m, so that its voxels are as high above its sensor as a vehicle's.
-    boxes : mapping of agent id to (G, 5) ndarray
-        True boxes, in that agent's frame.
-    """
+    """One instant of a scene; the world is the frame of the first agent present."""
 
     index: int
+    """As its folder says."""
     views: Mapping[str, View]
+    """By agent id: those present. Points are the centres of occupied voxels. The roadside unit's are moved down with
+    its pose, by 5 m, so that its voxels are as high above its sensor as a vehicle's.
+    """
     boxes: Mapping[str, FloatArray]
+    """By agent id: true boxes (G, 5), in that agent's frame."""
 
     def truth(self, ego: str) -> FloatArray:
         """True boxes (G, 5) for an ego, in its LiDAR frame."""
@@ -95,15 +82,10 @@ class V2XSimScene:
     """A scene at 5 Hz; its agents are those present in its first frame, ``agent1`` to ``agent5`` and ``agent0``.
 
     From frame to frame the world stays where it is only if the roadside unit is present.
-
-    Parameters
-    ----------
-    root : Path
-        The folder that holds ``agent0`` to ``agent5``.
-    number : int
     """
 
     root: Path
+    """The folder that holds ``agent0`` to ``agent5``."""
     number: int
     frame_period_s = FRAME_PERIOD_S
 

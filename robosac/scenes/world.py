@@ -30,37 +30,25 @@ RSU_HEIGHT_M = 5.0
 
 @dataclass(frozen=True)
 class Traffic:
-    """Vehicles and buildings of one scene, and the agents among them.
-
-    Attributes
-    ----------
-    along, lateral : (V,) ndarray
-        Position at time 0 along the road and to the left of its direction, metres.
-    road_yaw : (V,) ndarray
-        Direction of the lane in the world, radians.
-    yaw_offset : (V,) ndarray
-        Deviation of the vehicle's heading from its lane, radians.
-    speed : (V,) ndarray
-        Metres per second; 0 in the queue and at the kerb.
-    size : (V, 3) ndarray
-        Length, width, height in metres.
-    buildings : (B, 6) ndarray
-        x, y, length, width, yaw, height; world frame.
-    agent_vehicles : (A,) ndarray of int
-        Vehicles that carry a sensor.
-    rsu_pose : (x, y, yaw)
-        The roadside unit, world frame.
-    """
+    """Vehicles and buildings of one scene, and the agents among them."""
 
     along: FloatArray
     lateral: FloatArray
+    """(V,): position at time 0 along the road and to the left of its direction, metres."""
     road_yaw: FloatArray
+    """(V,): direction of the lane in the world, radians."""
     yaw_offset: FloatArray
+    """(V,): deviation of the vehicle's heading from its lane, radians."""
     speed: FloatArray
+    """(V,): metres per second; 0 in the queue and at the kerb."""
     size: FloatArray
+    """(V, 3): length, width, height in metres."""
     buildings: FloatArray
+    """(B, 6): x, y, length, width, yaw, height; world frame."""
     agent_vehicles: np.ndarray[tuple[int], np.dtype[np.int64]]
+    """(A,) int: vehicles that carry a sensor."""
     rsu_pose: tuple[float, float, float]
+    """(x, y, yaw): the roadside unit, world frame."""
 
     def vehicles_at(self, time_s: float) -> FloatArray:
         """Boxes of all vehicles.

@@ -16,24 +16,16 @@ from robosac.training.loss import detection_loss
 
 @dataclass(frozen=True)
 class AdversaryConfig:
-    """The adversary of the training (Madry et al., 2018; for collaborative perception Tu et al., 2021).
-
-    Attributes
-    ----------
-    share : float
-        Share of the egos with teammates that meet an attacker.
-    epsilon : float
-        L-infinity bound, in units of the features (those of the message without its gain).
-    steps : int
-        Signed steps of PGD from a random start.
-    step_size : float
-        In units of the features.
-    """
+    """The adversary of the training (Madry et al., 2018; for collaborative perception Tu et al., 2021)."""
 
     share: float = 0.5
+    """Share of the egos with teammates that meet an attacker."""
     epsilon: float = 0.5
+    """L-infinity bound, in units of the features (those of the message without its gain)."""
     steps: int = 3
+    """Signed steps of PGD from a random start."""
     step_size: float = 0.25
+    """In units of the features."""
 
 
 def add_adversary(

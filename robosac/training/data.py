@@ -15,23 +15,16 @@ from robosac.scenes import FRAME_PERIOD_S, IntersectionScene, SceneFrame
 
 @dataclass(frozen=True)
 class TrainingFrame:
-    """One frame of a scene, ready for training.
-
-    Attributes
-    ----------
-    packed : (A, 12288) uint8 ndarray
-        Occupancy grids of all agents, eight cells a byte.
-    poses : (A, 4, 4) ndarray
-    near : list of (K, 5) ndarray
-        For each agent as ego, the vehicles within its area, in its frame.
-    hits : list of (A, K) ndarray
-        How often each agent hit each of them.
-    """
+    """One frame of a scene, ready for training."""
 
     packed: np.ndarray[Any, np.dtype[np.uint8]]
+    """(A, 12288) uint8: occupancy grids of all agents, eight cells a byte."""
     poses: FloatArray
+    """(A, 4, 4)."""
     near: list[FloatArray]
+    """(K, 5) for each agent as ego: the vehicles within its area, in its frame."""
     hits: list[IntArray]
+    """(A, K) for each agent as ego: how often each agent hit each of these vehicles."""
 
     def grids(self) -> np.ndarray[Any, np.dtype[np.uint8]]:
         """Occupancy (A, 6, 128, 128)."""

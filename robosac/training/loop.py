@@ -26,34 +26,24 @@ Progress = Callable[[str, int, int, str], None]
 
 @dataclass(frozen=True)
 class TrainingConfig:
-    """Everything that decides what the training yields.
-
-    Attributes
-    ----------
-    seed : int
-        Of the initial weights and of every draw.
-    scenes, frames_per_scene : int
-        Data: that many scenes from the start of the training seeds, frames 1 s apart.
-    steps, frames_per_step, egos_per_frame : int
-        Each step encodes all agents of some frames and decodes some of them as ego.
-    learning_rate, weight_decay : float
-        AdamW; one cycle with cosine decay to zero.
-    ego_only_share : float
-        Share of egos decoded alone; the others get a uniform number of teammates, at least one.
-    adversary : AdversaryConfig or None
-        Adversarial training, on top of weights that are trained already.
-    """
+    """Everything that decides what the training yields."""
 
     seed: int = 1
+    """Of the initial weights and of every draw."""
     scenes: int = 800
     frames_per_scene: int = 5
+    """Data: that many scenes from the start of the training seeds, frames 1 s apart."""
     steps: int = 2600
     frames_per_step: int = 4
     egos_per_frame: int = 3
+    """Each step encodes all agents of some frames and decodes some of them as ego."""
     learning_rate: float = 3e-3
     weight_decay: float = 1e-2
+    """AdamW; one cycle with cosine decay to zero."""
     ego_only_share: float = 0.2
+    """Share of egos decoded alone; the others get a uniform number of teammates, at least one."""
     adversary: AdversaryConfig | None = None
+    """Adversarial training, on top of weights that are trained already."""
 
 
 def train_network(

@@ -32,25 +32,17 @@ Trial = tuple[Preparer, list[EvaluationFrame]]
 
 @dataclass(frozen=True)
 class OperatingPoint:
-    """What validation chose, and the figures behind it.
-
-    Attributes
-    ----------
-    feature_gain : float
-        What messages are multiplied by, so that a perturbation of 0.5 harms as much as in the literature.
-    score_threshold : float
-        Least score of an answered box.
-    consensus_score : float
-        Least score of a box in the consensus test.
-    figures : dict
-        Average precision at IoU 0.5 of ego only, all benign and no defence; consensus margin, false alarm and miss
-        rate.
-    """
+    """What validation chose, and the figures behind it."""
 
     feature_gain: float
+    """What messages are multiplied by, so that a perturbation of 0.5 harms as much as in the literature."""
     score_threshold: float
+    """Least score of an answered box."""
     consensus_score: float
+    """Least score of a box in the consensus test."""
     figures: dict[str, float]
+    """Average precision at IoU 0.5 of ego only, all benign and no defence; consensus margin, false alarm and miss rate.
+    """
 
 
 def validation_frames(network: MeanFusionNetwork, gain: float) -> Trial:

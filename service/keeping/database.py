@@ -62,15 +62,12 @@ class Database(Protocol):
 
     async def read(self, work: Work[T]) -> T:
         """Run work that only reads."""
-        ...
 
     async def write(self, work: Work[T]) -> T:
         """Run work; what it did is kept once this returns."""
-        ...
 
     async def close(self) -> None:
         """Let go of files and connections."""
-        ...
 
 
 def read_url(text: str) -> URL:

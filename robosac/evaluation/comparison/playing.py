@@ -29,31 +29,19 @@ MOST_RECORDED = 8
 
 @dataclass(frozen=True)
 class Plan:
-    """What is played.
-
-    Attributes
-    ----------
-    detector : Detector
-    defenses : mapping of name to Defense
-    extent : Extent
-    seed : int
-        Of attackers, attacks and draws.
-    recordings : Path, optional
-        Folder in which recorded frames are kept and looked for.
-    pose_error_m : float
-        Of the teammates, as `Encounters` takes it.
-    live : bool
-        Record nothing: each defence decodes for itself, and is timed.
-    data : SceneSource
-    """
+    """What is played."""
 
     detector: Detector
     defenses: Mapping[str, Defense]
     extent: Extent
     seed: int = 0
+    """Of attackers, attacks and draws."""
     recordings: Path | None = None
+    """Folder in which recorded frames are kept and looked for."""
     pose_error_m: float = 0.0
+    """Of the teammates, as `Encounters` takes it."""
     live: bool = False
+    """Record nothing: each defence decodes for itself, and is timed."""
     data: SceneSource = field(default_factory=Synthetic)
 
     def scenes(self) -> list[Scene]:
@@ -82,54 +70,36 @@ class Plan:
 
 @dataclass(frozen=True)
 class Naming:
-    """Whom a defence named in a sequence.
-
-    Attributes
-    ----------
-    struck : int
-        Attackers that acted in it.
-    after : tuple of int
-        Of each of them that was named: frames since its first strike, at least 1.
-    all_after : int or None
-        Frames since the first strike of all until all attackers were named together; None if they never were.
-    honest_named, honest : int
-        Honest teammates that were ever named, and all of them.
-    """
+    """Whom a defence named in a sequence."""
 
     struck: int
+    """Attackers that acted in it."""
     after: tuple[int, ...]
+    """Of each of them that was named: frames since its first strike, at least 1."""
     all_after: int | None
+    """Frames since the first strike of all until all attackers were named together; None if they never were."""
     honest_named: int
     honest: int
+    """Honest teammates that were ever named, and all of them."""
 
 
 @dataclass
 class Played:
-    """What one defence did in one sequence; lists are by frame.
-
-    Attributes
-    ----------
-    matched : list of Matched
-        Its answers.
-    infiltrated : list of bool
-        Whether an attacking message is in the answer.
-    refused, honest : list of int
-        Honest messages that are not in the answer, and all of them.
-    passes : list of int
-        Fused.
-    milliseconds : list of float
-        Empty unless live.
-    naming : Naming or None
-        None where the defence names nobody.
-    """
+    """What one defence did in one sequence; lists are by frame."""
 
     matched: list[Matched] = field(default_factory=list)
+    """Its answers."""
     infiltrated: list[bool] = field(default_factory=list)
+    """Whether an attacking message is in the answer."""
     refused: list[int] = field(default_factory=list)
     honest: list[int] = field(default_factory=list)
+    """Honest messages that are not in the answer, and all of them."""
     passes: list[int] = field(default_factory=list)
+    """Fused."""
     milliseconds: list[float] = field(default_factory=list)
+    """Empty unless live."""
     naming: Naming | None = None
+    """None where the defence names nobody."""
 
     def add(self, frame: EvaluationFrame, matched: Matched, accepted: Collection[str], passes: int) -> None:
         """Add a frame."""

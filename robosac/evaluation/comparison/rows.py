@@ -40,85 +40,57 @@ class Estimate:
 
 @dataclass(frozen=True)
 class Figures:
-    """What the answers of some frames are worth.
-
-    Attributes
-    ----------
-    ap50, ap70 : Estimate
-    ap50_difference, ap70_difference : Estimate
-        To the oracle on the same sequences; negative where something is lost.
-    ap70_ratio : Estimate or None
-        To the oracle; None where that has 0.
-    infiltrated : float
-        Share of frames with an attacking message in the answer.
-    """
+    """What the answers of some frames are worth."""
 
     ap50: Estimate
     ap70: Estimate
     ap50_difference: Estimate
     ap70_difference: Estimate
+    """To the oracle on the same sequences; negative where something is lost."""
     ap70_ratio: Estimate | None
+    """To the oracle; None where that has 0."""
     infiltrated: float
+    """Share of frames with an attacking message in the answer."""
 
 
 @dataclass(frozen=True)
 class NamingFigures:
-    """Whom a defence named.
-
-    Attributes
-    ----------
-    named_all : float or None
-        Share of attacked sequences in which all attackers were named; None where nobody attacks.
-    frames_to_name : float or None
-        Frames from the first strike until all attackers are named, the mean over those sequences.
-    attackers_named, attackers_struck : int
-        Attackers that were named after they struck, and all that struck.
-    frames_to_name_each, frames_to_name_most : float or None
-        Frames from the first strike of each of the former until it is named, the mean and the most.
-    honest_named, honest : int
-        Honest teammates that were ever named, and all of them.
-    """
+    """Whom a defence named."""
 
     named_all: float | None
+    """Share of attacked sequences in which all attackers were named; None where nobody attacks."""
     frames_to_name: float | None
+    """Frames from the first strike until all attackers are named, the mean over those sequences."""
     attackers_named: int
     attackers_struck: int
+    """Attackers that were named after they struck, and all that struck."""
     frames_to_name_each: float | None
     frames_to_name_most: int | None
+    """Frames from the first strike of each of the former until it is named, the mean and the most."""
     honest_named: int
     honest: int
+    """Honest teammates that were ever named, and all of them."""
 
 
 @dataclass(frozen=True)
 class Row:
-    """What one defence did in one setting.
-
-    Attributes
-    ----------
-    setting : Setting
-    defense : str
-        Or `ORACLE`, the fusion of everybody who is honest in the frame, or `EGO_ONLY`.
-    windows : mapping of first frame to Figures
-        Those of `WINDOWS` that there are frames for.
-    passes_first, passes_early, passes_steady : float
-        Fused passes a frame: in the first, in frames 2 to 5, and afterwards.
-    honest_refused : float or None
-        Share of honest messages left out of the answers; None where there are none.
-    milliseconds : float or None
-        Median time of a frame; None unless live.
-    naming : NamingFigures or None
-        None where the defence names nobody.
-    """
+    """What one defence did in one setting."""
 
     setting: Setting
     defense: str
+    """Or `ORACLE`, the fusion of everybody who is honest in the frame, or `EGO_ONLY`."""
     windows: Mapping[int, Figures]
+    """By first frame: those of `WINDOWS` that there are frames for."""
     passes_first: float
     passes_early: float
     passes_steady: float
+    """Fused passes a frame: in the first, in frames 2 to 5, and afterwards."""
     honest_refused: float | None
+    """Share of honest messages left out of the answers; None where there are none."""
     milliseconds: float | None = None
+    """Median time of a frame; None unless live."""
     naming: NamingFigures | None = None
+    """None where the defence names nobody."""
 
     @property
     def whole(self) -> Figures:

@@ -54,18 +54,12 @@ def built(defenses: Mapping[str, DefenseSettings], detector: Detector) -> tuple[
 
 @dataclass(frozen=True)
 class Setting:
-    """What a team is up against.
-
-    Attributes
-    ----------
-    campaign : str
-        As `robosac.attacks.load_campaign` takes it.
-    attackers : int
-        Among the ego's teammates.
-    """
+    """What a team is up against."""
 
     campaign: str
+    """As `robosac.attacks.load_campaign` takes it."""
     attackers: int
+    """Among the ego's teammates."""
 
     @classmethod
     def parse(cls, text: str) -> Setting:
@@ -90,18 +84,12 @@ class Setting:
 
 @dataclass(frozen=True)
 class Extent:
-    """How much is run.
-
-    Attributes
-    ----------
-    settings : tuple of Setting
-    scenes, frames : int
-        Test sequences, the first scenes, and frames of each; more than 5.
-    """
+    """How much is run."""
 
     settings: tuple[Setting, ...]
     scenes: int
     frames: int
+    """Test sequences, the first scenes, and frames of each; more than 5."""
 
 
 NOBODY = Setting(HONEST, 0)

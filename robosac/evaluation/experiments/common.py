@@ -21,26 +21,18 @@ Tick = Callable[[], None]
 
 @dataclass(frozen=True)
 class Scale:
-    """How much of everything is run.
-
-    Attributes
-    ----------
-    scenes, frames_per_scene : int
-        Frames 1 s apart, for experiments that judge frames one by one.
-    sequences, sequence_frames : int
-        At 5 Hz, for experiments with memory.
-    repeats : int
-        Runs of whatever draws at random on the same frames.
-    oracle_runs : int
-        Simulated frames of a perfect oracle.
-    """
+    """How much of everything is run."""
 
     scenes: int
     frames_per_scene: int
+    """Frames 1 s apart, for experiments that judge frames one by one."""
     sequences: int
     sequence_frames: int
+    """At 5 Hz, for experiments with memory."""
     repeats: int
+    """Runs of whatever draws at random on the same frames."""
     oracle_runs: int
+    """Simulated frames of a perfect oracle."""
 
 
 FULL = Scale(scenes=40, frames_per_scene=5, sequences=10, sequence_frames=25, repeats=10, oracle_runs=4000)
@@ -49,30 +41,19 @@ QUICK = Scale(scenes=6, frames_per_scene=2, sequences=2, sequence_frames=12, rep
 
 @dataclass
 class Context:
-    """What an experiment works with.
-
-    Attributes
-    ----------
-    scale : Scale
-    seed : int
-    out : Path
-        Where pictures go.
-    detector : Detector
-    hardened : Detector or None
-        The same after adversarial training.
-    data : SceneSource
-        Of scenes with `TEAM_SIZE` teammates.
-    progress : callable
-        Given a label and a number of steps, returns what to call after each.
-    """
+    """What an experiment works with."""
 
     scale: Scale
     seed: int
     out: Path
+    """Where pictures go."""
     detector: Detector
     hardened: Detector | None
+    """The same after adversarial training."""
     data: SceneSource
+    """Of scenes with `TEAM_SIZE` teammates."""
     progress: Callable[[str, int], Tick]
+    """Given a label and a number of steps, returns what to call after each."""
     _frames: dict[tuple[str, int, int], list[DecodedOnce]] = field(default_factory=dict)
 
     def scenes(self, count: int, frames: int = 1) -> list[Scene]:
