@@ -20,9 +20,12 @@ _DEFAULTS = Recipe()
 
 
 def run(
+    context: typer.Context,
     out: Annotated[
         Path,
-        typer.Option(help="The file to write; NAME.calibration.json beside NAME.safetensors is found there."),
+        typer.Option(
+            metavar="FILE", help="The file to write; NAME.calibration.json beside NAME.safetensors is found there."
+        ),
     ],
     detector: DetectorName = DEFAULT_DETECTOR,
     data: DataName = DEFAULT_DATA,
@@ -61,7 +64,7 @@ def run(
         )
         with progress(console) as bar:
             task = bar.add_task("frames", total=recipe.frames_per_level * len(recipe.pose_errors_m))
-            calibration, reliability = calibrate(chosen, recipe, _command(recipe, detector), lambda: bar.advance(task))
+            calibration, reliability = calibrate(chosen, recipe, command(context), lambda: bar.advance(task))
         calibration.write(out)
     except (OSError, ValueError) as error:
         console.print(f"[red]{error}[/red]")
@@ -69,22 +72,6 @@ def run(
     for error_m, bins in reliability.items():
         _print(console, error_m, bins)
     console.print(f"{out}: {calibration.detector}, weights {calibration.weights_digest:.12}...")
-
-
-def _command(recipe: Recipe, detector: str) -> str:
-    """The command that makes this calibration."""
-    given = {
-        "--detector": detector if detector != DEFAULT_DETECTOR else None,
-        "--data": recipe.data if recipe.data != DEFAULT_DATA else None,
-        "--attack": recipe.attacks,
-        "--attackers": recipe.attackers,
-        "--pose-error": recipe.pose_errors_m,
-        "--scenes": recipe.scenes,
-        "--check-scenes": recipe.check_scenes,
-        "--stretches": recipe.stretches_per_scene,
-        "--seed": recipe.seed,
-    }
-    return command("calibrate --out FILE", given)
 
 
 def _print(console: Console, pose_error_m: float, bins: list[ReliabilityBin]) -> None:

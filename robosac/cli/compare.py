@@ -35,7 +35,10 @@ from robosac.scenes import DEFAULT_DATA, SceneError
 
 
 def run(
-    out: Annotated[Path, typer.Option(help="Folder for comparison.md, comparison.csv and two pictures.")],
+    context: typer.Context,
+    out: Annotated[
+        Path, typer.Option(metavar="DIR", help="Folder for comparison.md, comparison.csv and two pictures.")
+    ],
     quick: Annotated[bool, typer.Option(help="Fewer attacks and frames, in a few minutes.")] = False,
     only: Annotated[list[str] | None, typer.Option(help=f"One of {', '.join(DEFENSES)}; may be repeated.")] = None,
     defense: Annotated[
@@ -49,7 +52,7 @@ def run(
     scenes: Annotated[int | None, typer.Option(min=1, help="Test sequences.")] = None,
     frames: Annotated[int | None, typer.Option(min=EARLY + 1, help="Of each sequence.")] = None,
     recordings: Annotated[
-        Path | None, typer.Option(help="Folder in which recorded frames are kept, to be used again.")
+        Path | None, typer.Option(metavar="DIR", help="Folder in which recorded frames are kept, to be used again.")
     ] = None,
     pose_error: Annotated[
         float, typer.Option(min=0.0, help="Standard deviation of the teammates' positions, metres.")
@@ -81,22 +84,7 @@ def run(
     with blaming("--data", SceneError), progress(console) as bar:
         task = bar.add_task("frames", total=len(extent.settings) * extent.scenes * extent.frames)
         rows = compare_defenses(plan, jobs, lambda: bar.advance(task))
-    given = {
-        "--seed": seed,
-        "--only": only,
-        "--defense": defense,
-        "--quick": quick,
-        "--setting": setting,
-        "--scenes": scenes,
-        "--frames": frames,
-        "--recordings": None if recordings is None else "DIR",
-        "--pose-error": pose_error or None,
-        "--live": live,
-        "--jobs": jobs if jobs > 1 else None,
-        "--detector": detector if detector != DEFAULT_DETECTOR else None,
-        "--data": data if data != DEFAULT_DATA else None,
-    }
-    path = write_comparison(rows, plan, out, command("compare --out DIR", given))
+    path = write_comparison(rows, plan, out, command(context))
     console.print(f"{path}: {len(rows)} rows in {(time.monotonic() - started) / 60:.1f} minutes")
 
 

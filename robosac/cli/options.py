@@ -3,8 +3,7 @@
 from __future__ import annotations
 
 import shlex
-from collections.abc import Mapping
-from typing import Annotated
+from typing import Annotated, Any
 
 import typer
 from rich.console import Console
@@ -56,13 +55,15 @@ def progress(console: Console, *more: ProgressColumn) -> Progress:
     return Progress(*columns, TimeElapsedColumn(), TimeRemainingColumn(), *more, console=console)
 
 
-def command(name: str, given: Mapping[str, object]) -> str:
-    """The command with these options: lists are repeated, True is a flag, None and False are left out."""
-    words = ["robosac", *name.split()]
-    for option, value in given.items():
+def command(context: typer.Context) -> str:
+    """The command that runs, without options that have their defaults; a metavar stands for a value that has one."""
+    words = ["robosac", str(context.info_name)]
+    options: list[Any] = context.command.params
+    for option in options:
+        value = context.params[option.name]
         if value is True:
-            words.append(option)
-        elif value is not None and value is not False:
+            words.append(option.opts[0])
+        elif value not in (option.default, None, [], ()):
             for each in value if isinstance(value, list | tuple) else [value]:
-                words += [option, f"{each:g}" if isinstance(each, float) else str(each)]
+                words += [option.opts[0], option.metavar or (f"{each:g}" if isinstance(each, float) else str(each))]
     return shlex.join(words)

@@ -22,7 +22,8 @@ from robosac.scenes import DEFAULT_DATA, SceneError
 
 
 def run(
-    out: Annotated[Path, typer.Option(help="Folder for report.md and the CSV and PNG files beside it.")],
+    context: typer.Context,
+    out: Annotated[Path, typer.Option(metavar="DIR", help="Folder for report.md and the CSV and PNG files beside it.")],
     only: Annotated[list[str] | None, typer.Option(help=f"One of {', '.join(EXPERIMENTS)}; may be repeated.")] = None,
     quick: Annotated[bool, typer.Option(help="A small sample of everything, in a few minutes.")] = False,
     seed: Seed = 0,
@@ -53,19 +54,12 @@ def run(
 
             return tick
 
-        context = Context(QUICK if quick else FULL, seed, out, chosen, hardened, source, steps)
+        work = Context(QUICK if quick else FULL, seed, out, chosen, hardened, source, steps)
         for name in names:
             bar.update(overall, description=name)
-            sections.append(EXPERIMENTS[name](context))
+            sections.append(EXPERIMENTS[name](work))
             bar.advance(overall)
     minutes = (time.monotonic() - started) / 60
-    given = {
-        "--seed": seed,
-        "--only": only,
-        "--quick": quick,
-        "--detector": detector if detector != DEFAULT_DETECTOR else None,
-        "--data": data if data != DEFAULT_DATA else None,
-    }
-    head = HEAD.format(command=command("reproduce --out DIR", given), minutes=max(minutes, 1.0))
+    head = HEAD.format(command=command(context), minutes=max(minutes, 1.0))
     path = write_report(out / "report.md", head, sections)
     console.print(f"{path}: {len(sections)} experiments in {minutes:.1f} minutes")
