@@ -19,7 +19,7 @@ from robosac.scenes import DEFAULT_DATA
 _DEFAULTS = Recipe()
 
 
-def run(
+def run(  # the options of a command line
     context: typer.Context,
     out: Annotated[
         Path,

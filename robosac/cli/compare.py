@@ -34,7 +34,7 @@ from robosac.figures import need_figures
 from robosac.scenes import DEFAULT_DATA, SceneError
 
 
-def run(
+def run(  # the options of a command line
     context: typer.Context,
     out: Annotated[
         Path, typer.Option(metavar="DIR", help="Folder for comparison.md, comparison.csv and two pictures.")

@@ -25,7 +25,7 @@ from robosac.scenes import DEFAULT_DATA, SceneError
 DEFAULT_SCENES = 40
 
 
-def run(
+def run(  # the options of a command line
     scenes: Annotated[int | None, typer.Option(min=1, help="Test scenes; 40, or all if there are fewer.")] = None,
     frames: Annotated[int, typer.Option(min=1, help="Frames of each, 1 s apart.")] = 5,
     attackers: Annotated[int, typer.Option(min=0, help="Attackers among the teammates.")] = 1,

@@ -21,7 +21,7 @@ from robosac.figures import need_figures
 from robosac.scenes import DEFAULT_DATA, SceneError
 
 
-def run(
+def run(  # the options of a command line
     context: typer.Context,
     out: Annotated[Path, typer.Option(metavar="DIR", help="Folder for report.md and the CSV and PNG files beside it.")],
     only: Annotated[list[str] | None, typer.Option(help=f"One of {', '.join(EXPERIMENTS)}; may be repeated.")] = None,

@@ -180,7 +180,7 @@ def under_attack(
     return EvaluationFrame(detector, ego, benign, {**benign, **sent}, frozenset(sent), sensed.truth)
 
 
-def evaluation_frames(
+def evaluation_frames(  # who senses where, and what is drawn: callers vary all of it
     detector: Detector,
     scenes: Iterable[Scene],
     frames_per_scene: int,

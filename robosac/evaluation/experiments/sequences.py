@@ -5,6 +5,7 @@ from __future__ import annotations
 import time
 from dataclasses import dataclass, field
 from itertools import combinations
+from typing import Any
 
 import numpy as np
 
@@ -75,32 +76,7 @@ def teams(context: Context) -> Section:
         "temporal consistency": SampleConsensus(**tested, reference=Reference.PREVIOUS),
     }
     runs = _play(context, defenses)
-    baseline = runs["undefended"].steady_seconds
-    theirs = {
-        "dynamic team": paper.DYNAMIC,
-        "static team, no re-check": paper.STATIC,
-        "temporal consistency": paper.TEMPORAL,
-    }
-    rows = []
-    for name, run in runs.items():
-        paper_ap50, paper_ap70, _, paper_fps = theirs.get(name, (None, None, None, None))
-        ap50, ap70 = precision(iter(run.answers))
-        rows.append(
-            {
-                "session": name,
-                "AP50 %, paper": paper_ap50,
-                "AP70 %, paper": paper_ap70,
-                "AP50": round(ap50, 3),
-                "AP70": round(ap70, 3),
-                "steps": round(float(np.mean(run.steps)), 2),
-                "answered together": round(float(np.mean(run.accepted)), 3),
-                "attacker in answer": round(float(np.mean(run.infiltrated)), 3),
-                "FPS, paper": paper_fps,
-                "FPS, measured": round(len(run.seconds) / sum(run.seconds), 1),
-                "median cost": round(float(np.median(run.steady_seconds) / np.median(baseline)), 3),
-                "mean cost": round(float(np.mean(run.steady_seconds) / np.mean(baseline)), 3),
-            }
-        )
+    rows = [_row(name, run, runs["undefended"].steady_seconds) for name, run in runs.items()]
     ego, previous = _false_alarms(context)
     alarms = [("ego", round(ego, 4)), ("previous answer", round(previous, 4))]
     return Section(
@@ -118,6 +94,30 @@ def teams(context: Context) -> Section:
             ),
         ],
     )
+
+
+def _row(name: str, run: _Run, baseline: list[float]) -> dict[str, Any]:
+    theirs = {
+        "dynamic team": paper.DYNAMIC,
+        "static team, no re-check": paper.STATIC,
+        "temporal consistency": paper.TEMPORAL,
+    }
+    paper_ap50, paper_ap70, _, paper_fps = theirs.get(name, (None, None, None, None))
+    ap50, ap70 = precision(iter(run.answers))
+    return {
+        "session": name,
+        "AP50 %, paper": paper_ap50,
+        "AP70 %, paper": paper_ap70,
+        "AP50": round(ap50, 3),
+        "AP70": round(ap70, 3),
+        "steps": round(float(np.mean(run.steps)), 2),
+        "answered together": round(float(np.mean(run.accepted)), 3),
+        "attacker in answer": round(float(np.mean(run.infiltrated)), 3),
+        "FPS, paper": paper_fps,
+        "FPS, measured": round(len(run.seconds) / sum(run.seconds), 1),
+        "median cost": round(float(np.median(run.steady_seconds) / np.median(baseline)), 3),
+        "mean cost": round(float(np.mean(run.steady_seconds) / np.mean(baseline)), 3),
+    }
 
 
 def _false_alarms(context: Context) -> tuple[float, float]:
