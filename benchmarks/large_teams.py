@@ -19,7 +19,7 @@ import typer
 
 from robosac import attacks
 from robosac.answers import Verdict
-from robosac.calibration import calibration_of
+from robosac.calibrated import calibration_of
 from robosac.defenses import Outcome
 from robosac.defenses.group_testing import GroupTestingSettings
 from robosac.defenses.group_testing import model as likelihoods

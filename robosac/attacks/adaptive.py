@@ -55,8 +55,6 @@ class Invent(BIM):
 
     Parameters
     ----------
-    epsilon, steps, step_size : float
-        As in `IterativeAttack`.
     objects : int
         How many, at most.
     """
@@ -162,8 +160,6 @@ class Shift(BIM):
 
     Parameters
     ----------
-    epsilon, steps, step_size : float
-        As in `IterativeAttack`.
     distance : float
         Metres; under one.
     """

@@ -94,8 +94,6 @@ class IterativeAttack(Attack):
 
     Parameters
     ----------
-    epsilon : float
-        L-infinity bound on the perturbation, in units of the message.
     steps : int
         At least 1.
     step_size : float

@@ -21,8 +21,6 @@ class CarliniWagner(IterativeAttack):
 
     Parameters
     ----------
-    epsilon : float
-        L-infinity bound on the perturbation, in units of the message.
     steps : int
         30 in the paper's experiments.
     step_size : float

@@ -15,7 +15,7 @@ from robosac import wire
 from robosac.answers import TestedHypothesis
 from robosac.audit.events import FrameAnswered, RecordError, SessionOpened, TeamChanged, event_on
 from robosac.budget import DomainError
-from robosac.calibration import calibration_digest, calibration_of
+from robosac.calibrated import calibration_digest, calibration_of
 from robosac.deadline import Recorded
 from robosac.defenses import Defense, Kinds, Outcome, State, build, read_settings
 from robosac.detectors import Message, Preparer

@@ -119,7 +119,12 @@ def _change_density(verdicts: Verdicts, kind: str | None, missing: list[str]) ->
     density = (worth * smooth / np.maximum(total, _FEW) + PSEUDO_COUNT * uniform) / (worth + PSEUDO_COUNT)
     if kind is not None:
         density = (1 - UNIFORM_SHARE) * density + UNIFORM_SHARE * uniform
-    normal: FloatArray = density / density.sum(axis=-1, keepdims=True)
+    return _normal(density)
+
+
+def _normal(rows: FloatArray) -> FloatArray:
+    """Rows (..., n) that each sum to 1."""
+    normal: FloatArray = rows / rows.sum(axis=-1, keepdims=True)
     return normal
 
 
@@ -127,9 +132,7 @@ def _change_ratio_bounded(clean: FloatArray, attacked: FloatArray) -> FloatArray
     ratio = np.clip(np.log(attacked / clean), -LARGEST_CHANGE_RATIO, LARGEST_CHANGE_RATIO)
     for index in np.ndindex(ratio.shape[:2]):
         ratio[index] = isotonic_regression(ratio[index], weights=(clean[index] + attacked[index]) / 2).x
-    bounded = clean * np.exp(ratio)
-    normal: FloatArray = bounded / bounded.sum(axis=-1, keepdims=True)
-    return normal
+    return _normal(clean * np.exp(ratio))
 
 
 def _density(counts: FloatArray, kind: str | None) -> FloatArray:
@@ -166,9 +169,7 @@ def _bounded(clean: FloatArray, attacked: FloatArray) -> FloatArray:
     for row, size in np.ndindex(ratio.shape[:2]):
         if SIZES[size][0] == 0:
             ratio[row, size] = _rising(ratio[row, size], weight[row, size])
-    bounded = clean * np.exp(ratio)
-    normal: FloatArray = bounded / bounded.sum(axis=-1, keepdims=True)
-    return normal
+    return _normal(clean * np.exp(ratio))
 
 
 def _rising(values: FloatArray, weights: FloatArray) -> FloatArray:

@@ -86,15 +86,7 @@ class EmbeddedDetector(MapFusionDetector):
         )
 
     def encode(self, points: FloatArray, pose: FloatArray) -> Message:
-        """The message for a LiDAR scan.
-
-        Parameters
-        ----------
-        points : (P, 3) ndarray
-            Returns in the sensor's frame, metres.
-        pose : (4, 4) ndarray
-            world_from_sensor; its z is the sensor's height above ground.
-        """
+        """As `robosac.detectors.base.Encoder.encode`; the z of the pose is the sensor's height above ground, metres."""
         grid = torch.from_numpy(occupancy(points, float(pose[2, 3]))).float()
         with torch.inference_mode():
             features = self._network.encode(grid[None])[0] * self._gain

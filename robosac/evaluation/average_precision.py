@@ -8,9 +8,7 @@ from typing import Any
 
 import numpy as np
 
-from robosac.boxes import FloatArray, pairwise_iou
-
-IntArray = np.ndarray[Any, np.dtype[np.int64]]
+from robosac.boxes import FloatArray, IntArray, pairwise_iou
 
 
 @dataclass(frozen=True)

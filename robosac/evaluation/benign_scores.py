@@ -17,14 +17,7 @@ def single_teammate_indices(
     """Jaccard indices of the ego fused with one honest teammate against the ego alone, ascending.
 
     The first frame of every scene counts, and every teammate in it; the scenes' vehicles take turns as ego. Fusions
-    without evidence are left out.
-
-    Parameters
-    ----------
-    detector : Detector
-    scenes : sequence of Scene
-    tick : callable
-        Called after each scene.
+    without evidence are left out. ``tick`` is called after each scene.
     """
     indices = []
     for turn, scene in enumerate(scenes):

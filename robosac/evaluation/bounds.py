@@ -89,16 +89,12 @@ def evaluate_bounds(
     sampling: Sampling = Sampling(),
     tick: Callable[[], None] = lambda: None,
 ) -> BoundsReport:
-    """Compute the table of bounds.
+    """Compute the table of bounds. ``tick`` is called after each frame.
 
     Parameters
     ----------
     frames : iterable of EvaluationFrame or None
         From `robosac.evaluation.frames`, made with this attack and number of attackers; None is skipped.
-    attack : Attack or Campaign
-    sampling : Sampling
-    tick : callable
-        Called after each frame.
 
     Raises
     ------

@@ -8,9 +8,9 @@ from functools import cached_property
 
 import numpy as np
 
-from robosac.boxes import FloatArray, from_world, pose_matrix
+from robosac.boxes import FloatArray, IntArray, from_world, pose_matrix
 from robosac.scenes.base import Split, View
-from robosac.scenes.lidar import IntArray, Lidar
+from robosac.scenes.lidar import Lidar
 from robosac.scenes.splits import TEST_SEEDS, VALIDATION_SEEDS
 from robosac.scenes.world import CAR_SENSOR_HEIGHT_M, RSU_HEIGHT_M, Traffic, build_traffic
 

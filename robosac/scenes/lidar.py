@@ -11,11 +11,11 @@ from dataclasses import dataclass
 
 import numpy as np
 
-from robosac.boxes import FloatArray
+from robosac.boxes import FloatArray, IntArray
 
 _PARALLEL = 1e-12
 
-IntArray = np.ndarray[tuple[int, ...], np.dtype[np.int64]]
+Float32Array = np.ndarray[tuple[int, ...], np.dtype[np.float32]]
 
 
 @dataclass(frozen=True)
@@ -88,9 +88,7 @@ class Lidar:
 
 def _crossings(
     obstacles: FloatArray, x: float, y: float, azimuth: FloatArray
-) -> tuple[
-    IntArray, IntArray, np.ndarray[tuple[int], np.dtype[np.float32]], np.ndarray[tuple[int], np.dtype[np.float32]]
-]:
+) -> tuple[IntArray, IntArray, Float32Array, Float32Array]:
     """Pairs of ray and box that meet seen from above, sorted by ray, with the ranges of entry and exit (slab
     method).
     """
@@ -110,18 +108,14 @@ def _crossings(
     return ray, box, enter[ray, box], leave[ray, box]
 
 
-def _not_zero(direction: FloatArray) -> np.ndarray[tuple[int, int], np.dtype[np.float32]]:
+def _not_zero(direction: FloatArray) -> Float32Array:
     """Directions with those along a side of the box turned a little, so that their reciprocal is a number."""
     return np.where(np.abs(direction) < _PARALLEL, _PARALLEL, direction).astype(np.float32)
 
 
 def _beam_ranges(
-    enter: np.ndarray[tuple[int], np.dtype[np.float32]],
-    leave: np.ndarray[tuple[int], np.dtype[np.float32]],
-    height: np.ndarray[tuple[int], np.dtype[np.float32]],
-    z: float,
-    slope: np.ndarray[tuple[int], np.dtype[np.float32]],
-) -> np.ndarray[tuple[int, int], np.dtype[np.float32]]:
+    enter: Float32Array, leave: Float32Array, height: Float32Array, z: float, slope: Float32Array
+) -> Float32Array:
     """Horizontal range at which each beam meets the box of its pair: at the side, on the roof, or never (inf).
 
     A beam that is below the ground there has met the ground nearer, which the caller sees.

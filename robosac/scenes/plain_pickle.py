@@ -30,8 +30,7 @@ class UnsafePickle(ValueError):
 class PlainArray:
     """What stands for an array while its pickle is read; `read` makes the array."""
 
-    def __init__(self, subtype: object = None, shape: object = None, kind: object = None) -> None:
-        del subtype, shape, kind  # of an empty array, which the state then replaces
+    def __init__(self, *_: object) -> None:  # of an empty array, which the state then replaces
         self._state: Any = None
 
     def __setstate__(self, state: Any) -> None:
@@ -65,8 +64,7 @@ class PlainArray:
 class PlainDtype:
     """What stands for a dtype while a pickle is read."""
 
-    def __init__(self, name: object = "", align: object = False, copy: object = False) -> None:
-        del align, copy
+    def __init__(self, name: object = "", *_: object) -> None:
         self.name = str(name)
         self._order = "="
 

@@ -10,7 +10,7 @@ are rotated by a random angle, so that nothing in the frame is aligned with the 
 
 from __future__ import annotations
 
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 
 import numpy as np
 
@@ -117,7 +117,7 @@ def _draw(rng: np.random.Generator, car_agents: int) -> Traffic | None:
         rsu_pose=_rsu(rng, world_yaw),
     )
     agents = _choose_agents(rng, traffic, ~truck, car_agents)
-    return None if agents is None else Traffic(**{**traffic.__dict__, "agent_vehicles": agents})
+    return None if agents is None else replace(traffic, agent_vehicles=agents)
 
 
 def _flowing_lane(rng: np.random.Generator) -> list[tuple[float, float]]:

@@ -113,15 +113,7 @@ class V2XSimDetector(MapFusionDetector):
         )
 
     def encode(self, points: FloatArray, pose: FloatArray) -> Message:
-        """The message for a LiDAR scan, of an ego; `robosac.detectors.base.for_role` makes a teammate's of it.
-
-        Parameters
-        ----------
-        points : (P, 3) ndarray
-            Returns in the sensor's frame, metres; those 3 m below to 2 m above the sensor count.
-        pose : (4, 4) ndarray
-            world_from_sensor.
-        """
+        """As `robosac.detectors.base.Encoder.encode`; returns from 3 m below to 2 m above the sensor count."""
         return self.encode_grid(occupancy(points), pose)
 
     def encode_grid(self, grid: BoolArray, pose: FloatArray) -> Message:

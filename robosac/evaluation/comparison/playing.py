@@ -111,14 +111,7 @@ class Played:
 
 
 def play_scene(plan: Plan, scene: Scene, tick: Callable[[], None] = lambda: None) -> dict[tuple[Setting, str], Played]:
-    """Every defence in every setting, in one scene.
-
-    Parameters
-    ----------
-    plan : Plan
-    scene : Scene
-    tick : callable
-        Called after each frame of each setting.
+    """Every defence in every setting, in one scene. ``tick`` is called after each frame of each setting.
 
     Raises
     ------

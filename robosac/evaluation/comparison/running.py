@@ -19,7 +19,7 @@ PlayedScene = dict[tuple[Setting, str], Played]
 
 
 def compare_defenses(plan: Plan, jobs: int = 1, tick: Callable[[], None] = lambda: None) -> list[Row]:
-    """Every defence in every setting.
+    """Every defence in every setting. ``tick`` is called after each frame of each setting.
 
     The rows of a defence depend neither on the other defences, nor on the other settings, nor on the number of jobs.
 
@@ -28,8 +28,6 @@ def compare_defenses(plan: Plan, jobs: int = 1, tick: Callable[[], None] = lambd
     plan : Plan
     jobs : int
         Processes that share the scenes; with more than one, detector and defences must be such that can be pickled.
-    tick : callable
-        Called after each frame of each setting.
 
     Returns
     -------

@@ -136,7 +136,7 @@ def trade_off(context: Context) -> Section:
         points = [(n, *_score(context, frames, _sampling(n, s))) for n in (1, 2, 3, 5, 7, 10)]
         rows += [(s, n, *_rounded((1 + steps, ap50, ap70))) for n, ap50, ap70, steps, _ in points]
         axes.plot([1 + point[3] for point in points], [point[1] for point in points], marker="o", label=f"s = {s}")
-    axes.axhline(_alone(frames)[0], color="grey", linestyle="--", label="ego only")
+    axes.axhline(precision((r.detect(), r.truth) for r in frames)[0], color="grey", linestyle="--", label="ego only")
     axes.axhline(_undefended(frames)[0], color="#b2182b", linestyle=":", label="no defence")
     axes.set(xlabel="decoder passes a frame (the ego's own included)", ylabel="AP at IoU 0.5")
     axes.legend(fontsize="small")
@@ -186,10 +186,6 @@ def _score(context: Context, frames: list[DecodedOnce], defense: Defense) -> tup
 
 def _undefended(frames: Iterable[DecodedOnce]) -> tuple[float, float]:
     return precision((r.detect(r.team), r.truth) for r in frames)
-
-
-def _alone(frames: Iterable[DecodedOnce]) -> tuple[float, float]:
-    return precision((r.detect(), r.truth) for r in frames)
 
 
 def _error_rates(frames: list[DecodedOnce], threshold: float) -> tuple[float, ...]:

@@ -8,7 +8,8 @@ from typer.testing import CliRunner
 
 from robosac.attacks import GaussianNoise
 from robosac.boxes import pose_matrix
-from robosac.calibration import Recipe, calibration_of
+from robosac.calibrated import calibration_of
+from robosac.calibration import Recipe
 from robosac.calibration.making import check
 from robosac.calibration.verdicts import Trial, Verdicts, complementary, validation_stretches
 from robosac.cli import app
