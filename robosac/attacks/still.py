@@ -32,7 +32,7 @@ class HoldingStill(IterativeAttack):
     steps: int = 30
     step_size: float = 0.04
 
-    everything: ClassVar[bool]
+    everything: ClassVar[bool] = False
     """Whether boxes that only teammates see should stay, too."""
 
     def aim(self, surface: AttackSurface, attackers: Collection[str]) -> Aim:
@@ -59,7 +59,6 @@ class EraseStill(HoldingStill, Erase):
     """`Erase`, while what the ego sees stays where it is."""
 
     name: ClassVar[str] = "erase-still"
-    everything: ClassVar[bool] = False
 
 
 @dataclass(frozen=True)
@@ -75,4 +74,3 @@ class ShiftStill(HoldingStill, Shift):
     """`Shift`, while what the ego sees stays where it is."""
 
     name: ClassVar[str] = "shift-still"
-    everything: ClassVar[bool] = False

@@ -11,10 +11,9 @@ import numpy as np
 from robosac import attacks
 from robosac.attacks import Attack
 from robosac.calibration.fit import TooFewVerdicts, fit
-from robosac.calibration.verdicts import STRETCH, STRETCH_STRIDE, Trial, collect, validation_stretches
+from robosac.calibration.verdicts import STRETCH, STRETCH_STRIDE, Stretch, Trial, collect, validation_stretches
 from robosac.defenses.group_testing import Calibration, EvidenceModel, GroupTesting
 from robosac.detectors import Detector
-from robosac.evaluation.frames import DecodedOnce
 from robosac.evaluation.playing import play
 from robosac.scenes import DEFAULT_DATA, SOURCES, Scene, first_scenes
 
@@ -109,9 +108,7 @@ def calibrate(
     for number, error in enumerate(sorted(recipe.pose_errors_m)):
         trial = Trial(chosen, recipe.attackers, error, recipe.stretches_per_scene)
 
-        def stretches(
-            part: Sequence[Scene], *stream: int, trial: Trial = trial
-        ) -> Iterator[tuple[str | None, list[DecodedOnce]]]:
+        def stretches(part: Sequence[Scene], *stream: int, trial: Trial = trial) -> Iterator[Stretch]:
             rng = np.random.default_rng([recipe.seed, _STREAM, *stream])
             return validation_stretches(detector, part, trial, rng, tick)
 
@@ -140,7 +137,7 @@ def _scenes(recipe: Recipe) -> list[Scene]:
     return first_scenes(source, "validation", count, frames, max(recipe.attackers))
 
 
-def check(model: EvidenceModel, stretches: Iterable[tuple[str | None, Sequence[DecodedOnce]]]) -> list[ReliabilityBin]:
+def check(model: EvidenceModel, stretches: Iterable[Stretch]) -> list[ReliabilityBin]:
     """Suspicion after the frames of each stretch against the truth."""
     defense = GroupTesting(model)
     predicted: list[float] = []

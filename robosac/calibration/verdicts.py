@@ -23,6 +23,8 @@ STRETCH_STRIDE = 10
 """Stretches of a scene begin this many frames apart, so that they differ."""
 STRETCH = 2
 """Successive frames of a stretch."""
+Stretch = tuple[str | None, list[DecodedOnce]]
+"""A kind of attack (None: nobody attacks), and successive frames, recorded."""
 ADDED_BOXES = 1.0
 """A benign teammate is complementary if it adds so many boxes, on average, to fusions of up to two others."""
 PairKey = tuple[str | None, int, int, int]
@@ -110,14 +112,10 @@ def validation_stretches(
     trial: Trial,
     rng: np.random.Generator,
     tick: Callable[[], None] = lambda: None,
-) -> Iterator[tuple[str | None, list[DecodedOnce]]]:
+) -> Iterator[Stretch]:
     """Successive frames without an attack, then the same frames under every attack, the vehicles taking turns as ego.
 
     ``tick`` is called after each recorded frame.
-
-    Yields
-    ------
-    kind, stretch : str or None, list of DecodedOnce
     """
     some = next(iter(trial.attacks.values()))
     for turn, (scene, number) in enumerate((s, n) for s in scenes for n in range(trial.stretches_per_scene)):
@@ -139,7 +137,7 @@ def validation_stretches(
             yield kind, stretch
 
 
-def collect(stretches: Iterable[tuple[str | None, Sequence[DecodedOnce]]]) -> Verdicts:
+def collect(stretches: Iterable[Stretch]) -> Verdicts:
     """Count the verdicts of stretches."""
     verdicts = Verdicts()
     for kind, stretch in stretches:

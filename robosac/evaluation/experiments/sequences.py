@@ -5,7 +5,6 @@ from __future__ import annotations
 import time
 from dataclasses import dataclass, field
 from itertools import combinations
-from typing import Any
 
 import numpy as np
 
@@ -17,22 +16,25 @@ from robosac.evaluation.experiments import paper
 from robosac.evaluation.experiments.common import Context, precision
 from robosac.evaluation.frames import DecodedOnce
 from robosac.evaluation.report import Section, Table
+from robosac.fusion import FusionResult
 from robosac.previous import PreviousAnswer
 from robosac.session import Session
 
 STEADY_FROM = 5
 BUDGET = 7
 COLLABORATORS = 3
+PAPER = {
+    "dynamic team": paper.DYNAMIC,
+    "static team, no re-check": paper.STATIC,
+    "temporal consistency": paper.TEMPORAL,
+}
 
 
 @dataclass
 class _Run:
     """What a defence did on all sequences."""
 
-    answers: list[tuple[FloatArray, FloatArray]] = field(default_factory=list)
-    steps: list[int] = field(default_factory=list)
-    accepted: list[bool] = field(default_factory=list)
-    infiltrated: list[bool] = field(default_factory=list)
+    answers: list[tuple[DecodedOnce, FusionResult]] = field(default_factory=list)
     seconds: list[float] = field(default_factory=list)
     steady_seconds: list[float] = field(default_factory=list)
 
@@ -55,10 +57,7 @@ def _play(context: Context, defenses: dict[str, Defense]) -> dict[str, _Run]:
                     seconds = time.perf_counter() - started
                     session.remember(result)
                     run = runs[name]
-                    run.answers.append((result.boxes, recorded.truth))
-                    run.steps.append(result.sampling_steps)
-                    run.accepted.append(bool(result.accepted))
-                    run.infiltrated.append(not recorded.attackers.isdisjoint(result.accepted))
+                    run.answers.append((recorded, result))
                     run.seconds.append(seconds)
                     if index >= STEADY_FROM:
                         run.steady_seconds.append(seconds)
@@ -76,7 +75,8 @@ def teams(context: Context) -> Section:
         "temporal consistency": SampleConsensus(**tested, reference=Reference.PREVIOUS),
     }
     runs = _play(context, defenses)
-    rows = [_row(name, run, runs["undefended"].steady_seconds) for name, run in runs.items()]
+    baseline = runs["undefended"].steady_seconds
+    rows = [_line(name, run, baseline) for name, run in runs.items()]
     ego, previous = _false_alarms(context)
     alarms = [("ego", round(ego, 4)), ("previous answer", round(previous, 4))]
     return Section(
@@ -96,23 +96,19 @@ def teams(context: Context) -> Section:
     )
 
 
-def _row(name: str, run: _Run, baseline: list[float]) -> dict[str, Any]:
-    theirs = {
-        "dynamic team": paper.DYNAMIC,
-        "static team, no re-check": paper.STATIC,
-        "temporal consistency": paper.TEMPORAL,
-    }
-    paper_ap50, paper_ap70, _, paper_fps = theirs.get(name, (None, None, None, None))
-    ap50, ap70 = precision(iter(run.answers))
+def _line(name: str, run: _Run, baseline: list[float]) -> dict[str, object]:
+    paper_ap50, paper_ap70, _, paper_fps = PAPER.get(name, (None, None, None, None))
+    ap50, ap70 = precision((result.boxes, frame.truth) for frame, result in run.answers)
+    infiltrated = [not frame.attackers.isdisjoint(result.accepted) for frame, result in run.answers]
     return {
         "session": name,
         "AP50 %, paper": paper_ap50,
         "AP70 %, paper": paper_ap70,
         "AP50": round(ap50, 3),
         "AP70": round(ap70, 3),
-        "steps": round(float(np.mean(run.steps)), 2),
-        "answered together": round(float(np.mean(run.accepted)), 3),
-        "attacker in answer": round(float(np.mean(run.infiltrated)), 3),
+        "steps": round(float(np.mean([result.sampling_steps for _, result in run.answers])), 2),
+        "answered together": round(float(np.mean([bool(result.accepted) for _, result in run.answers])), 3),
+        "attacker in answer": round(float(np.mean(infiltrated)), 3),
         "FPS, paper": paper_fps,
         "FPS, measured": round(len(run.seconds) / sum(run.seconds), 1),
         "median cost": round(float(np.median(run.steady_seconds) / np.median(baseline)), 3),
