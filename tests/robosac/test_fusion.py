@@ -1,58 +1,16 @@
 import logging
-import math
-from collections.abc import Collection
 from dataclasses import replace
-from typing import Literal
 
 import numpy as np
 import pytest
 
 from robosac.answers import Distrust, Reason, Source, Verdict
 from robosac.boxes import from_world, pose_matrix
-from robosac.deadline import SAFETY, Deadline
+from robosac.deadline import SAFETY
 from robosac.defenses import Decision, Reference, Rejection, SampleConsensus, StaticTeam, Undefended, remembered
-from robosac.detectors import DetectorInfo, Message
 from robosac.fusion import fuse
 from robosac.previous import PreviousAnswer
-
-EGO = Message(pose_matrix(0, 0, 0, 0), {})
-TEAM = dict.fromkeys("abcde", EGO)
-SEEN = np.array([[10.0 * i, 5.0, 4.0, 2.0, 0.0, 0.9] for i in range(5)])
-NOISE = SEEN + [[3.0, 50.0, 0, 0, 0, 0]]
-
-
-class FakeDetector:
-    """Decodes the same boxes for every clean subset and others for one with an attacker; time passes by its clock."""
-
-    def __init__(self, attackers: Collection[str] = (), pass_s: float = 0.0, broken: str = "") -> None:
-        self.info = DetectorInfo("fake", {"ego": {}, "teammate": {}}, (-32, -32, 32, 32), 2.0, "0", 0.5)
-        self.attackers = set(attackers)
-        self.pass_s = pass_s
-        self.broken = broken
-        self.now = 0.0
-        self.decoded: list[tuple[str, ...]] = []
-
-    def clock(self) -> float:
-        return self.now
-
-    def prepare(self, ego, teammates):
-        if self.broken == "prepare" and teammates:
-            raise RuntimeError("cannot warp")
-        return self
-
-    def detect(self, teammates=()):
-        if self.broken == "detect" and teammates:
-            raise RuntimeError("cannot decode")
-        self.now += self.pass_s
-        self.decoded.append(tuple(teammates))
-        return NOISE if self.attackers & set(teammates) else SEEN
-
-
-def run(
-    detector, defense=SampleConsensus(sampling_budget=7, collaborators=3), team=TEAM, seed=0, due=math.inf, **options
-):
-    rng = np.random.default_rng(seed)
-    return fuse(detector, defense, EGO, team, rng=rng, deadline=Deadline(due, clock=detector.clock), **options)
+from tests.robosac.fusing import EGO, NOISE, SEEN, TEAM, FakeDetector, Stubborn, run
 
 
 @pytest.mark.parametrize("seed", range(10))
@@ -143,65 +101,6 @@ def test_a_slow_pass_makes_the_next_estimate_careful():
     assert (result.sampling_steps, result.deadline_met) == (1, True)
 
 
-@pytest.mark.parametrize("part", ["prepare", "detect"])
-def test_a_fault_inside_is_answered_by_the_ego_alone(part, caplog):
-    with caplog.at_level(logging.CRITICAL):
-        result = run(FakeDetector(broken=part))
-    assert result.source is Source.EGO_ONLY
-    assert "RuntimeError: cannot" in result.fault
-    assert set(result.rejected) == set(TEAM)
-    assert {r.reason for r in result.rejected.values()} == {Reason.NOT_SAMPLED}
-    np.testing.assert_array_equal(result.boxes, SEEN)
-
-
-class Liar(SampleConsensus):
-    """Answers with a subset that was never in consensus."""
-
-    def converse(self, team, state, rng):
-        yield [("a",)]
-        return Decision(("a", "b"), Source.CONSENSUS, dict.fromkeys("cde"), None, state)
-
-
-class Stubborn(SampleConsensus):
-    """Answers with what it tested, whatever the verdict."""
-
-    def converse(self, team, state, rng):
-        yield [("a", "c")]
-        return Decision(("a", "c"), Source.CONSENSUS, dict.fromkeys("bde"), None, state)
-
-
-class Muddled(SampleConsensus):
-    """Says one thing and does another."""
-
-    def __init__(self, accepted, source, rejected):
-        super().__init__()
-        object.__setattr__(self, "decision", (accepted, source, rejected))
-
-    def converse(self, team, state, rng):
-        yield [("a",)]
-        accepted, source, rejected = self.decision
-        return Decision(accepted, source, dict.fromkeys(rejected), None, state)
-
-
-@pytest.mark.parametrize(
-    ("defense", "attackers"),
-    [
-        (Liar(), ""),
-        (Stubborn(), "c"),
-        (Muddled((), Source.CONSENSUS, "abcde"), ""),
-        (Muddled(("a",), Source.EGO_ONLY, "bcde"), ""),
-        (Muddled(("a",), Source.CONSENSUS, "bcd"), ""),
-        (Muddled(("a",), Source.CONSENSUS, "abcde"), ""),
-    ],
-)
-def test_nothing_unverified_or_unexplained_reaches_the_answer(defense, attackers, caplog):
-    with caplog.at_level(logging.CRITICAL):
-        result = run(FakeDetector(attackers), defense)
-    assert (result.source, result.accepted) == (Source.EGO_ONLY, ())
-    assert "UnverifiedAnswer" in result.fault
-    assert set(result.rejected) == set(TEAM)
-
-
 def test_no_evidence_verifies_nothing(caplog):
     blind = FakeDetector()
     blind.detect = lambda teammates=(): SEEN[:0]
@@ -241,48 +140,6 @@ def test_the_dearest_pass_counts_not_the_latest():
     detector.detect = detect
     result = run(detector, due=8.0)
     assert result.sampling_steps == 2
-
-
-class Usurper(StaticTeam):
-    """Trusts whom it likes."""
-
-    def converse(self, team, state, rng):
-        yield [("a",)]
-        trusted = {"trusted": ["a", "b"], "frames_since_check": 0}
-        return Decision(("a",), Source.CONSENSUS, dict.fromkeys("bcde"), None, trusted)
-
-
-class Flatterer(StaticTeam):
-    """Answers with teammates that are not on its list."""
-
-    def converse(self, team, state, rng):
-        yield from ()
-        return Decision(("a", "b"), Source.TRUSTED, dict.fromkeys("cde"), None, state)
-
-
-@pytest.mark.parametrize("defense", [Usurper(), Flatterer()])
-def test_trust_comes_from_consensus_and_from_nothing_else(defense, caplog):
-    with caplog.at_level(logging.CRITICAL):
-        result = run(FakeDetector(), defense, state={"trusted": ["a"] if isinstance(defense, Flatterer) else []})
-    assert (result.source, result.accepted) == (Source.EGO_ONLY, ())
-    assert "UnverifiedAnswer" in result.fault
-
-
-class Hoarder(SampleConsensus):
-    """A defence of one's own, which remembers what no log can hold."""
-
-    kind: Literal["hoarder"] = "hoarder"
-
-    def converse(self, team, state, rng):
-        decision = yield from super().converse(team, state, rng)
-        return replace(decision, state={"seen": {*team}})
-
-
-def test_a_state_that_cannot_be_kept_is_a_fault_of_the_frame(caplog):
-    with caplog.at_level(logging.CRITICAL):
-        result = run(FakeDetector(), Hoarder())
-    assert (result.source, result.state) == (Source.EGO_ONLY, {})
-    assert "CanonicalizationError" in result.fault
 
 
 def test_a_trusted_frame_costs_one_pass_and_none_of_the_ego_alone():

@@ -6,7 +6,6 @@ import msgpack
 import numpy as np
 import pytest
 
-from robosac import wire
 from robosac.boxes import pose_matrix
 from robosac.defenses import SampleConsensus
 from robosac.detectors import Message
@@ -102,114 +101,6 @@ async def test_both_msgpack_types_are_taken_and_others_are_not(served, good_fram
         problem(response, 415, "unsupported-media-type")
     response = await served.post(session, "frames", good_frame(1), **{"Content-Encoding": "gzip"})
     problem(response, 415, "unsupported-encoding")
-
-
-async def test_vehicles_send_their_own_messages(served, messages):
-    session = await served.open()
-    sends = [served.teammate(session, name).send(0, messages[name]) for name in TEAM]
-    answer, *_ = await asyncio.gather(served.ego(session).ask(0, messages[EGO]), *sends)
-    assert answer.source == "consensus"
-    assert {entry.reason for entry in answer.rejected.values()} <= {"not_sampled", "dissensus"}
-    assert answer.timings_ms["gather"] >= 0
-
-
-async def test_the_ego_does_not_wait_longer_than_for_all(served, messages):
-    session = await served.open(gather_ms=10_000)
-    for name in TEAM:
-        await served.teammate(session, name).send(0, messages[name])
-    answer = await served.ego(session).ask(0, messages[EGO])
-    assert answer.timings_ms["gather"] < 1000
-
-
-async def test_missing_teammates_are_waited_for_and_then_left_out(served, messages):
-    session = await served.open(gather_ms=60)
-    for name in ("car-2", "car-3"):
-        await served.teammate(session, name).send(0, messages[name])
-    answer = await served.ego(session).ask(0, messages[EGO])
-    assert answer.timings_ms["gather"] >= 50
-    assert [answer.rejected[name].reason for name in ("car-4", "car-5", "rsu")] == ["missing"] * 3
-    assert set(answer.accepted) <= {"car-2", "car-3"}
-
-
-async def test_with_nobody_there_the_ego_answers_alone(served, messages):
-    session = await served.open(gather_ms=0)
-    answer = await served.ego(session).ask(0, messages[EGO])
-    assert (answer.source, answer.accepted, answer.sampling_steps) == ("ego_only", (), 0)
-    assert len(answer.boxes)
-    assert set(answer.rejected) == set(TEAM)
-
-
-async def test_messages_may_come_some_frames_ahead_but_only_so_many(messages):
-    async with serve(max_pending_frames=2) as served:
-        session = await served.open(gather_ms=20)
-        token = session.teammate_tokens["car-2"]
-
-        async def post(frame):
-            return await served.post(session, "messages", wire.pack_message(frame, "car-2", messages["car-2"]), token)
-
-        for frame in (0, 1, 2):
-            assert (await post(frame)).status_code == 202
-        problem(await post(3), 409, "too-far-ahead")
-        for frame in (0, 1, 2):
-            assert "car-2" in (await served.ego(session).ask(frame, messages[EGO])).accepted
-
-
-async def test_absurd_frame_numbers_do_not_lock_their_sender_out(messages):
-    async with serve(max_pending_frames=2) as served:
-        session = await served.open(gather_ms=20)
-        teammate = served.teammate(session, "car-2")
-        for frame in (10**6, 10**6 + 1, 10**6 + 2):
-            await teammate.send(frame, messages["car-2"])
-        for frame in range(4):
-            await teammate.send(frame, messages["car-2"])
-            assert "car-2" in (await served.ego(session).ask(frame, messages[EGO])).accepted
-
-
-async def test_a_refused_message_counts_for_its_own_frame(served, messages):
-    session = await served.open(gather_ms=20)
-    ego, token = served.ego(session), session.teammate_tokens["rsu"]
-    await served.teammate(session, "rsu").send(0, messages["rsu"])
-    early = msgpack.unpackb(wire.pack_message(2, "rsu", messages["rsu"]))
-    early["pose"] = [0.0] * 16
-    problem(await served.post(session, "messages", msgpack.packb(early), token), 422, "bad-pose")
-    assert (await ego.ask(0, messages[EGO])).accepted == ("rsu",)
-    assert (await ego.ask(1, messages[EGO])).rejected["rsu"].reason == "missing"
-    assert (await ego.ask(2, messages[EGO])).rejected["rsu"].reason == "malformed"
-    assert (await ego.ask(3, messages[EGO])).rejected["rsu"].reason == "missing"
-
-
-async def test_a_message_for_a_session_that_ends_meanwhile_is_not_accepted(served, messages):
-    session = await served.open()
-
-    async def body():
-        await served.ego(session).close()
-        yield wire.pack_message(0, "rsu", messages["rsu"])
-
-    problem(await served.post(session, "messages", body(), session.teammate_tokens["rsu"]), 404, "unknown-session")
-
-
-async def test_late_stale_and_second_messages_are_refused_and_named(served, messages):
-    session = await served.open(gather_ms=20)
-    ego, teammate = served.ego(session), served.teammate(session, "car-2")
-
-    def body(frame):
-        return wire.pack_message(frame, "car-2", messages["car-2"])
-
-    async def post(frame):
-        return await served.post(session, "messages", body(frame), session.teammate_tokens["car-2"])
-
-    await teammate.send(5, messages["car-2"])
-    problem(await post(5), 409, "duplicate-message")
-    assert (await ego.ask(5, messages[EGO])).accepted == ("car-2",)
-    problem(await post(5), 409, "duplicate-message")
-    assert (await ego.ask(6, messages[EGO])).rejected["car-2"].reason == "replayed"
-    problem(await post(6), 409, "stale-frame")
-    assert (await ego.ask(7, messages[EGO])).rejected["car-2"].reason == "late"
-    problem(await post(3), 409, "stale-frame")
-    assert (await ego.ask(8, messages[EGO])).rejected["car-2"].reason == "stale"
-    assert (await ego.ask(9, messages[EGO])).rejected["car-2"].reason == "missing"
-    refused = [r["reason"] for r in await ego.audit() if r["event"] == "message_refused"]
-    assert refused == ["replayed", "replayed", "late", "stale"]
 
 
 async def test_frames_of_the_ego_must_increase(served, good_frame):

@@ -1,0 +1,153 @@
+import json
+
+import pytest
+
+from robosac.answers import Source, Verdict
+from robosac.defenses import GroupTesting, Outcome
+from robosac.defenses.group_testing import OPEN, GroupTestingSettings
+from robosac.defenses.group_testing.memory import FORGETTING_FRAMES
+from tests.robosac.defenses.group_testing.conversing import SEEN, TEAM, make_model, outcome, run_frame
+from tests.robosac.defenses.group_testing.sessions import DEFENSE, named, run
+
+
+def test_what_an_older_version_remembered_is_taken_over(rng):
+    known, _ = run(DEFENSE, ["car-3"], 5, rng)
+    memory = {key: value for key, value in known.state["memory"].items() if not key.startswith("shown")}
+    later, _ = run(DEFENSE, ["car-3"], 1, rng, {**known.state, "memory": memory})
+    assert named(later) == {"car-3"}
+
+
+def test_an_ego_that_sees_nothing_falls_back_on_whom_it_trusts(rng):
+    def blind(subset, attackers):
+        return Outcome(subset, 0.0, Verdict.DISSENSUS, SEEN[:0], SEEN[:0])
+
+    first, _ = run(DEFENSE, [], 1, rng, judge=blind)
+    assert (first.source, first.accepted) == (Source.EGO_ONLY, ())
+    prior = DEFENSE.initial_state(TEAM)["suspicion"]
+    assert first.suspicion == pytest.approx(prior, abs=1e-4)
+    known, _ = run(DEFENSE, ["car-3"], 5, rng)
+    later, _ = run(DEFENSE, [], 1, rng, known.state, judge=blind)
+    assert later.source is Source.TRUSTED
+    assert set(later.accepted) == set(TEAM) - {"car-3"}
+    assert later.state["trusted"] == known.state["trusted"]
+
+
+def test_one_box_is_too_little_for_a_consensus(rng):
+    def nearly_blind(subset, attackers):
+        return Outcome(subset, 1.0, Verdict.CONSENSUS, SEEN[:1], SEEN[:1])
+
+    decision, _ = run(DEFENSE, [], 3, rng, judge=nearly_blind)
+    assert (decision.source, decision.accepted, decision.state["trusted"]) == (Source.EGO_ONLY, (), [])
+
+
+def test_without_time_whom_it_trusts_is_the_answer(rng):
+    known, _ = run(DEFENSE, ["car-3"], 5, rng)
+    hurried, tested = run(DEFENSE, ["car-3"], 1, rng, known.state, most=0)
+    assert tested == [[]]
+    assert (hurried.source, set(hurried.accepted)) == (Source.TRUSTED, set(TEAM) - {"car-3"})
+    fresh, _ = run(DEFENSE, [], 1, rng, most=0)
+    assert fresh.source is Source.EGO_ONLY
+
+
+def test_a_team_that_changes(rng):
+    known, _ = run(DEFENSE, ["car-3"], 5, rng)
+    without = DEFENSE.change_team(known.state, [name for name in TEAM if name != "car-3"])
+    assert "car-3" not in without["suspicion"]
+    assert without["named"] == []
+    back = DEFENSE.change_team(json.loads(json.dumps(without)), TEAM)
+    assert back["suspicion"]["car-3"] == pytest.approx(known.suspicion["car-3"], abs=1e-4)
+    assert "car-3" not in back["trusted"]
+    long_ago = {**without, "memory": {**without["memory"], "frame": int(20 * FORGETTING_FRAMES)}}
+    stranger = DEFENSE.change_team(without, [*without["suspicion"], "new"])["suspicion"]["new"]
+    assert DEFENSE.change_team(long_ago, TEAM)["suspicion"]["car-3"] == pytest.approx(
+        stranger, abs=5e-3
+    )  # who knows of an attack
+    assert 0.05 < stranger < 0.25
+
+
+def test_an_absent_teammate_keeps_what_is_known_of_it(rng):
+    known, _ = run(DEFENSE, ["car-3"], 5, rng)
+    present = tuple(name for name in TEAM if name != "car-3")
+    decision, tested = run(DEFENSE, [], 2, rng, known.state, team=present)
+    assert all("car-3" not in o.teammates for frame in tested for o in frame)
+    assert decision.suspicion["car-3"] > 0.9
+    assert set(decision.rejected) == set(present) - set(decision.accepted)
+
+
+def test_a_calibration_with_other_kinds_begins_again_with_the_same_team(rng):
+    known, _ = run(DEFENSE, ["car-3"], 5, rng)
+    other = GroupTesting(make_model(("pgd", OPEN)))
+    decision, _ = run(other, ["car-3"], 3, rng, known.state)
+    assert named(decision) == {"car-3"}
+    assert len(decision.state["posterior"]["weights"]) == 3
+
+
+def test_fifty_teammates(rng):
+    team = tuple(f"v{i:02d}" for i in range(50))
+    bad = {"v07", "v19", "v42"}
+    state, seen = DEFENSE.initial_state(team), set()
+    for _ in range(25):
+        decision, tested = run_frame(DEFENSE, state, team, bad, rng)
+        state = json.loads(json.dumps(decision.state))
+        assert bad.isdisjoint(decision.accepted)
+        seen |= set(decision.state["named"])
+    assert len(tested) <= 4
+    assert seen == bad
+    assert len(json.dumps(state)) < 100_000
+
+
+TWENTY = tuple(f"v{i:02d}" for i in range(20))
+
+
+def test_twenty_teammates_with_four_attackers(rng):
+    bad = {"v03", "v04", "v11", "v17"}
+    decision, tested = run(DEFENSE, bad, 9, rng, team=TWENTY)
+    assert named(decision) == bad
+    assert bad.isdisjoint(decision.accepted)
+    assert all(len(o.teammates) <= 10 for frame in tested[:3] for o in frame)
+
+
+def test_a_larger_team_tests_first_and_answers_with_what_is_clean(rng):
+    """Where that fails and the time is up, with whom it trusts; a small team answers first."""
+    known, _ = run(DEFENSE, {"v00"}, 1, rng, team=TWENTY)
+    doubtful = {name for name, p in known.suspicion.items() if p > 0.1}
+    assert len(doubtful) > 4
+    for bad in (set(), doubtful):
+        decision, tested = run(DEFENSE, bad, 1, rng, known.state, team=TWENTY, most=1)
+        (subset,) = [set(o.teammates) for o in tested[0]]
+        assert subset & doubtful
+        assert subset - doubtful <= set(known.state["trusted"])
+        assert decision.source is (Source.TRUSTED if bad else Source.CONSENSUS)
+        assert set(decision.accepted) == (set(known.state["trusted"]) if bad else subset)
+    small, _ = run(DEFENSE, ["car-3"], 1, rng)
+    _, tested = run(DEFENSE, ["car-3"], 1, rng, small.state, most=1)
+    assert set(tested[0][0].teammates) <= set(small.state["trusted"])
+
+
+@pytest.mark.parametrize(
+    "settings",
+    [
+        {"attack_prior": 0.0},
+        {"attacker_prior": 1.0},
+        {"hijack": 0.6},
+        {"naming_bound": 1.0},
+        {"naming_bound": 0.4},
+        {"first_budget": 0},
+        {"budget": 0},
+        {"consensus_threshold": 0.0},
+    ],
+)
+def test_settings_out_of_range(settings):
+    with pytest.raises(ValueError, match=next(iter(settings))):
+        GroupTestingSettings(**settings)
+
+
+def test_outcomes_without_boxes_tell_nothing(rng):
+    def bare(subset, attackers):
+        full = outcome(subset, attackers)
+        return Outcome(full.teammates, full.jaccard_index, full.verdict, None, SEEN)
+
+    before = DEFENSE.initial_state(TEAM)["suspicion"]
+    decision, tested = run_frame(DEFENSE, DEFENSE.initial_state(TEAM), TEAM, ["car-3"], rng, judge=bare)
+    assert tested
+    assert decision.suspicion == pytest.approx(before, abs=1e-6)

@@ -1,0 +1,103 @@
+import logging
+from dataclasses import replace
+from typing import Literal
+
+import numpy as np
+import pytest
+
+from robosac.answers import Reason, Source
+from robosac.defenses import Decision, SampleConsensus, StaticTeam
+from tests.robosac.fusing import SEEN, TEAM, FakeDetector, Stubborn, run
+
+
+@pytest.mark.parametrize("part", ["prepare", "detect"])
+def test_a_fault_inside_is_answered_by_the_ego_alone(part, caplog):
+    with caplog.at_level(logging.CRITICAL):
+        result = run(FakeDetector(broken=part))
+    assert result.source is Source.EGO_ONLY
+    assert "RuntimeError: cannot" in result.fault
+    assert set(result.rejected) == set(TEAM)
+    assert {r.reason for r in result.rejected.values()} == {Reason.NOT_SAMPLED}
+    np.testing.assert_array_equal(result.boxes, SEEN)
+
+
+class Liar(SampleConsensus):
+    """Answers with a subset that was never in consensus."""
+
+    def converse(self, team, state, rng):
+        yield [("a",)]
+        return Decision(("a", "b"), Source.CONSENSUS, dict.fromkeys("cde"), None, state)
+
+
+class Muddled(SampleConsensus):
+    """Says one thing and does another."""
+
+    def __init__(self, accepted, source, rejected):
+        super().__init__()
+        object.__setattr__(self, "decision", (accepted, source, rejected))
+
+    def converse(self, team, state, rng):
+        yield [("a",)]
+        accepted, source, rejected = self.decision
+        return Decision(accepted, source, dict.fromkeys(rejected), None, state)
+
+
+@pytest.mark.parametrize(
+    ("defense", "attackers"),
+    [
+        (Liar(), ""),
+        (Stubborn(), "c"),
+        (Muddled((), Source.CONSENSUS, "abcde"), ""),
+        (Muddled(("a",), Source.EGO_ONLY, "bcde"), ""),
+        (Muddled(("a",), Source.CONSENSUS, "bcd"), ""),
+        (Muddled(("a",), Source.CONSENSUS, "abcde"), ""),
+    ],
+)
+def test_nothing_unverified_or_unexplained_reaches_the_answer(defense, attackers, caplog):
+    with caplog.at_level(logging.CRITICAL):
+        result = run(FakeDetector(attackers), defense)
+    assert (result.source, result.accepted) == (Source.EGO_ONLY, ())
+    assert "UnverifiedAnswer" in result.fault
+    assert set(result.rejected) == set(TEAM)
+
+
+class Usurper(StaticTeam):
+    """Trusts whom it likes."""
+
+    def converse(self, team, state, rng):
+        yield [("a",)]
+        trusted = {"trusted": ["a", "b"], "frames_since_check": 0}
+        return Decision(("a",), Source.CONSENSUS, dict.fromkeys("bcde"), None, trusted)
+
+
+class Flatterer(StaticTeam):
+    """Answers with teammates that are not on its list."""
+
+    def converse(self, team, state, rng):
+        yield from ()
+        return Decision(("a", "b"), Source.TRUSTED, dict.fromkeys("cde"), None, state)
+
+
+@pytest.mark.parametrize("defense", [Usurper(), Flatterer()])
+def test_trust_comes_from_consensus_and_from_nothing_else(defense, caplog):
+    with caplog.at_level(logging.CRITICAL):
+        result = run(FakeDetector(), defense, state={"trusted": ["a"] if isinstance(defense, Flatterer) else []})
+    assert (result.source, result.accepted) == (Source.EGO_ONLY, ())
+    assert "UnverifiedAnswer" in result.fault
+
+
+class Hoarder(SampleConsensus):
+    """A defence of one's own, which remembers what no log can hold."""
+
+    kind: Literal["hoarder"] = "hoarder"
+
+    def converse(self, team, state, rng):
+        decision = yield from super().converse(team, state, rng)
+        return replace(decision, state={"seen": {*team}})
+
+
+def test_a_state_that_cannot_be_kept_is_a_fault_of_the_frame(caplog):
+    with caplog.at_level(logging.CRITICAL):
+        result = run(FakeDetector(), Hoarder())
+    assert (result.source, result.state) == (Source.EGO_ONLY, {})
+    assert "CanonicalizationError" in result.fault
