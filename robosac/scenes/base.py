@@ -122,6 +122,6 @@ def first_scenes(source: SceneSource, split: Split, count: int, frames: int = 1,
 def seconds_apart(scene: Scene, count: int) -> Iterator[Frame]:
     """``count`` frames of a scene that are 1 s apart, or all that there are."""
     step = max(1, round(1 / scene.frame_period_s))
-    numbers = range(0, count * step, step)
-    for index in numbers if scene.length is None else range(0, min(count * step, scene.length), step):
+    end = count * step if scene.length is None else min(count * step, scene.length)
+    for index in range(0, end, step):
         yield scene.frame(index)
