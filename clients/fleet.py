@@ -136,6 +136,8 @@ async def run_fleet(options: FleetOptions, console: Console) -> FleetSummary:
         If there is no such attack, detector or data, or the gateway's detector has other weights.
     """
     detector, attack = detectors.load(options.detector), attacks.load_campaign(options.attack)
+    if fault := attacks.lacking(attack, detector):
+        raise ValueError(fault)
     count = options.first_scene + options.scenes
     scenes = first_scenes(SOURCES.make(options.data), "test", count, options.frames)
     summary = FleetSummary(detector)

@@ -90,6 +90,9 @@ def test_what_cannot_be_is_said_before_the_work(own):
     asked = robosac("compare", "--detector", "my_detector:build", "--out", "out", *quick)
     assert asked.returncode == 2
     assert "occupancy-max is not calibrated" in " ".join(asked.stderr.replace("│", "").split())
+    shifted = robosac("fleet", "--detector", "my_detector:build", "--data", "my_data:Road", "--attack", "shift")
+    assert shifted.returncode == 1
+    assert "The fleet stopped: shift cannot attack the detector occupancy-max" in " ".join(shifted.stdout.split())
     many = robosac("evaluate", "--data", "my_data:Road", "--scenes", 1, "--collaborators", 3)
     assert "no 3 of 3 teammates can be free of 1 attackers" in " ".join(many.stderr.replace("│", "").split())
     assert not (own / "x.json").exists()
