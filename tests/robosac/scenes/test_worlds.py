@@ -127,8 +127,9 @@ def test_highway_agents_stay_together_while_others_come_and_go():
         vehicles = traffic.vehicles_at(time_s)
         centre = vehicles[traffic.agent_vehicles, :2].mean(axis=0)
         assert np.hypot(*(vehicles[:, :2] - centre).T).max() < 300.0
-    agents = [traffic.vehicles_at(time_s)[traffic.agent_vehicles, :2] for time_s in (0.0, 5.0)]
-    assert np.hypot(*(agents[1] - agents[0]).T).min() > 5 * 21.9
+    start, soon, late = (traffic.vehicles_at(time_s)[traffic.agent_vehicles, :2] for time_s in (0.0, 5.0, 60.0))
+    assert np.hypot(*(soon - start).T).min() > 5 * 21.9
+    assert np.hypot(*(late - start).T).min() > 60 * 21.9 - 280.0
 
 
 @pytest.mark.parametrize("name", WORLDS)
