@@ -10,6 +10,7 @@ from robosac.scenes.base import (
     View,
     first_scenes,
     seconds_apart,
+    whose_turn,
 )
 from robosac.scenes.intersection import FRAME_PERIOD_S, AgentView, IntersectionScene, SceneFrame
 from robosac.scenes.lidar import Lidar
@@ -47,4 +48,5 @@ __all__ = [
     "World",
     "first_scenes",
     "seconds_apart",
+    "whose_turn",
 ]
