@@ -1,5 +1,6 @@
 import pickle
 import re
+from pathlib import Path
 
 import numpy as np
 import pytest
@@ -165,6 +166,12 @@ def test_scenes_of_one_purpose_serve_no_other():
 def test_the_worlds_are_listed_to_who_asks_for_another(text):
     with pytest.raises(SceneError, match=re.escape(", ".join(WORLDS))):
         SOURCES.make(text)
+
+
+def test_the_page_on_worlds_lists_them_all():
+    page = Path(__file__).parents[3] / "docs" / "synthetic-world.md"
+    table = page.read_text().partition("## Other worlds")[2].partition("## The detector")[0]
+    assert re.findall(r"^\| `([\w-]+)` \|", table, re.MULTILINE) == list(WORLDS)
 
 
 def test_nonsense_is_refused():
