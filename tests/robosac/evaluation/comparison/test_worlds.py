@@ -67,10 +67,10 @@ def test_a_line_says_what_the_world_s_report_says(out):
 
 
 def test_a_world_is_played_as_it_is_by_itself(out, tmp_path):
-    result = run("--data", "world:crossing-dropped", "--only", "sample_consensus", *SHORT, "--out", str(tmp_path))
+    result = run("--data", "world:highway", "--only", "sample_consensus", *SHORT, "--out", str(tmp_path))
     assert result.exit_code == 0, result.output
     alone = [row for row in read(tmp_path / "comparison.csv") if row["defense"] == "sample_consensus"]
-    among = [row for row in read(out / NAMES[0] / "comparison.csv") if row["defense"] == "sample_consensus"]
+    among = [row for row in read(out / "highway" / "comparison.csv") if row["defense"] == "sample_consensus"]
     assert alone == among
 
 
