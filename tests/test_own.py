@@ -2,6 +2,7 @@
 
 import csv
 import io
+import os
 import re
 import subprocess
 import sys
@@ -27,7 +28,7 @@ def own(tmp_path, monkeypatch):
         example, name = re.findall(r"```python\n(.*?)```", text, re.DOTALL)[0], re.findall(r"`(my_\w+\.py)`", text)[0]
         (tmp_path / name).write_text(example)
     monkeypatch.syspath_prepend(str(tmp_path))
-    monkeypatch.setenv("PYTHONPATH", str(tmp_path))
+    monkeypatch.setenv("PYTHONPATH", str(tmp_path), prepend=os.pathsep)
     monkeypatch.chdir(tmp_path)
     yield tmp_path
     for name in [name for name in sys.modules if name.startswith("my_")]:
@@ -74,6 +75,25 @@ async def test_all_four_are_calibrated_served_and_driven(own, monkeypatch):
             summary = await run_fleet(fleet, console)
             assert summary.frames == 4
             assert (summary.naming is not None) is names  # group testing where none is asked for
+
+
+def test_data_can_be_disturbed_and_compared_with_itself(own):
+    example = re.findall(r"```python\n(.*?)```", (DOCS / "own-data.md").read_text(), re.DOTALL)[1]
+    (own / "my_worlds.py").write_text(example)
+    worlds = ["--world", "my_data:Road", "--world", "my_worlds:WetRoad"]
+    short = ["--setting", "honest:0", "--only", "no defence", "--scenes", 2, "--frames", 6, "--jobs", 2]
+    done = robosac("compare", *worlds, *short, "--out", "out")
+    assert done.returncode == 0, done.stderr
+    with (own / "out" / "worlds.csv").open() as file:
+        dry, wet = csv.DictReader(file)
+    assert (dry["world"], wet["world"]) == ("my_data-Road", "my_worlds-WetRoad")
+    assert dry["true_boxes"] == wet["true_boxes"]
+    assert float(dry["oracle_ap70"]) > float(wet["oracle_ap70"]) > 0
+    assert {path.name for path in (own / "out").iterdir()} == {
+        *(line["world"] for line in (dry, wet)),
+        "worlds.csv",
+        "worlds.md",
+    }
 
 
 def test_what_cannot_be_is_said_before_the_work(own):

@@ -17,7 +17,7 @@ from robosac.defenses.group_testing.model import CHANGE_SIZES, change_bin, crowd
 from robosac.detectors import Detector
 from robosac.evaluation.frames import DecodedOnce, Sensed, Subset, under_attack
 from robosac.evaluation.recordings import record, subsets
-from robosac.scenes import Scene
+from robosac.scenes import Scene, whose_turn
 
 STRETCH_STRIDE = 10
 """Stretches of a scene begin this many frames apart, so that they differ."""
@@ -119,11 +119,11 @@ def validation_stretches(
     """
     some = next(iter(trial.attacks.values()))
     for turn, (scene, number) in enumerate((s, n) for s in scenes for n in range(trial.stretches_per_scene)):
-        ego_id = scene.egos[turn % len(scene.egos)]
         start = number * STRETCH_STRIDE
         frames = [scene.frame(index) for index in range(start, start + STRETCH)]
+        ego_id = whose_turn(scene, turn, *frames)
         met = [Sensed.of(detector, frame, ego_id, trial.pose_error_m, rng) for frame in frames]
-        team = sorted(set(met[0].messages) - {ego_id})
+        team = sorted({name for sensed in met for name in sensed.messages} - {ego_id})
         honest: list[DecodedOnce] = []
         attacked = [(kind, attack, count) for kind, attack in trial.attacks.items() for count in trial.attackers]
         for kind, attack, count in [(None, some, 0), *attacked]:

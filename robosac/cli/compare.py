@@ -2,8 +2,9 @@
 
 from __future__ import annotations
 
+import re
 import time
-from collections.abc import Sequence
+from collections.abc import Mapping, Sequence
 from dataclasses import replace
 from pathlib import Path
 from typing import Annotated
@@ -24,20 +25,27 @@ from robosac.evaluation.comparison import (
     QUICK,
     Extent,
     Plan,
+    Row,
     Setting,
     built,
-    compare_defenses,
+    compare_plans,
     write_comparison,
+    write_worlds,
 )
 from robosac.evaluation.comparison.rows import EARLY
 from robosac.figures import need_figures
-from robosac.scenes import DEFAULT_DATA, SceneError
+from robosac.scenes import DEFAULT_DATA, SOURCES, WORLDS, SceneError, SceneSource, World
 
 
 def run(  # the options of a command line
     context: typer.Context,
     out: Annotated[
-        Path, typer.Option(metavar="DIR", help="Folder for comparison.md, comparison.csv and two pictures.")
+        Path,
+        typer.Option(
+            metavar="DIR",
+            help="Folder for comparison.md, comparison.csv and two pictures; with --world for one such folder a world, "
+            "worlds.md and worlds.csv.",
+        ),
     ],
     quick: Annotated[bool, typer.Option(help="Fewer attacks and frames, in a few minutes.")] = False,
     only: Annotated[list[str] | None, typer.Option(help=f"One of {', '.join(DEFENSES)}; may be repeated.")] = None,
@@ -62,6 +70,13 @@ def run(  # the options of a command line
     seed: Seed = 0,
     detector: DetectorName = DEFAULT_DETECTOR,
     data: DataName = DEFAULT_DATA,
+    world: Annotated[
+        list[str] | None,
+        typer.Option(
+            help=f"A world to play all of this in: one of {', '.join(WORLDS)}, all of them (all), or a scene source of "
+            "one's own, module:callable; may be repeated.",
+        ),
+    ] = None,
 ) -> None:
     """Play every defence against every attack on the same test sequences, and write tables and pictures."""
     if live and recordings is not None:
@@ -73,19 +88,43 @@ def run(  # the options of a command line
     make_folder(out, "--out")
     if recordings is not None:
         make_folder(recordings, "--recordings")
-    chosen, source = load_detector(detector), load_data(data)
+    if world and data != DEFAULT_DATA:
+        raise typer.BadParameter("--world says where scenes come from; --data does, too", param_hint="--world")
+    chosen, sources = load_detector(detector), _worlds(world) if world else {"": load_data(data)}
     columns, left_out = _defenses(only or (), defense or (), chosen)
     possible, impossible = _possible(extent, chosen, asked=bool(setting))
     for why in (*left_out, *impossible):
         console.print(f"Left out: {why}")
     extent = replace(extent, settings=possible)
-    plan = Plan(chosen, columns, extent, seed, recordings, pose_error, live, source)
+    what = (chosen, columns, extent, seed, recordings, pose_error, live)
+    plans = {name: Plan(*what, source) for name, source in sources.items()}
     started = time.monotonic()
-    with blaming("--data", SceneError), progress(console) as bar:
-        task = bar.add_task("frames", total=len(extent.settings) * extent.scenes * extent.frames)
-        rows = compare_defenses(plan, jobs, lambda: bar.advance(task))
-    path = write_comparison(rows, plan, out, command(context))
-    console.print(f"{path}: {len(rows)} rows in {(time.monotonic() - started) / 60:.1f} minutes")
+    with blaming("--world" if world else "--data", SceneError), progress(console) as bar:
+        task = bar.add_task("frames", total=len(plans) * len(extent.settings) * extent.scenes * extent.frames)
+        found = compare_plans(list(plans.values()), jobs, lambda: bar.advance(task))
+    path = _write(dict(zip(plans, found, strict=True)), plans, out, command(context))
+    rows = sum(len(each) for each in found)
+    console.print(f"{path}: {rows} rows in {(time.monotonic() - started) / 60:.1f} minutes")
+
+
+def _worlds(names: Sequence[str]) -> dict[str, SceneSource]:
+    """The sources of the worlds that are asked for, by the names of their folders."""
+    asked = dict.fromkeys(each for name in names for each in (WORLDS if name == "all" else [name]))
+    folders = {re.sub(r"[^\w.-]", "-", name): name for name in asked}
+    with blaming("--world", ValueError):
+        if len(folders) < len(asked):
+            raise ValueError("two of them would have the same folder")
+        return {
+            folder: SOURCES.make(name if ":" in name else f"{World.kind}:{name}") for folder, name in folders.items()
+        }
+
+
+def _write(rows: Mapping[str, Sequence[Row]], plans: Mapping[str, Plan], out: Path, line: str) -> Path:
+    """The report of each world in its folder, and that of all; without worlds the only one there is."""
+    for name, plan in plans.items():
+        (out / name).mkdir(parents=True, exist_ok=True)
+        path = write_comparison(rows[name], plan, out / name, line)
+    return path if "" in plans else write_worlds(rows, plans, out, line)
 
 
 def _possible(extent: Extent, detector: Detector, asked: bool) -> tuple[tuple[Setting, ...], list[str]]:

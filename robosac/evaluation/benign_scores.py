@@ -8,7 +8,7 @@ from robosac.answers import Verdict
 from robosac.consensus import at_least, compare
 from robosac.detectors import Detector
 from robosac.evaluation.frames import encode_all
-from robosac.scenes import Scene
+from robosac.scenes import Scene, whose_turn
 
 
 def single_teammate_indices(
@@ -21,8 +21,9 @@ def single_teammate_indices(
     """
     indices = []
     for turn, scene in enumerate(scenes):
-        messages = encode_all(detector, scene.frame(0))
-        ego_id = scene.egos[turn % len(scene.egos)]
+        first = scene.frame(0)
+        ego_id = whose_turn(scene, turn, first)
+        messages = encode_all(detector, first)
         frame = detector.prepare(messages.pop(ego_id), messages)
         own = at_least(frame.detect(), detector.info.consensus_score)
         for name in messages:

@@ -10,19 +10,21 @@ from robosac.scenes.base import (
     View,
     first_scenes,
     seconds_apart,
+    whose_turn,
 )
 from robosac.scenes.intersection import FRAME_PERIOD_S, AgentView, IntersectionScene, SceneFrame
 from robosac.scenes.lidar import Lidar
+from robosac.scenes.worlds import WORLDS, World
 
 DEFAULT_DATA = "synthetic"
-DATA_HELP = "Where scenes come from: synthetic, v2x-sim:DIR, or module:callable."
+DATA_HELP = "Where scenes come from: synthetic, world:NAME, v2x-sim:DIR, or module:callable."
 SOURCES: Kind[SceneSource] = Kind(
     noun="scene source",
     package="robosac.scenes",
     contract=SceneSource,
     name_of=lambda candidate: vars(candidate).get("kind", ""),
     takes_argument=True,
-    forms="v2x-sim:DIR, or module:callable",
+    forms="world:NAME, v2x-sim:DIR, or module:callable",
     error=SceneError,
 )
 """All sources by name; `Kind.make` makes one."""
@@ -42,6 +44,9 @@ __all__ = [
     "SOURCES",
     "Split",
     "View",
+    "WORLDS",
+    "World",
     "first_scenes",
     "seconds_apart",
+    "whose_turn",
 ]

@@ -119,6 +119,20 @@ def first_scenes(source: SceneSource, split: Split, count: int, frames: int = 1,
     return list(scenes)
 
 
+def whose_turn(scene: Scene, turn: int, *frames: Frame) -> str:
+    """The ego whose turn it is, where vehicles take turns: the next one of those that are in all of some frames.
+
+    Raises
+    ------
+    SceneError
+        If none is.
+    """
+    present = [name for name in scene.egos if all(name in frame.views for frame in frames)]
+    if not present:
+        raise SceneError(f"scene {scene.number}, frame {frames[0].index}: nobody is there who may be the ego")
+    return present[turn % len(present)]
+
+
 def seconds_apart(scene: Scene, count: int) -> Iterator[Frame]:
     """``count`` frames of a scene that are 1 s apart, or all that there are."""
     step = max(1, round(1 / scene.frame_period_s))

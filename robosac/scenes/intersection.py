@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from abc import ABC, abstractmethod
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, field
 from functools import cached_property
@@ -64,17 +65,11 @@ class SceneFrame:
 
 
 @dataclass(frozen=True)
-class IntersectionScene:
-    """A sequence at 5 Hz with several cars and one roadside unit as agents.
+class GeneratedScene(ABC):
+    """A sequence at 5 Hz with several cars and one roadside unit as agents; a subclass draws the traffic.
 
     Any frame can be computed by itself; the same seed and index give the same frame, bit for bit. Agents are named
     ``car-1``, ``car-2``, ... and ``rsu``.
-
-    Examples
-    --------
-    >>> frame = IntersectionScene(seed=8).frame(0)
-    >>> sorted(frame.views)
-    ['car-1', 'car-2', 'car-3', 'car-4', 'car-5', 'rsu']
     """
 
     seed: int
@@ -86,8 +81,21 @@ class IntersectionScene:
     frame_period_s = FRAME_PERIOD_S
 
     @cached_property
-    def _traffic(self) -> Traffic:
-        return build_traffic(np.random.default_rng([self.seed, 0]), self.car_agents)
+    def traffic(self) -> Traffic:
+        """Where everything is at any time.
+
+        Raises
+        ------
+        ValueError
+            If no car carries a sensor.
+        """
+        if self.car_agents < 1:
+            raise ValueError(f"car_agents must be at least 1, got {self.car_agents}")
+        return self.draw(np.random.default_rng([self.seed, 0]))
+
+    @abstractmethod
+    def draw(self, rng: np.random.Generator) -> Traffic:
+        """Draw the traffic, with as many cars that carry a sensor as there shall be."""
 
     @property
     def number(self) -> int:
@@ -114,7 +122,7 @@ class IntersectionScene:
         """
         if index < 0:
             raise ValueError(f"frame index must not be negative, got {index}")
-        traffic = self._traffic
+        traffic = self.traffic
         vehicles = traffic.vehicles_at(index * FRAME_PERIOD_S)
         obstacles = np.vstack([np.column_stack([vehicles, traffic.size[:, 2]]), traffic.buildings])
         carriers = {f"car-{i + 1}": int(v) for i, v in enumerate(traffic.agent_vehicles)}
@@ -134,6 +142,22 @@ class IntersectionScene:
             all_hits[others] = hits
             views[agent] = AgentView(pose_matrix(x, y, height, yaw), points, all_hits[: len(vehicles)])
         return SceneFrame(index, vehicles, views, carriers)
+
+
+@dataclass(frozen=True)
+class IntersectionScene(GeneratedScene):
+    """A scene at the intersection of `robosac.scenes.world`, with as much traffic as that has by default.
+
+    Examples
+    --------
+    >>> frame = IntersectionScene(seed=8).frame(0)
+    >>> sorted(frame.views)
+    ['car-1', 'car-2', 'car-3', 'car-4', 'car-5', 'rsu']
+    """
+
+    def draw(self, rng: np.random.Generator) -> Traffic:
+        """The traffic of `build_traffic`."""
+        return build_traffic(rng, self.car_agents)
 
 
 class Synthetic:

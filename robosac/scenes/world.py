@@ -23,9 +23,35 @@ STOP_LINE_M = 10.0
 TRUCK_SHARE = 0.15
 AGENT_RANGE_M = 30.0
 MOVING_AGENT_RANGE_M = 12.0
+MOVING_AGENTS = 2
 MID_SCENE_S = 2.5
 CAR_SENSOR_HEIGHT_M = 1.7
 RSU_HEIGHT_M = 5.0
+
+Speeds = tuple[float, float]
+"""Lowest and highest, metres per second."""
+
+
+@dataclass(frozen=True)
+class Flow:
+    """How much traffic there is at the intersection, and how fast it flows."""
+
+    speed_mps: Speeds = (4.0, 9.0)
+    """Of a lane of the flowing axis, drawn between these; all its vehicles have the same."""
+    gap_m: float = 12.0
+    more_gap_m: float = 7.0
+    """From centre to centre in a flowing lane: at least the first, and more by the second on average."""
+    queue: tuple[int, int] = (2, 5)
+    """Fewest and most vehicles that wait in a lane."""
+    tail_share: float = 0.5
+    """Of the waiting lanes, those that hold the tail of the next junction's queue beyond the crossing."""
+    parked_share: float = 0.3
+    """Of the places at the kerb that are taken."""
+    truck_share: float = TRUCK_SHARE
+    """Of the vehicles on the lanes."""
+
+
+PLAIN_FLOW = Flow()
 
 
 @dataclass(frozen=True)
@@ -66,7 +92,7 @@ class Traffic:
         return np.column_stack([x, y, self.size[:, :2], self.road_yaw + self.yaw_offset])
 
 
-def build_traffic(rng: np.random.Generator, car_agents: int) -> Traffic:
+def build_traffic(rng: np.random.Generator, car_agents: int, flow: Flow = PLAIN_FLOW) -> Traffic:
     """Draw the traffic of one scene.
 
     Parameters
@@ -75,35 +101,29 @@ def build_traffic(rng: np.random.Generator, car_agents: int) -> Traffic:
     car_agents : int
         Cars that carry a sensor, at least 1. At most two of them drive on the flowing axis, and those are within 12 m
         of the centre in the middle of a 5 s sequence; the others stand in the queue or at the kerb, within 30 m.
-
-    Raises
-    ------
-    ValueError
-        If ``car_agents`` is below 1.
+    flow : Flow
     """
-    if car_agents < 1:
-        raise ValueError(f"car_agents must be at least 1, got {car_agents}")
     while True:
-        traffic = _draw(rng, car_agents)
+        traffic = _draw(rng, car_agents, flow)
         if traffic is not None:
             return traffic
 
 
-def _draw(rng: np.random.Generator, car_agents: int) -> Traffic | None:
+def _draw(rng: np.random.Generator, car_agents: int, flow: Flow) -> Traffic | None:
     world_yaw = rng.uniform(-np.pi, np.pi)
     rows: list[tuple[float, float, float, float, bool]] = []  # along, lateral, road_yaw, speed, may be a truck
     for direction in (0.0, np.pi):
         for lane in LANES_M:
-            rows += [(s, -lane, world_yaw + direction, v, True) for s, v in _flowing_lane(rng)]
-            rows += [(s, -lane, world_yaw + direction + np.pi / 2, 0.0, True) for s in _queue_lane(rng)]
+            rows += [(s, -lane, world_yaw + direction, v, True) for s, v in _flowing_lane(rng, flow)]
+            rows += [(s, -lane, world_yaw + direction + np.pi / 2, 0.0, True) for s in _queue_lane(rng, flow)]
         for axis in (0.0, np.pi / 2):
-            rows += [(s, -PARKED_ROW_M, world_yaw + direction + axis, 0.0, False) for s in _parked_row(rng)]
+            rows += [(s, -PARKED_ROW_M, world_yaw + direction + axis, 0.0, False) for s in _parked_row(rng, flow)]
     along, lateral, road_yaw, speed = (
         np.array(column, dtype=np.float64) for column in list(zip(*rows, strict=True))[:4]
     )
     may_be_truck = np.array([row[4] for row in rows])
-    truck = may_be_truck & (rng.random(len(rows)) < TRUCK_SHARE)
-    size = _sizes(rng, truck)
+    truck = may_be_truck & (rng.random(len(rows)) < flow.truck_share)
+    size = draw_sizes(rng, truck)
     parked = np.abs(lateral) == PARKED_ROW_M
     traffic = Traffic(
         along=along,
@@ -116,38 +136,39 @@ def _draw(rng: np.random.Generator, car_agents: int) -> Traffic | None:
         agent_vehicles=np.empty(0, dtype=np.int64),
         rsu_pose=_rsu(rng, world_yaw),
     )
-    agents = _choose_agents(rng, traffic, ~truck, car_agents)
+    agents = choose_agents(rng, traffic, ~truck, car_agents)
     return None if agents is None else replace(traffic, agent_vehicles=agents)
 
 
-def _flowing_lane(rng: np.random.Generator) -> list[tuple[float, float]]:
-    speed = rng.uniform(4.0, 9.0)
+def _flowing_lane(rng: np.random.Generator, flow: Flow) -> list[tuple[float, float]]:
+    speed = rng.uniform(*flow.speed_mps)
     position = -ROAD_LENGTH_M / 2 + rng.uniform(0.0, 10.0)
     lane = []
-    while position < ROAD_LENGTH_M / 2 - 12.0:
+    while position < ROAD_LENGTH_M / 2 - flow.gap_m:
         lane.append((position, speed))
-        position += 12.0 + rng.exponential(7.0)
+        position += flow.gap_m + rng.exponential(flow.more_gap_m)
     return lane
 
 
-def _queue_lane(rng: np.random.Generator) -> list[float]:
+def _queue_lane(rng: np.random.Generator, flow: Flow) -> list[float]:
     lane = []
     position = -STOP_LINE_M - rng.uniform(3.0, 5.5)
-    for _ in range(rng.integers(2, 6)):
+    for _ in range(rng.integers(flow.queue[0], flow.queue[1] + 1)):
         lane.append(position)
         position -= 10.0 + rng.exponential(0.7)
-    if rng.random() < 0.5:  # the tail of the next junction's queue
+    if rng.random() < flow.tail_share:
         lane += [STOP_LINE_M + rng.uniform(12.0, 18.0), STOP_LINE_M + rng.uniform(28.5, 36.0)]
     return lane
 
 
-def _parked_row(rng: np.random.Generator) -> list[float]:
+def _parked_row(rng: np.random.Generator, flow: Flow) -> list[float]:
     slots = np.arange(17.0, 48.0, 6.6)
     slots = np.concatenate([-slots, slots])
-    return [float(s) for s in slots[rng.random(len(slots)) < 0.3] + rng.uniform(-0.4, 0.4)]
+    return [float(s) for s in slots[rng.random(len(slots)) < flow.parked_share] + rng.uniform(-0.4, 0.4)]
 
 
-def _sizes(rng: np.random.Generator, truck: np.ndarray[tuple[int], np.dtype[np.bool_]]) -> FloatArray:
+def draw_sizes(rng: np.random.Generator, truck: np.ndarray[tuple[int], np.dtype[np.bool_]]) -> FloatArray:
+    """Length, width and height (V, 3) of vehicles, metres; ``truck`` (V,) says which are lorries."""
     n = len(truck)
     car = np.column_stack([rng.uniform(3.9, 5.0, n), rng.uniform(1.7, 2.0, n), rng.uniform(1.4, 1.75, n)])
     lorry = np.column_stack([rng.uniform(6.5, 9.5, n), rng.uniform(2.3, 2.55, n), rng.uniform(2.7, 3.6, n)])
@@ -173,15 +194,41 @@ def _rsu(rng: np.random.Generator, world_yaw: float) -> tuple[float, float, floa
     return float(radius * np.cos(angle)), float(radius * np.sin(angle)), float(rng.uniform(-np.pi, np.pi))
 
 
-def _choose_agents(
-    rng: np.random.Generator, traffic: Traffic, is_car: np.ndarray[tuple[int], np.dtype[np.bool_]], count: int
+def choose_agents(
+    rng: np.random.Generator,
+    traffic: Traffic,
+    is_car: np.ndarray[tuple[int], np.dtype[np.bool_]],
+    count: int,
+    moving_range_m: float = MOVING_AGENT_RANGE_M,
+    standing_range_m: float = AGENT_RANGE_M,
+    most_moving: int = MOVING_AGENTS,
 ) -> np.ndarray[tuple[int], np.dtype[np.int64]] | None:
+    """Draw the cars that carry a sensor.
+
+    Parameters
+    ----------
+    rng : numpy.random.Generator
+    traffic : Traffic
+    is_car : (V,) bool ndarray
+        Which vehicles may be one.
+    count : int
+        How many.
+    moving_range_m, standing_range_m : float
+        Those that move, and those that stand, are as near the origin in the middle of a 5 s sequence.
+    most_moving : int
+        So many move at most; the others stand.
+
+    Returns
+    -------
+    (count,) int ndarray or None
+        None if there are not enough.
+    """
     mid = traffic.vehicles_at(MID_SCENE_S)
     distance = np.hypot(mid[:, 0], mid[:, 1])
-    flowing = traffic.speed > 0
-    moving = np.flatnonzero(is_car & flowing & (distance < MOVING_AGENT_RANGE_M))
-    moving = rng.permutation(moving)[: min(2, count - 1)]
-    standing = np.flatnonzero(is_car & ~flowing & (distance < AGENT_RANGE_M))
+    drives = traffic.speed > 0
+    moving = np.flatnonzero(is_car & drives & (distance < moving_range_m))
+    moving = rng.permutation(moving)[: min(most_moving, count - 1)]
+    standing = np.flatnonzero(is_car & ~drives & (distance < standing_range_m))
     standing = rng.permutation(standing)[: count - len(moving)]
     chosen = np.concatenate([moving, standing])
     return rng.permutation(chosen) if len(chosen) == count else None

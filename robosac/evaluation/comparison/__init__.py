@@ -3,8 +3,9 @@
 from robosac.evaluation.comparison.playing import Plan
 from robosac.evaluation.comparison.report import write_comparison
 from robosac.evaluation.comparison.rows import Row
-from robosac.evaluation.comparison.running import compare_defenses
+from robosac.evaluation.comparison.running import compare_defenses, compare_plans
 from robosac.evaluation.comparison.settings import DEFENSES, FULL, QUICK, Extent, Setting, built
+from robosac.evaluation.comparison.worlds import write_worlds
 
 __all__ = [
     "DEFENSES",
@@ -16,5 +17,7 @@ __all__ = [
     "Setting",
     "built",
     "compare_defenses",
+    "compare_plans",
     "write_comparison",
+    "write_worlds",
 ]

@@ -91,6 +91,11 @@ class Row:
     """Median time of a frame; None unless live."""
     naming: NamingFigures | None = None
     """None where the defence names nobody."""
+    true_boxes: float = 0.0
+    """A frame."""
+    sequences: int = 0
+    wrongly_naming: int = 0
+    """All sequences, and those in which an honest teammate was ever named."""
 
     @property
     def whole(self) -> Figures:
@@ -145,6 +150,9 @@ def sum_up(
         honest_refused=float(refused / honest) if honest else None,
         milliseconds=float(np.median(times)) if live and times else None,
         naming=_naming(naming) if naming else None,
+        true_boxes=float(np.mean([frame.truths for played in sequences for frame in played.matched])),
+        sequences=len(sequences),
+        wrongly_naming=sum(each.honest_named > 0 for each in naming),
     )
 
 

@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable
+from collections.abc import Callable, Sequence
 from concurrent.futures import FIRST_EXCEPTION, ProcessPoolExecutor, wait
 from multiprocessing import get_context
 from multiprocessing.sharedctypes import Synchronized
@@ -41,11 +41,21 @@ def compare_defenses(plan: Plan, jobs: int = 1, tick: Callable[[], None] = lambd
     robosac.scenes.SceneError
         As `Plan.scenes`.
     """
-    wanted = plan.scenes()
+    (rows,) = compare_plans([plan], jobs, tick)
+    return rows
+
+
+def compare_plans(plans: Sequence[Plan], jobs: int = 1, tick: Callable[[], None] = lambda: None) -> list[list[Row]]:
+    """Several comparisons, each as `compare_defenses` makes it; the processes share the scenes of all."""
+    scenes = [plan.scenes() for plan in plans]
     if jobs == 1:
-        scenes = [play_scene(plan, scene, tick) for scene in wanted]
+        played = [[play_scene(plan, scene, tick) for scene in each] for plan, each in zip(plans, scenes, strict=True)]
     else:
-        scenes = _in_processes(plan, len(wanted), jobs, tick)
+        played = _in_processes(plans, [len(each) for each in scenes], jobs, tick)
+    return [_rows(plan, each) for plan, each in zip(plans, played, strict=True)]
+
+
+def _rows(plan: Plan, scenes: Sequence[PlayedScene]) -> list[Row]:
     rows = []
     for setting in plan.extent.settings:
         oracle = precisions([scene[setting, ORACLE] for scene in scenes])
@@ -54,13 +64,16 @@ def compare_defenses(plan: Plan, jobs: int = 1, tick: Callable[[], None] = lambd
     return rows
 
 
-def _in_processes(plan: Plan, scenes: int, jobs: int, tick: Callable[[], None]) -> list[PlayedScene]:
+def _in_processes(
+    plans: Sequence[Plan], scenes: Sequence[int], jobs: int, tick: Callable[[], None]
+) -> list[list[PlayedScene]]:
     # spawned, as a process with threads (of the progress bar, of torch) must not be forked
     context = get_context("spawn")
     done: Synchronized[int] = context.Value("L", 0)
     told = 0
-    with ProcessPoolExecutor(min(jobs, scenes), context, _begin, (plan, done)) as pool:
-        futures = [pool.submit(_play_scene, number) for number in range(scenes)]
+    with ProcessPoolExecutor(min(jobs, sum(scenes)), context, _begin, (plans, done)) as pool:
+        asked = [[pool.submit(_play_scene, which, number) for number in range(n)] for which, n in enumerate(scenes)]
+        futures = [future for each in asked for future in each]
         try:
             while wait(futures, _POLL_S, FIRST_EXCEPTION).not_done:
                 told = _tell(tick, told, done.value)
@@ -70,7 +83,7 @@ def _in_processes(plan: Plan, scenes: int, jobs: int, tick: Callable[[], None]) 
         finally:
             pool.shutdown(wait=False, cancel_futures=True)
     _tell(tick, told, done.value)
-    return [future.result() for future in futures]
+    return [[future.result() for future in each] for each in asked]
 
 
 def _tell(tick: Callable[[], None], told: int, done: int) -> int:
@@ -79,23 +92,23 @@ def _tell(tick: Callable[[], None], told: int, done: int) -> int:
     return done
 
 
-_worker: tuple[Plan, Synchronized[int]] | None = None
+_worker: tuple[Sequence[Plan], Synchronized[int]] | None = None
 """In a worker process, what it was begun with: a shared counter cannot be sent along with a scene."""
 
 
-def _begin(plan: Plan, done: Synchronized[int]) -> None:
+def _begin(plans: Sequence[Plan], done: Synchronized[int]) -> None:
     global _worker  # noqa: PLW0603
     torch.set_num_threads(1)
-    _worker = plan, done
+    _worker = plans, done
 
 
-def _play_scene(number: int) -> PlayedScene:
+def _play_scene(which: int, number: int) -> PlayedScene:
     if _worker is None:
         raise RuntimeError("only in a process of the pool")
-    plan, done = _worker
+    plans, done = _worker
 
     def tick() -> None:
         with done.get_lock():
             done.value += 1
 
-    return play_scene(plan, plan.scenes()[number], tick)
+    return play_scene(plans[which], plans[which].scenes()[number], tick)

@@ -33,7 +33,7 @@ def test_vehicles_keep_apart_and_to_the_roads(seed):
         overlap = pairwise_iou(vehicles, vehicles)
         np.fill_diagonal(overlap, 0.0)
         assert overlap.max() < 1e-9
-        buildings = scene._traffic.buildings[:, :5]
+        buildings = scene.traffic.buildings[:, :5]
         assert pairwise_iou(vehicles, buildings).max() < 1e-9
 
 
@@ -67,7 +67,7 @@ def test_agents_stay_near_the_centre_and_poses_are_exact(seed):
 def test_returns_lie_on_surfaces():
     scene = IntersectionScene(2, lidar=Lidar(noise_m=0.0, dropout=0.0))
     frame = scene.frame(0)
-    solid = np.vstack([frame.vehicles, scene._traffic.buildings[:, :5]])
+    solid = np.vstack([frame.vehicles, scene.traffic.buildings[:, :5]])
     for view in frame.views.values():
         world = view.points @ view.pose[:3, :3].T + view.pose[:3, 3]
         standing = world[world[:, 2] > 0.02]

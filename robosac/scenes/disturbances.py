@@ -1,0 +1,221 @@
+"""What goes wrong between the world and the ego, put around any scene.
+
+Each class here takes a scene and is one: the same agents, the same truth, but somebody senses worse, is late, or is
+wrong about its pose. They can be put around each other, and around scenes of one's own data. A *teammate* is any agent
+but the first ego, the one that sequences belong to; only `JumpingEgo` touches that. True boxes stay those of the scene
+itself: what rain hides is there all the same.
+
+What is random follows from the scene's number, the frame's, and the agent, so any frame can be had by itself.
+"""
+
+from __future__ import annotations
+
+from abc import ABC, abstractmethod
+from collections.abc import Mapping, Sequence
+from dataclasses import dataclass, field, replace
+
+import numpy as np
+
+from robosac.boxes import FloatArray, pose_matrix
+from robosac.scenes.base import Frame, Scene, View
+
+_STREAM = 7_000_000
+"""Frames of generated scenes draw from streams that begin with the scene's and the frame's number."""
+_DROPPED, _LATE, _RAIN, _NOISE, _NOISY, _BIAS, _JUMP = range(_STREAM, _STREAM + 7)
+
+
+@dataclass(frozen=True)
+class DisturbedFrame:
+    """A frame of which some agents have other views."""
+
+    original: Frame
+    views: Mapping[str, View]
+
+    @property
+    def index(self) -> int:
+        """That of the original."""
+        return self.original.index
+
+    def truth(self, ego: str) -> FloatArray:
+        """True boxes (G, 5) of the original, in the frame of the sensor as it really stands."""
+        return self.original.truth(ego)
+
+
+@dataclass(frozen=True)
+class Disturbed(ABC):
+    """A scene of which a subclass changes the views."""
+
+    scene: Scene
+    """What is disturbed."""
+
+    @property
+    def number(self) -> int:
+        return self.scene.number
+
+    @property
+    def agents(self) -> Sequence[str]:
+        return self.scene.agents
+
+    @property
+    def egos(self) -> Sequence[str]:
+        return self.scene.egos
+
+    @property
+    def length(self) -> int | None:
+        return self.scene.length
+
+    @property
+    def frame_period_s(self) -> float:
+        return self.scene.frame_period_s
+
+    @property
+    def teammates(self) -> tuple[str, ...]:
+        """All agents but the first ego, in their order."""
+        return tuple(name for name in self.scene.agents if name != self.scene.egos[0])
+
+    def frame(self, index: int) -> Frame:
+        """The frame of the scene, disturbed."""
+        original = self.scene.frame(index)
+        return DisturbedFrame(original, self.views(original))
+
+    @abstractmethod
+    def views(self, frame: Frame) -> Mapping[str, View]:
+        """What stands in the place of a frame's views; an agent that is left out is absent."""
+
+    def rng(self, stream: int, *more: int) -> np.random.Generator:
+        """For draws that are the same whenever the same is asked for."""
+        return np.random.default_rng([self.number, stream, *more])
+
+    def one_of_them(self, stream: int) -> tuple[str, ...]:
+        """A teammate drawn for the whole scene; empty if there is none."""
+        team = self.teammates
+        return (team[self.rng(stream).integers(len(team))],) if team else ()
+
+
+@dataclass(frozen=True)
+class Rain(Disturbed):
+    """Returns are missing with every agent, the more the farther away."""
+
+    missing: float = 0.3
+    """Share of the returns that is lost at any distance, from 0 to 1."""
+    reach_m: float = 60.0
+    """Of the others, ``exp(-distance / reach_m)`` are left."""
+
+    def views(self, frame: Frame) -> Mapping[str, View]:
+        disturbed = {}
+        for number, name in enumerate(self.agents):
+            if (view := frame.views.get(name)) is not None:
+                kept = (1.0 - self.missing) * np.exp(-np.linalg.norm(view.points, axis=1) / self.reach_m)
+                drawn = self.rng(_RAIN, frame.index, number).random(len(kept))
+                disturbed[name] = View(view.pose, view.points[drawn < kept])
+        return disturbed
+
+
+@dataclass(frozen=True)
+class NoisyScanner(Disturbed):
+    """One teammate's ranges are wrong, each return's by itself."""
+
+    noise_m: float = 0.4
+    """Standard deviation, metres."""
+
+    def views(self, frame: Frame) -> Mapping[str, View]:
+        disturbed = dict(frame.views)
+        for name in self.one_of_them(_NOISY):
+            if name in disturbed:
+                view = disturbed[name]
+                distance = np.maximum(np.linalg.norm(view.points, axis=1), 0.1)
+                wrong = self.rng(_NOISE, frame.index).normal(0.0, self.noise_m, len(distance))
+                stretch = np.maximum(1.0 + wrong / distance, 0.0).astype(view.points.dtype)
+                disturbed[name] = View(view.pose, view.points * stretch[:, None])
+        return disturbed
+
+
+@dataclass(frozen=True)
+class Late(Disturbed):
+    """Teammates send what they sensed some frames ago.
+
+    Who has no such frame, as at the beginning of the scene, sends what it senses now.
+    """
+
+    everybody: bool = False
+    """All teammates are late, or one that is drawn for the scene."""
+    fresh_pose: bool = True
+    """Whether the old returns come with the pose of now. With the old pose what stands still is where it was seen; with
+    that of now it moves along with a sender that moves.
+    """
+    frames: int = 1
+    """How late."""
+    _last: dict[int, Frame] = field(default_factory=dict, init=False, repr=False, compare=False)
+    """The frames that the next one will ask for again."""
+
+    def views(self, frame: Frame) -> Mapping[str, View]:
+        late = self.teammates if self.everybody else self.one_of_them(_LATE)
+        disturbed = dict(frame.views)
+        if frame.index >= self.frames:
+            earlier = self._earlier(frame.index - self.frames).views
+            for name in late:
+                if name in disturbed and name in earlier:
+                    old = earlier[name]
+                    disturbed[name] = View(disturbed[name].pose if self.fresh_pose else old.pose, old.points)
+        self._keep(frame)
+        return disturbed
+
+    def _earlier(self, index: int) -> Frame:
+        kept = self._last.get(index)
+        return self.scene.frame(index) if kept is None else kept
+
+    def _keep(self, frame: Frame) -> None:
+        self._last[frame.index] = frame
+        for index in [index for index in self._last if not 0 <= frame.index - index < self.frames]:
+            del self._last[index]
+
+
+@dataclass(frozen=True)
+class Dropped(Disturbed):
+    """Messages get lost: a teammate is absent from a frame now and then."""
+
+    share: float = 0.1
+    """Of all messages."""
+
+    def views(self, frame: Frame) -> Mapping[str, View]:
+        lost = self.rng(_DROPPED, frame.index).random(len(self.agents)) < self.share
+        gone = {name for name, is_lost in zip(self.agents, lost, strict=True) if is_lost} - {self.egos[0]}
+        return {name: view for name, view in frame.views.items() if name not in gone}
+
+
+@dataclass(frozen=True)
+class Biased(Disturbed):
+    """Each teammate is wrong about its position by the same vector all the time."""
+
+    bias_m: float = 0.2
+    """Along the world's x and y, each time with a sign that is drawn for the scene; metres."""
+
+    def views(self, frame: Frame) -> Mapping[str, View]:
+        signs = self.rng(_BIAS).choice([-1.0, 1.0], (len(self.agents), 2))
+        wrong = dict(zip(self.agents, self.bias_m * signs, strict=True))
+        wrong[self.egos[0]] = np.zeros(2)
+        return {name: replaced(view, *wrong[name]) for name, view in frame.views.items()}
+
+
+@dataclass(frozen=True)
+class JumpingEgo(Disturbed):
+    """The first ego is wrong about its own pose, in each frame anew."""
+
+    error_m: float = 0.1
+    error_deg: float = 0.2
+    """Standard deviations along the world's x and y, and of the heading."""
+
+    def views(self, frame: Frame) -> Mapping[str, View]:
+        rng = self.rng(_JUMP, frame.index)
+        dx, dy = rng.normal(0.0, self.error_m, 2)
+        turn = rng.normal(0.0, np.deg2rad(self.error_deg))
+        ego = self.egos[0]
+        return {name: replaced(view, dx, dy, turn) if name == ego else view for name, view in frame.views.items()}
+
+
+def replaced(view: View, dx: float, dy: float, turn: float = 0.0) -> View:
+    """A view of an agent that believes to stand (dx, dy) metres away, and turned by an angle in radians."""
+    pose = view.pose.copy()
+    pose[:3, :3] = pose_matrix(0.0, 0.0, 0.0, turn)[:3, :3] @ view.pose[:3, :3]
+    pose[:2, 3] += dx, dy
+    return replace(view, pose=pose)
