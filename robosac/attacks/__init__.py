@@ -12,6 +12,7 @@ from robosac.attacks.carlini_wagner import CarliniWagner
 from robosac.attacks.geometric import NoGeometry
 from robosac.attacks.gradient import BIM, PGD
 from robosac.attacks.noise import GaussianNoise
+from robosac.attacks.situation import Foreign, Lie, Past, Situation
 from robosac.attacks.still import EraseStill, InventStill, ShiftStill
 from robosac.plugins import Kind
 
@@ -77,15 +78,19 @@ __all__ = [
     "CarliniWagner",
     "Erase",
     "EraseStill",
+    "Foreign",
     "GaussianNoise",
     "HONEST",
     "Invent",
     "InventSteady",
     "InventStill",
     "IterativeAttack",
+    "Lie",
     "NoGeometry",
+    "Past",
     "Shift",
     "ShiftStill",
+    "Situation",
     "lacking",
     "load",
     "load_campaign",

@@ -13,9 +13,10 @@ from typing import Any
 
 import numpy as np
 
-from robosac.attacks.alibi import Alibi, covering, framing, with_alibi
+from robosac.attacks.alibi import Alibi, covering, framing, keeping
 from robosac.attacks.base import Attack, IterativeAttack
 from robosac.attacks.geometric import SHOWN
+from robosac.attacks.situation import Past, Situation
 from robosac.boxes import FloatArray, pose_matrix
 from robosac.detectors.base import Detector, Encoder, GeometricSurface, Message, Preparer, blank
 from robosac.plugins import lacks
@@ -29,7 +30,7 @@ Schedule = Callable[[int, Sequence[str]], Sequence[str]]
 """Of the number of a frame and all attackers, those that act; the others send honest messages. All egos of a frame meet
 the same ones.
 """
-Lie = Callable[[FloatArray], FloatArray]
+Pretence = Callable[[FloatArray], FloatArray]
 """Of one's true pose, the claimed one: world_from_sensor (4, 4), both."""
 
 
@@ -73,7 +74,7 @@ class Campaign:
     attack: Attack | None
     """None sends honest tensors: the lie, if any, is in the pose."""
     schedule: Schedule = always
-    pose: Lie | None = None
+    pose: Pretence | None = None
     """Of the acting attackers; the attack is optimised for the fusion that it leads to."""
     alibi: Alibi | None = None
     """Fusions in which the attack behaves; for iterative attacks."""
@@ -98,6 +99,11 @@ class Campaign:
         return self.attack.epsilon if self.attack is not None else 0.0
 
     @property
+    def remembers(self) -> bool:
+        """Whether what it does in a frame depends on earlier ones; see `Attack.remembers`."""
+        return self.attack is not None and self.attack.remembers
+
+    @property
     def needs(self) -> tuple[str, ...]:
         """What the attack and its alibi call of an attack surface; see `Attack.needs`."""
         return (*(self.attack.needs if self.attack is not None else ()), *(SHOWN if self.alibi is not None else ()))
@@ -110,6 +116,7 @@ class Campaign:
         attackers: Collection[str],
         frame: int,
         rng: np.random.Generator,
+        situation: Situation | None = None,
     ) -> dict[str, Message]:
         """What the attackers that act in this frame send to this ego instead of their benign messages.
 
@@ -121,6 +128,8 @@ class Campaign:
             All under the adversary's control.
         frame : int
             Its number in the sequence.
+        situation : Situation, optional
+            What else the adversary knows of the frame; by default where everybody is, and no past.
 
         Raises
         ------
@@ -137,14 +146,21 @@ class Campaign:
             sent = {name: replace(message, pose=self.pose(message.pose)) for name, message in sent.items()}
         if self.attack is None:
             return sent
-        surface = detector.attack_surface(ego, {**benign, **sent})
+        met = {**benign, **sent}
+        surface = detector.attack_surface(ego, met)
+        known = Past().situation(frame, ego, met, np.empty((0, 5))) if situation is None else situation
+        known = replace(
+            known,
+            poses={name: message.pose for name, message in met.items()},
+            tensor=lambda message: detector.attack_surface(ego, {"": message}).messages[""],
+        )
         if self.alibi is not None and isinstance(self.attack, IterativeAttack):
-            clean = {name: surface.messages[name] for name in acting}
-            aim = with_alibi(self.attack, self.alibi, surface, acting)
-            tensors = self.attack.descend(aim, clean, rng)
+            terms = keeping(self.alibi, surface, acting)
+            tensors = self.attack.optimise(surface, acting, rng, known, terms, warm=self.remembers)
         else:
-            tensors = self.attack.run(surface, acting, rng)
-        return {name: detector.perturbed(sent[name], tensor) for name, tensor in tensors.items()}
+            tensors = self.attack.run(surface, acting, rng, known)
+        attacking = {name: detector.perturbed(sent[name], tensor) for name, tensor in tensors.items()}
+        return {**sent, **attacking} if self.pose is not None else attacking
 
 
 def lacking(attack: Attack | Campaign | None, detector: Preparer) -> str | None:

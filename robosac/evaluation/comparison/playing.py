@@ -15,7 +15,7 @@ from robosac.detectors import Detector
 from robosac.evaluation.average_precision import Matched, match
 from robosac.evaluation.comparison.settings import Extent, Setting
 from robosac.evaluation.encounters import Encounters
-from robosac.evaluation.frames import EvaluationFrame
+from robosac.evaluation.frames import EvaluationFrame, another_scene
 from robosac.evaluation.playing import FaultyDefense, play
 from robosac.evaluation.recordings import Recordings
 from robosac.scenes import Scene, SceneError, SceneSource, first_scenes
@@ -118,7 +118,7 @@ def play_scene(plan: Plan, scene: Scene, tick: Callable[[], None] = lambda: None
     FaultyDefense
         If a defence fails.
     """
-    what = (plan.detector, scene, plan.seed, plan.pose_error_m)
+    what = (plan.detector, scene, plan.seed, plan.pose_error_m, another_scene(plan.data, "test", scene))
     source = Encounters(*what) if plan.live else Recordings(*what, plan.recordings, plan.data.name)
     played: dict[tuple[Setting, str], Played] = {}
     for setting in plan.extent.settings:

@@ -1,6 +1,12 @@
 """A detector in closed form: what an attack should do to it is known."""
 
+import numpy as np
 import torch
+
+from robosac.attacks import Situation
+
+VEHICLES = np.array([[x, y, 4.0, 2.0, yaw] for x in (3.0, 13.0, 23.0) for y in (-5.0, 5.0) for yaw in (0.0, 1.6)])
+"""True boxes with gaps between them, none of them where `Linear` has a place."""
 
 
 class Linear:
@@ -25,3 +31,8 @@ class Linear:
         y, x = torch.meshgrid(*(10.0 * torch.arange(n) for n in total.shape), indexing="ij")
         constants = (torch.full_like(total, value) for value in (1.4, 0.7, 1.0, 0.0))
         return total, torch.stack([x, y + 0.5 * total.roll(1), *constants], dim=-1)
+
+
+def situation(**changes):
+    """A first frame of a `Linear` ego, among `VEHICLES`."""
+    return Situation(**{"truth": VEHICLES, **changes})

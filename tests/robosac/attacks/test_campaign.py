@@ -20,6 +20,7 @@ from robosac.attacks.alibi import covering, framing
 from robosac.attacks.campaign import always, asleep, false_pose, flicker, turns
 from robosac.boxes import from_world, pose_matrix
 from robosac.evaluation.frames import Sensed, under_attack
+from robosac.scenes import IntersectionScene
 
 PAIR = ["car-2", "rsu"]
 
@@ -57,7 +58,8 @@ def test_a_false_pose_moves_the_message_along_the_sender_axes():
 
 
 def under(campaign, messages, detector, index=0, attackers=("car-2",)):
-    sensed = Sensed(index, "car-1", messages, np.empty((0, 5)))
+    truth = IntersectionScene(seed=3).frame(0).truth("car-1")
+    sensed = Sensed(index, "car-1", messages, truth)
     return under_attack(detector, sensed, attackers, campaign, np.random.default_rng(0))
 
 
