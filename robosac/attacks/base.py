@@ -53,6 +53,8 @@ class Attack(ABC):
     """What the attack calls of an attack surface, besides its ``messages``."""
     remembers: ClassVar[bool] = False
     """Whether it goes by earlier frames, too: then it is run over the frames of a sequence in order."""
+    bounded: ClassVar[bool] = True
+    """Whether messages keep within ``epsilon`` of the benign ones."""
 
     epsilon: float = 0.5
     """L-infinity bound on the perturbation, in units of the message."""
