@@ -12,17 +12,20 @@ from math import radians
 from typing import Any
 
 import numpy as np
+import torch
 
+from robosac.attacks import penalties
 from robosac.attacks.alibi import Alibi, covering, framing, keeping
-from robosac.attacks.base import Attack, IterativeAttack
+from robosac.attacks.base import Attack, IterativeAttack, Tensors, Term
 from robosac.attacks.geometric import SHOWN
 from robosac.attacks.situation import Past, Situation
 from robosac.boxes import FloatArray, pose_matrix
-from robosac.detectors.base import Detector, Encoder, GeometricSurface, Message, Preparer, blank
+from robosac.detectors.base import AttackSurface, Detector, Encoder, GeometricSurface, Message, Preparer, blank
 from robosac.plugins import lacks
 
 SEPARATOR = "@"
 HONEST = "honest"
+SOFT_STEPS, SOFT_STEP = 30, 0.04
 _FLICKER = 51
 
 
@@ -78,8 +81,18 @@ class Campaign:
     """Of the acting attackers; the attack is optimised for the fusion that it leads to."""
     alibi: Alibi | None = None
     """Fusions in which the attack behaves; for iterative attacks."""
+    softness: float = 0.0
+    """Weight of the sum of `robosac.attacks.penalties.PENALTIES`; for iterative attacks. Such an attack remembers, and
+    takes at least `SOFT_STEPS` steps of at most `SOFT_STEP`, since larger ones shake the boxes by themselves.
+    """
+    bound: float = 1.0
+    """So many times the attack's own bound."""
 
     def __post_init__(self) -> None:
+        if self.softness and not isinstance(self.attack, IterativeAttack):
+            raise ValueError(f"only an attack that optimises can be soft, not {self.name}")
+        if self.bound != 1.0 and (self.attack is None or not self.attack.bounded):
+            raise ValueError(f"only an attack with a bound can have another one, not {self.name}")
         if self.alibi is not None and not isinstance(self.attack, IterativeAttack):
             raise ValueError(f"only an attack that optimises can have an alibi, not {self.name}")
 
@@ -95,18 +108,19 @@ class Campaign:
 
     @property
     def epsilon(self) -> float:
-        """The attack's bound; 0 where the tensors are honest."""
-        return self.attack.epsilon if self.attack is not None else 0.0
+        """The bound on the perturbation; 0 where the tensors are honest."""
+        return self.bound * self.attack.epsilon if self.attack is not None else 0.0
 
     @property
     def remembers(self) -> bool:
         """Whether what it does in a frame depends on earlier ones; see `Attack.remembers`."""
-        return self.attack is not None and self.attack.remembers
+        return bool(self.softness) or (self.attack is not None and self.attack.remembers)
 
     @property
     def needs(self) -> tuple[str, ...]:
-        """What the attack and its alibi call of an attack surface; see `Attack.needs`."""
-        return (*(self.attack.needs if self.attack is not None else ()), *(SHOWN if self.alibi is not None else ()))
+        """What the attack, its alibi and penalties call of an attack surface; see `Attack.needs`."""
+        needs = self.attack.needs if self.attack is not None else ()
+        return (*needs, *SHOWN) if self.alibi is not None or self.softness else needs
 
     def messages(
         self,
@@ -154,13 +168,34 @@ class Campaign:
             poses={name: message.pose for name, message in met.items()},
             tensor=lambda message: detector.attack_surface(ego, {"": message}).messages[""],
         )
-        if self.alibi is not None and isinstance(self.attack, IterativeAttack):
-            terms = keeping(self.alibi, surface, acting)
-            tensors = self.attack.optimise(surface, acting, rng, known, terms, warm=self.remembers)
-        else:
-            tensors = self.attack.run(surface, acting, rng, known)
+        tensors = self._attacked(surface, acting, rng, known)
         attacking = {name: detector.perturbed(sent[name], tensor) for name, tensor in tensors.items()}
         return {**sent, **attacking} if self.pose is not None else attacking
+
+    def _attacked(
+        self, surface: AttackSurface, acting: Sequence[str], rng: np.random.Generator, situation: Situation
+    ) -> Mapping[str, torch.Tensor]:
+        """The attack's tensors, under the campaign's bound and pretences."""
+        if self.attack is None:
+            return {}
+        attack = self.attack if self.bound == 1.0 else replace(self.attack, epsilon=self.epsilon)
+        if not isinstance(attack, IterativeAttack) or not (self.softness or self.alibi):
+            return attack.run(surface, acting, rng, situation)
+        terms = keeping(self.alibi, surface, acting) if self.alibi is not None else []
+        if self.softness:
+            attack = replace(attack, steps=max(attack.steps, SOFT_STEPS), step_size=min(attack.step_size, SOFT_STEP))
+            terms.append(self._paid(surface, situation))
+        sent = attack.optimise(surface, acting, rng, situation, terms, warm=self.remembers)
+        if self.softness and sent:
+            penalties.remember(situation, surface, sent)
+        return sent
+
+    def _paid(self, surface: AttackSurface, situation: Situation) -> Term:
+        def paid(sent: Tensors) -> torch.Tensor:
+            each = [penalty(situation, surface, sent) for penalty in penalties.PENALTIES]
+            return self.softness * torch.stack(each).sum()
+
+        return paid
 
 
 def lacking(attack: Attack | Campaign | None, detector: Preparer) -> str | None:
@@ -196,5 +231,8 @@ BEHAVIOURS: Mapping[str, Mapping[str, Any]] = {
     "covering": {"alibi": covering},
     "framing": {"alibi": framing},
     "false-pose": {"pose": false_pose},
+    "soft": {"softness": 1.0},
+    "soft3": {"softness": 3.0},
+    "double": {"bound": 2.0},
 }
 """All behaviours by name: what each sets of a `Campaign`."""
