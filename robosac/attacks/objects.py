@@ -28,6 +28,8 @@ GONE = -3.5
 """Class logit that no place of an erased object should exceed: a score of .03."""
 NEAR_M = 2.5
 """Places whose boxes are centred so near to an object may show it."""
+MOST_PLACES = 2000
+"""So many places, the best, are looked at to see what is shown. It bounds the search where there are many anchors."""
 HARM = 3.0
 """Weight of the lies, where everything else that should stay as it is has the weight 1."""
 
@@ -49,8 +51,11 @@ class View:
         return view
 
     def shown(self, perception: Perception, score: float) -> FloatArray:
-        """Centres (n, 2) of all places of a perception with a score from here on; ego frame."""
-        centres: FloatArray = perception.geometry[..., :2][perception.scores >= score].double().numpy()
+        """Centres (n, 2) of the places of a perception with a score from here on, at most `MOST_PLACES`; ego frame."""
+        scores = perception.scores.flatten()
+        best = scores.topk(min(MOST_PLACES, len(scores)))
+        chosen = best.indices[best.values >= score]
+        centres: FloatArray = perception.geometry.reshape(-1, 6)[chosen, :2].double().numpy()
         return centres
 
 

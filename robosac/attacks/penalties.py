@@ -68,13 +68,10 @@ class _Pair:
     def of(cls, surface: AttackSurface, smaller: Sequence[str], joining: Sequence[str]) -> _Pair:
         before = Perception.of(surface, smaller)
         honest = Perception.of(surface, [*smaller, *joining])
-        known = before.geometry[..., :2][before.scores >= KNOWN_SCORE]
-        apart = torch.ones_like(before.scores, dtype=torch.bool)
-        apart &= before.scores < KNOWN_SCORE
-        candidates = apart & (honest.scores > 0)
+        apart = before.scores < KNOWN_SCORE
+        known = torch.from_numpy(peaks(torch.logit(before.scores, eps=1e-6), before.geometry)[:, :2]).float()
         if len(known):
-            centres = before.geometry[..., :2][candidates]
-            apart[candidates] = torch.cdist(centres, known).min(dim=1).values > NEAR_M
+            apart[apart.clone()] &= torch.cdist(before.geometry[..., :2][apart], known).min(dim=1).values > NEAR_M
         pair = cls(tuple(smaller), tuple(joining), before, apart, 0.0, 0.0)
         logits = torch.logit(honest.scores, eps=1e-6)
         return cls(
