@@ -1,7 +1,8 @@
 """What an attack pays for being seen: differentiable forms of what a defence measures.
 
 The attack minimises its own aim and, weighted, the sum of `PENALTIES`. Another penalty is a function and its place in
-that list. A penalty is called in every step of the attack. What it needs once in a frame, `Situation.once` keeps.
+that list. A penalty is called in every step of the attack. What it needs once in a frame, `Situation.once` keeps. They
+may share passes, so only their sum can be differentiated.
 """
 
 from __future__ import annotations
@@ -37,6 +38,8 @@ NEAR_M = 2.5
 SHARE = 3.0
 """Boxes that come or go are counted as their share of all boxes, times this: of 30 boxes each one weighs .1."""
 MOST_BOXES = 300
+MOST_PLACES = 4096
+"""So many boxes and places, the best, are looked at. It bounds the work where there are many anchors."""
 _NMS_IOU = 0.1
 _SOFT = 0.5
 _STREAM = 55
@@ -144,7 +147,8 @@ def changes(situation: Situation, surface: AttackSurface, sent: Tensors) -> torc
 
 def _changed(before: torch.Tensor, logits: torch.Tensor, boxes: torch.Tensor) -> torch.Tensor:
     """About how many of the boxes (m, 6) of before are gone, and how many came."""
-    seen = logits.detach() > _logit(KNOWN_SCORE) - 2.0
+    best = logits.detach().topk(min(MOST_PLACES, len(logits)))
+    seen = best.indices[best.values > _logit(KNOWN_SCORE) - 2.0]
     logits, boxes = logits[seen], boxes[seen]
     if not len(logits):
         return (before[:, 5] >= WITNESS_SCORE).sum() + logits.sum()
