@@ -115,7 +115,7 @@ def frames(attack, surface, truths, poses, period_s=0.2, start=0):
 
 
 STANDING = np.array([car(12.0, -4.0), car(-9.0, 6.0, 2.0)])
-MOVES = [pose_matrix(1.5 * n, 0.2 * n, 1.7, 0.02 * n) for n in range(4)]
+MOVES = [pose_matrix(1.5 * n, 0.2 * n, 1.7, 0.02 * n) for n in range(3, 7)]
 
 
 @pytest.mark.parametrize("attack", [Ghost, GhostAhead, Ghosts, Swarm], ids=lambda attack: attack.name)
