@@ -25,6 +25,7 @@ from robosac import attacks, defenses, detectors
 from robosac.answers import FrameAnswer, Reason
 from robosac.attacks import CAMPAIGN_HELP
 from robosac.detectors import DEFAULT_DETECTOR
+from robosac.evaluation.frames import another_scene
 from robosac.scenes import DATA_HELP, DEFAULT_DATA, SOURCES, first_scenes
 
 RECENT = 12
@@ -139,12 +140,14 @@ async def run_fleet(options: FleetOptions, console: Console) -> FleetSummary:
     if fault := attacks.lacking(attack, detector):
         raise ValueError(fault)
     count = options.first_scene + options.scenes
-    scenes = first_scenes(SOURCES.make(options.data), "test", count, options.frames)
+    source = SOURCES.make(options.data)
+    scenes = first_scenes(source, "test", count, options.frames)
     summary = FleetSummary(detector)
     screen = _Screen(console, options.scenes * options.frames * options.egos)
     with screen.live:
         for scene in scenes[options.first_scene :]:
-            fleet = Fleet(scene, detector, options.egos, options.attackers, attack, options.seed)
+            other = another_scene(source, "test", scene)
+            fleet = Fleet(scene, detector, options.egos, options.attackers, attack, options.seed, other)
             await _run_scene(options, fleet, summary, screen)
     return summary
 

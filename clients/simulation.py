@@ -8,9 +8,10 @@ from dataclasses import dataclass
 import numpy as np
 
 from robosac.attacks import Attack, Campaign
+from robosac.attacks.situation import Lie, Past
 from robosac.boxes import FloatArray
 from robosac.detectors import Detector, Message
-from robosac.evaluation.frames import Sensed, encode_all, under_attack
+from robosac.evaluation.frames import Sensed, encode_all, foreign_views, under_attack, vehicles_around
 from robosac.scenes import Frame, Scene
 
 
@@ -32,6 +33,8 @@ class EgoFrame:
     """(G, 5); ego frame."""
     points: FloatArray
     """(P, 3); the ego's LiDAR returns."""
+    lies: tuple[Lie, ...] = ()
+    """What the attack says that it lies about."""
 
 
 class Fleet:
@@ -51,6 +54,8 @@ class Fleet:
         Chosen at random among the vehicles that are not egos.
     attack : Attack or Campaign
     seed : int
+    elsewhere : Scene, optional
+        Another scene, for attacks that replay what is sensed there.
 
     Raises
     ------
@@ -66,6 +71,7 @@ class Fleet:
         attackers: int,
         attack: Attack | Campaign,
         seed: int,
+        elsewhere: Scene | None = None,
     ) -> None:
         others = [name for name in scene.agents if name not in scene.egos[:egos]]
         if not 1 <= egos <= len(scene.egos):
@@ -77,7 +83,9 @@ class Fleet:
         self.scene = scene
         self.egos = scene.egos[:egos]
         self.detector = detector
-        self._attack = attack
+        self._campaign = Campaign.of(attack)
+        self._foreign = foreign_views(detector, elsewhere)
+        self._pasts: dict[tuple[str, frozenset[str]], Past] = {}
         self._rng = np.random.default_rng([seed, scene.number])
         chosen = self._rng.choice(len(others), attackers, replace=False)
         self.attackers = frozenset(others[i] for i in chosen)
@@ -93,7 +101,19 @@ class Fleet:
         return [self._for_ego(ego_id, frame, messages) for ego_id in self.egos if ego_id in messages]
 
     def _for_ego(self, ego_id: str, frame: Frame, messages: Mapping[str, Message]) -> EgoFrame:
-        sensed = Sensed(frame.index, ego_id, messages, frame.truth(ego_id))
-        met = under_attack(self.detector, sensed, self.attackers, self._attack, self._rng)
+        sensed = Sensed(frame.index, ego_id, messages, frame.truth(ego_id), vehicles_around(frame, ego_id))
+        past = self._past(ego_id, frame.index)
+        met = under_attack(self.detector, sensed, self.attackers, self._campaign, self._rng, past)
         number, points = self.scene.number, frame.views[ego_id].points
-        return EgoFrame(number, ego_id, met.attackers, met.benign, met.teammates, met.ego, met.truth, points)
+        return EgoFrame(number, ego_id, met.attackers, met.benign, met.teammates, met.ego, met.truth, points, met.lies)
+
+    def _past(self, ego_id: str, index: int) -> Past:
+        """What those who act in this frame remember of this ego; what they overheard before they acted, too."""
+        if not self._campaign.remembers:
+            return Past(self.scene.frame_period_s, self._foreign)
+        acting = frozenset(self._campaign.schedule(index, sorted(self.attackers)))
+        if (ego_id, acting) not in self._pasts:
+            overheard = next((past.earlier for (ego, _), past in self._pasts.items() if ego == ego_id), {})
+            past = Past(self.scene.frame_period_s, self._foreign, earlier=overheard)
+            self._pasts[ego_id, acting] = past
+        return self._pasts[ego_id, acting]

@@ -12,6 +12,7 @@ import numpy as np
 from rich.console import Console
 
 from clients import trial
+from clients.lies import Lies
 from clients.simulation import EgoFrame
 from robosac.answers import FrameAnswer
 from robosac.boxes import FloatArray
@@ -56,6 +57,7 @@ class FleetSummary:
     attacked_from: dict[Met, int] = field(default_factory=dict)
     named_in: dict[Met, int] = field(default_factory=dict)
     names: bool = False
+    lies: Lies = field(default_factory=Lies)
     example: Example | None = None
     _harm: int = -1
 
@@ -102,6 +104,7 @@ class FleetSummary:
         for vehicle in answer.named:
             self.named_in.setdefault((frame.scene, frame.ego_id, vehicle), answer.frame)
         self.names |= answer.suspicion is not None
+        self.lies.add(frame, answer, received, undefended)
         for role, members in (("attackers", frame.attackers), ("honest", set(team) - frame.attackers)):
             tally = self.participation.setdefault(role, Counter())
             for vehicle in members:
@@ -129,6 +132,7 @@ class FleetSummary:
             "sources": dict(self.sources),
             "participation": {role: dict(tally) for role, tally in self.participation.items()},
             "naming": self.naming,
+            "objects": self.lies.as_dict(),
             "sampling_steps": {"mean": float(np.mean(self.steps)), "max": int(np.max(self.steps))},
             "latency_ms": trial.percentiles(self.latencies_ms),
             "deadline_met_share": self.in_time / self.frames,
@@ -171,6 +175,8 @@ class FleetSummary:
                 + (f", after {after:.1f} frames on average" if after is not None else "")
                 + f"; honest teammates named: {naming['honest_named']}."
             )
+        if (told := self.lies.sentence()) is not None:
+            console.print(told)
         colour = "green" if self.clean_share >= 0.95 else "red"
         console.print(f"[{colour}]No attacker accepted in {self.clean_share:.1%} of the frames.[/{colour}]")
 

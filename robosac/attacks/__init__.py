@@ -10,9 +10,14 @@ from robosac.attacks.base import Attack, IterativeAttack
 from robosac.attacks.campaign import BEHAVIOURS, HONEST, SEPARATOR, Campaign, lacking
 from robosac.attacks.carlini_wagner import CarliniWagner
 from robosac.attacks.geometric import NoGeometry
+from robosac.attacks.ghosts import Ghost, GhostAhead, GhostDriving, Ghosts, Swarm
 from robosac.attacks.gradient import BIM, PGD
 from robosac.attacks.noise import GaussianNoise
+from robosac.attacks.objects import OnObjects
+from robosac.attacks.replays import Copy, Elsewhere, Frozen, Replay, Stale
+from robosac.attacks.situation import Foreign, Lie, Past, Situation
 from robosac.attacks.still import EraseStill, InventStill, ShiftStill
+from robosac.attacks.vehicles import Displace, OnVehicles, Remove, RemoveMany
 from robosac.plugins import Kind
 
 KIND: Kind[Attack] = Kind("attack", __name__, Attack)
@@ -71,21 +76,40 @@ __all__ = [
     "BEHAVIOURS",
     "BIM",
     "CAMPAIGN_HELP",
+    "HONEST",
     "PGD",
     "Attack",
     "Campaign",
     "CarliniWagner",
+    "Copy",
+    "Displace",
+    "Elsewhere",
     "Erase",
     "EraseStill",
+    "Foreign",
+    "Frozen",
     "GaussianNoise",
-    "HONEST",
+    "Ghost",
+    "GhostAhead",
+    "GhostDriving",
+    "Ghosts",
     "Invent",
     "InventSteady",
     "InventStill",
     "IterativeAttack",
+    "Lie",
     "NoGeometry",
+    "OnObjects",
+    "OnVehicles",
+    "Past",
+    "Remove",
+    "RemoveMany",
+    "Replay",
     "Shift",
     "ShiftStill",
+    "Situation",
+    "Stale",
+    "Swarm",
     "lacking",
     "load",
     "load_campaign",

@@ -12,6 +12,7 @@ from torch.nn import functional
 from robosac.attacks.base import SEEN, Aim, Knowledge, Tensors
 from robosac.attacks.geometric import SHOWN, Perception, average, balanced, displacement, geometric
 from robosac.attacks.gradient import BIM
+from robosac.attacks.situation import Situation
 from robosac.detectors.base import AttackSurface
 
 APART_M = 5.0
@@ -64,7 +65,7 @@ class Invent(BIM):
 
     objects: int = 12
 
-    def aim(self, surface: AttackSurface, attackers: Collection[str]) -> Aim:  # noqa: ARG002
+    def aim(self, surface: AttackSurface, attackers: Collection[str], situation: Situation) -> Aim:  # noqa: ARG002
         """The loss of step 2."""
         honest = Perception.of(surface, surface.messages)
         with torch.no_grad():
@@ -112,9 +113,9 @@ class InventSteady(Invent):
     steps: int = 30
     step_size: float = 0.04
 
-    def aim(self, surface: AttackSurface, attackers: Collection[str]) -> Aim:
+    def aim(self, surface: AttackSurface, attackers: Collection[str], situation: Situation) -> Aim:
         """The aim of `Invent`, and the objects at their points."""
-        harm, shown = super().aim(surface, attackers), geometric(surface)
+        harm, shown = super().aim(surface, attackers, situation), geometric(surface)
         ego, honest = Perception.of(surface, ()), Perception.of(surface, surface.messages)
         seen = torch.maximum(ego.scores, honest.scores) >= SEEN
         cells, points = self._points(honest.geometry[..., :2], seen)
@@ -169,7 +170,7 @@ class Shift(BIM):
 
     distance: float = 0.9
 
-    def aim(self, surface: AttackSurface, attackers: Collection[str]) -> Aim:  # noqa: ARG002
+    def aim(self, surface: AttackSurface, attackers: Collection[str], situation: Situation) -> Aim:  # noqa: ARG002
         """Boxes at other places, scores as they were."""
         shown = geometric(surface)
         ego, honest = Perception.of(surface, ()), Perception.of(surface, surface.messages)

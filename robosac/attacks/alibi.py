@@ -10,7 +10,7 @@ from collections.abc import Callable, Collection, Sequence
 
 import torch
 
-from robosac.attacks.base import Aim, IterativeAttack, Tensors
+from robosac.attacks.base import Tensors, Term
 from robosac.attacks.geometric import Perception, unnoticed
 from robosac.detectors.base import AttackSurface
 
@@ -43,21 +43,18 @@ def framing(team: Sequence[str], attackers: Collection[str]) -> list[list[str]]:
     return [] if victim is None else [[name for name in team if name != victim], sorted(attackers)]
 
 
-def with_alibi(attack: IterativeAttack, alibi: Alibi, surface: AttackSurface, attackers: Collection[str]) -> Aim:
-    """An attack's aim with an alibi: ``aim + CALM * mean of unnoticed(part)`` over the parts in which to behave.
+def keeping(alibi: Alibi, surface: AttackSurface, attackers: Collection[str]) -> list[Term]:
+    """What an attack with an alibi minimises besides its aim: ``CALM * mean of unnoticed(part)`` over the parts in
+    which to behave; nothing if there are none.
 
     Raises
     ------
     NoGeometry
         If there is an alibi to keep, and the surface does not show boxes.
     """
-    harm = attack.aim(surface, attackers)
     parts = [(part, Perception.of(surface, part)) for part in alibi(sorted(surface.messages), attackers)]
-    if not parts:
-        return harm
 
-    def loss(sent: Tensors, delta: Tensors) -> torch.Tensor:
-        noticed = torch.stack([unnoticed(surface, part, sent, honest) for part, honest in parts]).mean()
-        return harm(sent, delta) + CALM * noticed
+    def term(sent: Tensors) -> torch.Tensor:
+        return CALM * torch.stack([unnoticed(surface, part, sent, honest) for part, honest in parts]).mean()
 
-    return loss
+    return [term] if parts else []

@@ -7,7 +7,7 @@ Several attackers are optimised jointly. The attack acts on the message as it is
 from __future__ import annotations
 
 from abc import ABC, abstractmethod
-from collections.abc import Callable, Collection, Mapping
+from collections.abc import Callable, Collection, Mapping, Sequence
 from dataclasses import dataclass
 from typing import ClassVar
 
@@ -15,6 +15,7 @@ import numpy as np
 import torch
 from torch.nn import functional
 
+from robosac.attacks.situation import Situation
 from robosac.detectors.base import AttackSurface
 
 SEEN = 0.1
@@ -22,6 +23,9 @@ SEEN = 0.1
 Tensors = Mapping[str, torch.Tensor]
 Aim = Callable[[Tensors, Tensors], torch.Tensor]
 """What the adversary minimises: of the attackers' present messages and their perturbations."""
+Term = Callable[[Tensors], torch.Tensor]
+"""What is added to that, of the attackers' present messages."""
+_VARIABLES = "variables"
 
 
 @dataclass(frozen=True)
@@ -47,6 +51,10 @@ class Attack(ABC):
     name: ClassVar[str]
     needs: ClassVar[tuple[str, ...]] = ()
     """What the attack calls of an attack surface, besides its ``messages``."""
+    remembers: ClassVar[bool] = False
+    """Whether it goes by earlier frames, too: then it is run over the frames of a sequence in order."""
+    bounded: ClassVar[bool] = True
+    """Whether messages keep within ``epsilon`` of the benign ones."""
 
     epsilon: float = 0.5
     """L-infinity bound on the perturbation, in units of the message."""
@@ -58,7 +66,11 @@ class Attack(ABC):
 
     @abstractmethod
     def run(
-        self, surface: AttackSurface, attackers: Collection[str], rng: np.random.Generator
+        self,
+        surface: AttackSurface,
+        attackers: Collection[str],
+        rng: np.random.Generator,
+        situation: Situation | None = None,
     ) -> dict[str, torch.Tensor]:
         """Make the attackers' messages.
 
@@ -70,11 +82,13 @@ class Attack(ABC):
             Teammates under the adversary's control.
         rng : numpy.random.Generator
             For all that is random about the attack.
+        situation : Situation, optional
+            The frame's number, poses, true boxes and past; by default a first frame of which nothing else is known.
 
         Returns
         -------
         mapping of attacker to tensor
-            The messages to send instead, of the shape of the benign ones.
+            The messages to send instead, of the shape of the benign ones. Who is missing sends its benign one.
 
         Raises
         ------
@@ -106,15 +120,56 @@ class IterativeAttack(Attack):
     step_size: float = 0.1
 
     def run(
-        self, surface: AttackSurface, attackers: Collection[str], rng: np.random.Generator
+        self,
+        surface: AttackSurface,
+        attackers: Collection[str],
+        rng: np.random.Generator,
+        situation: Situation | None = None,
     ) -> dict[str, torch.Tensor]:
         """Optimise the attackers' messages jointly."""
-        clean = {name: surface.messages[name] for name in sorted(attackers)}
-        return self.descend(self.aim(surface, clean), clean, rng) if clean else {}
+        return self.optimise(surface, attackers, rng, situation or Situation(), warm=self.remembers)
 
-    def descend(self, aim: Aim, clean: Tensors, rng: np.random.Generator) -> dict[str, torch.Tensor]:
-        """The loop: messages within the bound around these benign ones at which the aim is small."""
-        variables = {name: v.requires_grad_(True) for name, v in self.start(clean, rng).items()}
+    def optimise(
+        self,
+        surface: AttackSurface,
+        attackers: Collection[str],
+        rng: np.random.Generator,
+        situation: Situation,
+        terms: Sequence[Term] = (),
+        warm: bool = False,
+    ) -> dict[str, torch.Tensor]:
+        """Optimise the attackers' messages jointly for the attack's aim and further terms.
+
+        Parameters
+        ----------
+        terms : sequence of Term
+            Are added to the aim.
+        warm : bool
+            Whether to begin with the variables that the frame before ended with, and to keep those of this frame.
+        """
+        clean = {name: surface.messages[name] for name in sorted(attackers)}
+        if not clean or not self.prepare(surface, clean, rng, situation):
+            return {}
+        harm = self.aim(surface, clean, situation)
+
+        def aim(sent: Tensors, delta: Tensors) -> torch.Tensor:
+            added = [term(sent) for term in terms]
+            return sum(added, harm(sent, delta))
+
+        start = self.start(clean, rng)
+        if warm:
+            kept: Tensors = situation.memory.get(_VARIABLES, {})
+            start |= {n: kept[n].clone() for n in clean if n in kept and kept[n].shape == clean[n].shape}
+        end = self.descend(aim, start, clean)
+        if warm:
+            situation.memory[_VARIABLES] = {n: variable.detach() for n, variable in end.items()}
+        return {name: (clean[name] + self.perturbation(variable)).detach() for name, variable in end.items()}
+
+    def descend(self, aim: Aim, start: Tensors, clean: Tensors) -> Tensors:
+        """The loop: from these variables to such at which the aim is small, the messages within the bound around these
+        benign ones.
+        """
+        variables = {name: v.requires_grad_(True) for name, v in start.items()}
         optimiser = self.optimiser(list(variables.values()))
         for _ in range(self.steps):
             delta = {name: self.perturbation(v) for name, v in variables.items()}
@@ -126,13 +181,23 @@ class IterativeAttack(Attack):
                 optimiser.step()
                 for variable in variables.values():
                     variable.copy_(self.project(variable))
-        return {name: (clean[name] + self.perturbation(variables[name])).detach() for name in clean}
+        return variables
+
+    def prepare(
+        self,
+        surface: AttackSurface,  # noqa: ARG002
+        attackers: Collection[str],  # noqa: ARG002
+        rng: np.random.Generator,  # noqa: ARG002
+        situation: Situation,  # noqa: ARG002
+    ) -> bool:
+        """What is settled before the aim, as what to lie about. If it returns False, all are honest in this frame."""
+        return True
 
     def start(self, clean: Tensors, rng: np.random.Generator) -> dict[str, torch.Tensor]:  # noqa: ARG002
         """The first variables, within the bound; by default those of no perturbation."""
         return {name: torch.zeros_like(tensor) for name, tensor in clean.items()}
 
-    def aim(self, surface: AttackSurface, attackers: Collection[str]) -> Aim:  # noqa: ARG002
+    def aim(self, surface: AttackSurface, attackers: Collection[str], situation: Situation) -> Aim:  # noqa: ARG002
         """What the adversary minimises in this frame; by default `objective` of the class logits of the whole team."""
         with torch.no_grad():
             known = Knowledge(surface.class_logits({}), surface.class_logits(surface.messages))

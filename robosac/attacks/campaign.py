@@ -12,16 +12,20 @@ from math import radians
 from typing import Any
 
 import numpy as np
+import torch
 
-from robosac.attacks.alibi import Alibi, covering, framing, with_alibi
-from robosac.attacks.base import Attack, IterativeAttack
+from robosac.attacks import penalties
+from robosac.attacks.alibi import Alibi, covering, framing, keeping
+from robosac.attacks.base import Attack, IterativeAttack, Tensors, Term
 from robosac.attacks.geometric import SHOWN
+from robosac.attacks.situation import Past, Situation
 from robosac.boxes import FloatArray, pose_matrix
-from robosac.detectors.base import Detector, Encoder, GeometricSurface, Message, Preparer, blank
+from robosac.detectors.base import AttackSurface, Detector, Encoder, GeometricSurface, Message, Preparer, blank
 from robosac.plugins import lacks
 
 SEPARATOR = "@"
 HONEST = "honest"
+SOFT_STEPS, SOFT_STEP = 30, 0.04
 _FLICKER = 51
 
 
@@ -29,7 +33,7 @@ Schedule = Callable[[int, Sequence[str]], Sequence[str]]
 """Of the number of a frame and all attackers, those that act; the others send honest messages. All egos of a frame meet
 the same ones.
 """
-Lie = Callable[[FloatArray], FloatArray]
+Pretence = Callable[[FloatArray], FloatArray]
 """Of one's true pose, the claimed one: world_from_sensor (4, 4), both."""
 
 
@@ -73,12 +77,22 @@ class Campaign:
     attack: Attack | None
     """None sends honest tensors: the lie, if any, is in the pose."""
     schedule: Schedule = always
-    pose: Lie | None = None
+    pose: Pretence | None = None
     """Of the acting attackers; the attack is optimised for the fusion that it leads to."""
     alibi: Alibi | None = None
     """Fusions in which the attack behaves; for iterative attacks."""
+    softness: float = 0.0
+    """Weight of the sum of `robosac.attacks.penalties.PENALTIES`; for iterative attacks. Such an attack remembers, and
+    takes at least `SOFT_STEPS` steps of at most `SOFT_STEP`, since larger ones shake the boxes by themselves.
+    """
+    bound: float = 1.0
+    """So many times the attack's own bound."""
 
     def __post_init__(self) -> None:
+        if self.softness and not isinstance(self.attack, IterativeAttack):
+            raise ValueError(f"only an attack that optimises can be soft, not {self.name}")
+        if self.bound != 1.0 and (self.attack is None or not self.attack.bounded):
+            raise ValueError(f"only an attack with a bound can have another one, not {self.name}")
         if self.alibi is not None and not isinstance(self.attack, IterativeAttack):
             raise ValueError(f"only an attack that optimises can have an alibi, not {self.name}")
 
@@ -94,13 +108,19 @@ class Campaign:
 
     @property
     def epsilon(self) -> float:
-        """The attack's bound; 0 where the tensors are honest."""
-        return self.attack.epsilon if self.attack is not None else 0.0
+        """The bound on the perturbation; 0 where the tensors are honest."""
+        return self.bound * self.attack.epsilon if self.attack is not None else 0.0
+
+    @property
+    def remembers(self) -> bool:
+        """Whether what it does in a frame depends on earlier ones; see `Attack.remembers`."""
+        return bool(self.softness) or (self.attack is not None and self.attack.remembers)
 
     @property
     def needs(self) -> tuple[str, ...]:
-        """What the attack and its alibi call of an attack surface; see `Attack.needs`."""
-        return (*(self.attack.needs if self.attack is not None else ()), *(SHOWN if self.alibi is not None else ()))
+        """What the attack, its alibi and penalties call of an attack surface; see `Attack.needs`."""
+        needs = self.attack.needs if self.attack is not None else ()
+        return (*needs, *SHOWN) if self.alibi is not None or self.softness else needs
 
     def messages(
         self,
@@ -110,6 +130,7 @@ class Campaign:
         attackers: Collection[str],
         frame: int,
         rng: np.random.Generator,
+        situation: Situation | None = None,
     ) -> dict[str, Message]:
         """What the attackers that act in this frame send to this ego instead of their benign messages.
 
@@ -121,6 +142,8 @@ class Campaign:
             All under the adversary's control.
         frame : int
             Its number in the sequence.
+        situation : Situation, optional
+            What else the adversary knows of the frame; by default where everybody is, and no past.
 
         Raises
         ------
@@ -137,14 +160,42 @@ class Campaign:
             sent = {name: replace(message, pose=self.pose(message.pose)) for name, message in sent.items()}
         if self.attack is None:
             return sent
-        surface = detector.attack_surface(ego, {**benign, **sent})
-        if self.alibi is not None and isinstance(self.attack, IterativeAttack):
-            clean = {name: surface.messages[name] for name in acting}
-            aim = with_alibi(self.attack, self.alibi, surface, acting)
-            tensors = self.attack.descend(aim, clean, rng)
-        else:
-            tensors = self.attack.run(surface, acting, rng)
-        return {name: detector.perturbed(sent[name], tensor) for name, tensor in tensors.items()}
+        met = {**benign, **sent}
+        surface = detector.attack_surface(ego, met)
+        known = Past().situation(frame, ego, met, np.empty((0, 5))) if situation is None else situation
+        known = replace(
+            known,
+            poses={name: message.pose for name, message in met.items()},
+            tensor=lambda message: detector.attack_surface(ego, {"": message}).messages[""],
+        )
+        tensors = self._attacked(surface, acting, rng, known)
+        attacking = {name: detector.perturbed(sent[name], tensor) for name, tensor in tensors.items()}
+        return {**sent, **attacking} if self.pose is not None else attacking
+
+    def _attacked(
+        self, surface: AttackSurface, acting: Sequence[str], rng: np.random.Generator, situation: Situation
+    ) -> Mapping[str, torch.Tensor]:
+        """The attack's tensors, under the campaign's bound and pretences."""
+        if self.attack is None:
+            return {}
+        attack = self.attack if self.bound == 1.0 else replace(self.attack, epsilon=self.epsilon)
+        if not isinstance(attack, IterativeAttack) or not (self.softness or self.alibi):
+            return attack.run(surface, acting, rng, situation)
+        terms = keeping(self.alibi, surface, acting) if self.alibi is not None else []
+        if self.softness:
+            attack = replace(attack, steps=max(attack.steps, SOFT_STEPS), step_size=min(attack.step_size, SOFT_STEP))
+            terms.append(self._paid(surface, situation))
+        sent = attack.optimise(surface, acting, rng, situation, terms, warm=self.remembers)
+        if self.softness and sent:
+            penalties.remember(situation, surface, sent)
+        return sent
+
+    def _paid(self, surface: AttackSurface, situation: Situation) -> Term:
+        def paid(sent: Tensors) -> torch.Tensor:
+            each = [penalty(situation, surface, sent) for penalty in penalties.PENALTIES]
+            return self.softness * torch.stack(each).sum()
+
+        return paid
 
 
 def lacking(attack: Attack | Campaign | None, detector: Preparer) -> str | None:
@@ -180,5 +231,8 @@ BEHAVIOURS: Mapping[str, Mapping[str, Any]] = {
     "covering": {"alibi": covering},
     "framing": {"alibi": framing},
     "false-pose": {"pose": false_pose},
+    "soft": {"softness": 1.0},
+    "soft3": {"softness": 3.0},
+    "double": {"bound": 2.0},
 }
 """All behaviours by name: what each sets of a `Campaign`."""

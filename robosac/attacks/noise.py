@@ -9,6 +9,7 @@ import numpy as np
 import torch
 
 from robosac.attacks.base import Attack
+from robosac.attacks.situation import Situation
 from robosac.detectors.base import AttackSurface
 
 
@@ -18,7 +19,11 @@ class GaussianNoise(Attack):
     name: ClassVar[str] = "noise"
 
     def run(
-        self, surface: AttackSurface, attackers: Collection[str], rng: np.random.Generator
+        self,
+        surface: AttackSurface,
+        attackers: Collection[str],
+        rng: np.random.Generator,
+        situation: Situation | None = None,  # noqa: ARG002
     ) -> dict[str, torch.Tensor]:
         """Add the noise."""
         sent = {}

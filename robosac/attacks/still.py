@@ -11,6 +11,7 @@ import torch
 from robosac.attacks.adaptive import Erase, Invent, Shift
 from robosac.attacks.base import SEEN, Aim, IterativeAttack, Tensors
 from robosac.attacks.geometric import CERTAIN, SHOWN, Perception, displacement, geometric
+from robosac.attacks.situation import Situation
 from robosac.detectors.base import AttackSurface
 
 STILLNESS = 2.0
@@ -35,9 +36,9 @@ class HoldingStill(IterativeAttack):
     everything: ClassVar[bool] = False
     """Whether boxes that only teammates see should stay, too."""
 
-    def aim(self, surface: AttackSurface, attackers: Collection[str]) -> Aim:
+    def aim(self, surface: AttackSurface, attackers: Collection[str], situation: Situation) -> Aim:
         """The attack's own aim and the term that holds still."""
-        harm, shown = super().aim(surface, attackers), geometric(surface)
+        harm, shown = super().aim(surface, attackers, situation), geometric(surface)
         ego = Perception.of(surface, ())
         honest = Perception.of(surface, [name for name in surface.messages if name not in attackers])
         held = honest.scores >= CERTAIN

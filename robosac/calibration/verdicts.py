@@ -10,12 +10,13 @@ from itertools import combinations, pairwise
 import numpy as np
 
 from robosac.attacks import Attack
+from robosac.attacks.situation import Past
 from robosac.boxes import FloatArray
 from robosac.consensus import at_least
 from robosac.defenses.group_testing.geometry import changes, crowd, followed, measure
 from robosac.defenses.group_testing.model import CHANGE_SIZES, change_bin, crowd_bin, pair_bin, size_row
 from robosac.detectors import Detector
-from robosac.evaluation.frames import DecodedOnce, Sensed, Subset, under_attack
+from robosac.evaluation.frames import DecodedOnce, Sensed, Subset, foreign_views, under_attack
 from robosac.evaluation.recordings import record, subsets
 from robosac.scenes import Scene, whose_turn
 
@@ -124,13 +125,16 @@ def validation_stretches(
         ego_id = whose_turn(scene, turn, *frames)
         met = [Sensed.of(detector, frame, ego_id, trial.pose_error_m, rng) for frame in frames]
         team = sorted({name for sensed in met for name in sensed.messages} - {ego_id})
+        other = scenes[(scenes.index(scene) + 1) % len(scenes)]
+        foreign = foreign_views(detector, other if other is not scene else None)
         honest: list[DecodedOnce] = []
         attacked = [(kind, attack, count) for kind, attack in trial.attacks.items() for count in trial.attackers]
         for kind, attack, count in [(None, some, 0), *attacked]:
             chosen = [team[i] for i in rng.choice(len(team), count, replace=False)]
             stretch = []
+            past = Past(scene.frame_period_s, foreign)
             for index, sensed in enumerate(met):
-                frame_met = under_attack(detector, sensed, chosen, attack, rng)
+                frame_met = under_attack(detector, sensed, chosen, attack, rng, past)
                 stretch.append(record(frame_met, honest[index] if honest else None))
                 tick()
             honest = honest or stretch

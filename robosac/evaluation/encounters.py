@@ -11,8 +11,9 @@ import numpy as np
 
 from robosac.attacks import BEHAVIOURS, HONEST, load_campaign
 from robosac.attacks.campaign import SEPARATOR
+from robosac.attacks.situation import Past
 from robosac.detectors import Detector
-from robosac.evaluation.frames import EvaluationFrame, Sensed, under_attack
+from robosac.evaluation.frames import EvaluationFrame, Sensed, foreign_views, under_attack
 from robosac.scenes import Scene
 
 _POSES = 53
@@ -50,6 +51,8 @@ class Encounters:
     """Standard deviation of the error of each teammate's position along either axis, metres; the same errors whatever
     the attack.
     """
+    elsewhere: Scene | None = None
+    """Another scene, for attacks that replay what is sensed there."""
     _sensed: dict[int, Sensed] = field(default_factory=dict, init=False)
 
     def sequence(
@@ -80,13 +83,27 @@ class Encounters:
         return [sequence[index] for index in range(frames)]
 
     def met(self, act: Act, indices: Sequence[int]) -> Iterator[EvaluationFrame]:
-        """The frames of these numbers, if this is done in all of them."""
+        """The frames of these numbers, ascending, if this is done in all of them.
+
+        An attack that remembers is run over all frames from the first of the scene on, and only the wanted ones are
+        given: so they depend on nothing but the act.
+        """
         campaign = load_campaign(act.attack)
         stream = zlib.crc32(repr(tuple(act)).encode())
-        for index in indices:
-            if index not in self._sensed:
-                rng = np.random.default_rng([self.scene.number, _POSES, index])
-                frame, ego = self.scene.frame(index), self.scene.egos[0]
-                self._sensed[index] = Sensed.of(self.detector, frame, ego, self.pose_error_m, rng)
+        wanted, past = set(indices), self._past()
+        for index in range(max(wanted, default=-1) + 1) if campaign.remembers else indices:
             rng = np.random.default_rng([self.seed, _ATTACK, self.scene.number, index, stream])
-            yield under_attack(self.detector, self._sensed[index], act.acting, campaign, rng)
+            past = past if campaign.remembers else self._past()
+            met = under_attack(self.detector, self._sense(index), act.acting, campaign, rng, past)
+            if index in wanted:
+                yield met
+
+    def _past(self) -> Past:
+        return Past(self.scene.frame_period_s, foreign_views(self.detector, self.elsewhere))
+
+    def _sense(self, index: int) -> Sensed:
+        if index not in self._sensed:
+            rng = np.random.default_rng([self.scene.number, _POSES, index])
+            frame, ego = self.scene.frame(index), self.scene.egos[0]
+            self._sensed[index] = Sensed.of(self.detector, frame, ego, self.pose_error_m, rng)
+        return self._sensed[index]

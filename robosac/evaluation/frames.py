@@ -11,13 +11,14 @@ import numpy as np
 
 from robosac.answers import Verdict
 from robosac.attacks import Attack, Campaign
+from robosac.attacks.situation import Foreign, Lie, Past
 from robosac.boxes import FloatArray, pose_matrix
 from robosac.consensus import DEFAULT_THRESHOLD, at_least, compare
 from robosac.defenses import Defense
 from robosac.detectors import Detector, DetectorInfo, Message, PreparedFrame
 from robosac.detectors.base import for_role
 from robosac.fusion import FusionResult, fuse
-from robosac.scenes import Frame, Scene, SceneError, seconds_apart
+from robosac.scenes import Frame, Scene, SceneError, SceneSource, Split, seconds_apart
 
 Subset = frozenset[str]
 YAW_PER_METRE = np.deg2rad(2.0)
@@ -38,6 +39,8 @@ class EvaluationFrame:
     """Those whose message of this frame is not what an honest one would send."""
     truth: FloatArray
     """(G, 5): true boxes; ego frame."""
+    lies: tuple[Lie, ...] = field(default=(), kw_only=True)
+    """What the attack says that it lies about; none for attacks that are on no object."""
 
     @property
     def info(self) -> DetectorInfo:
@@ -144,6 +147,10 @@ class Sensed:
     """By agent: everybody's, the ego's among them, each with all that it would send as an ego."""
     truth: FloatArray
     """(G, 5): true boxes; ego frame."""
+    vehicles: FloatArray | None = None
+    """(V, 5): all other vehicles around the ego as far as the scene tells, what an adversary can know; ego frame. None
+    if that is `truth`.
+    """
 
     @classmethod
     def of(cls, detector: Detector, frame: Frame, ego_id: str, pose_error_m: float, rng: np.random.Generator) -> Sensed:
@@ -158,7 +165,43 @@ class Sensed:
             raise SceneError(f"frame {frame.index}: {ego_id} is to be the ego, and is not there")
         messages = encode_all(detector, frame)
         placed = {n: m if n == ego_id else misplaced(m, pose_error_m, rng) for n, m in messages.items()}
-        return cls(frame.index, ego_id, placed, frame.truth(ego_id))
+        return cls(frame.index, ego_id, placed, frame.truth(ego_id), vehicles_around(frame, ego_id))
+
+
+def vehicles_around(frame: Frame, ego_id: str) -> FloatArray:
+    """All other vehicles around an ego, (V, 5) in its frame: those of `nearby` where a frame has that, else of
+    `truth`.
+    """
+    nearby = getattr(frame, "nearby", None)
+    return frame.truth(ego_id) if nearby is None else np.asarray(nearby(ego_id)[0])
+
+
+def foreign_views(detector: Detector, scene: Scene | None) -> Foreign | None:
+    """What agents sense in another scene, for adversaries that replay it; without a scene there is none.
+
+    An agent that is not there is given the view of another one, the last by name.
+    """
+    if scene is None:
+        return None
+
+    def message(name: str, index: int) -> Message | None:
+        frame = scene.frame(index if scene.length is None else min(index, scene.length - 1))
+        views = frame.views
+        view = views.get(name) or views.get(max(views, default=""))
+        if view is None:
+            return None
+        return for_role(detector.encode(view.points, view.pose), detector.info, "teammate")
+
+    return message
+
+
+def another_scene(source: SceneSource, split: Split, scene: Scene) -> Scene | None:
+    """The scene after this one in its source, the first after the last; None if there is no other."""
+    scenes = source.scenes(split)
+    numbers = [other.number for other in scenes]
+    if scene.number not in numbers or len(scenes) < 2:
+        return None
+    return scenes[(numbers.index(scene.number) + 1) % len(scenes)]
 
 
 def under_attack(
@@ -167,17 +210,30 @@ def under_attack(
     attackers: Collection[str],
     attack: Attack | Campaign,
     rng: np.random.Generator,
+    past: Past | None = None,
 ) -> EvaluationFrame:
     """One frame with some teammates under the adversary's control, who optimises their messages together.
 
-    Those who are not in the frame send nothing. ``rng`` is the attack's.
+    Those who are not in the frame send nothing.
+
+    Parameters
+    ----------
+    rng : numpy.random.Generator
+        The attack's.
+    past : Past, optional
+        What the adversary has of the sequence, to be handed from frame to frame; by default nothing.
     """
+    past = Past() if past is None else past
     ego = sensed.messages[sensed.ego_id]
     others = {name: message for name, message in sensed.messages.items() if name != sensed.ego_id}
     benign = {name: for_role(message, detector.info, "teammate") for name, message in others.items()}
     present = [name for name in attackers if name in benign]
-    sent = Campaign.of(attack).messages(detector, ego, benign, present, sensed.index, rng)
-    return EvaluationFrame(detector, ego, benign, {**benign, **sent}, frozenset(sent), sensed.truth)
+    known = sensed.truth if sensed.vehicles is None else sensed.vehicles
+    situation = past.situation(sensed.index, ego, benign, known)
+    sent = Campaign.of(attack).messages(detector, ego, benign, present, sensed.index, rng, situation)
+    past.keep(sensed.index, benign)
+    lies = tuple(situation.lies)
+    return EvaluationFrame(detector, ego, benign, {**benign, **sent}, frozenset(sent), sensed.truth, lies=lies)
 
 
 def evaluation_frames(  # who senses where, and what is drawn: callers vary all of it

@@ -10,9 +10,11 @@ from collections.abc import Collection, Iterator, Mapping, Sequence
 from dataclasses import dataclass, field
 from itertools import combinations
 from pathlib import Path
+from typing import Any
 
 import numpy as np
 
+from robosac.attacks.situation import Lie
 from robosac.boxes import FloatArray
 from robosac.detectors import Detector, Message
 from robosac.evaluation.encounters import NOBODY_ACTS, Act, Encounters
@@ -39,7 +41,7 @@ def record(frame: EvaluationFrame, unattacked: DecodedOnce | None = None) -> Dec
             boxes[subset] = unattacked.detect(subset)
         else:
             boxes[subset] = prepared.detect(sorted(subset)).astype(np.float32).astype(np.float64)
-    return recorded(frame.detector, frame.ego.pose, frame.team, frame.attackers, frame.truth, boxes)
+    return recorded(frame.detector, frame.ego.pose, frame.team, frame.attackers, frame.truth, boxes, frame.lies)
 
 
 def recorded(
@@ -49,10 +51,12 @@ def recorded(
     attackers: Collection[str],
     truth: FloatArray,
     boxes: dict[Subset, FloatArray],
+    lies: Sequence[Lie] = (),
 ) -> DecodedOnce:
-    """A frame of which nothing is known but the ego's pose, the true boxes, and the boxes of all subsets."""
+    """A frame of which nothing is known but the ego's pose, true boxes, lies, and the boxes of all subsets."""
     empty = Message(pose, {})
-    return DecodedOnce(detector, empty, {}, dict.fromkeys(team, empty), frozenset(attackers), truth, boxes)
+    sent = dict.fromkeys(team, empty)
+    return DecodedOnce(detector, empty, {}, sent, frozenset(attackers), truth, boxes, lies=tuple(lies))
 
 
 @dataclass
@@ -95,7 +99,10 @@ class Recordings(Encounters):
 def save(path: Path, frames: Mapping[int, DecodedOnce]) -> None:
     """Write frames of one team, by their numbers, to an ``.npz`` file, which takes its place at once."""
     ordered = sorted(frames.items())
-    head = [{"index": i, "attackers": sorted(f.attackers), "team": list(f.team)} for i, f in ordered]
+    head = [
+        {"index": i, "attackers": sorted(f.attackers), "team": list(f.team), "lies": [_told(lie) for lie in f.lies]}
+        for i, f in ordered
+    ]
     boxes = [frame.boxes[subset] for _, frame in ordered for subset in subsets(frame.team)]
     partial = path.with_name(f"{path.stem}.{os.getpid()}.npz")
     np.savez_compressed(
@@ -120,8 +127,19 @@ def load(path: Path, detector: Detector) -> dict[int, DecodedOnce]:
     for entry, pose, truth in zip(head, poses, truths, strict=True):
         team = entry["team"]
         decoded = {subset: next(boxes) for subset in subsets(team)}
-        frames[entry["index"]] = recorded(detector, pose, team, entry["attackers"], truth, decoded)
+        lies = [_heard(lie) for lie in entry.get("lies", ())]  # recordings from before attacks on objects tell none
+        frames[entry["index"]] = recorded(detector, pose, team, entry["attackers"], truth, decoded, lies)
     return frames
+
+
+def _told(lie: Lie) -> dict[str, Any]:
+    truth = None if lie.truth is None else lie.truth.tolist()
+    return {"kind": lie.kind, "box": lie.box.tolist(), "number": lie.number, "truth": truth}
+
+
+def _heard(values: Mapping[str, Any]) -> Lie:
+    truth = None if values["truth"] is None else np.array(values["truth"])
+    return Lie(values["kind"], np.array(values["box"]), values["number"], truth)
 
 
 def subsets(team: Sequence[str]) -> list[Subset]:

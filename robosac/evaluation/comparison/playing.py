@@ -15,7 +15,8 @@ from robosac.detectors import Detector
 from robosac.evaluation.average_precision import Matched, match
 from robosac.evaluation.comparison.settings import Extent, Setting
 from robosac.evaluation.encounters import Encounters
-from robosac.evaluation.frames import EvaluationFrame
+from robosac.evaluation.frames import EvaluationFrame, another_scene
+from robosac.evaluation.objects import Judged, ObjectHistory, Shown, judge
 from robosac.evaluation.playing import FaultyDefense, play
 from robosac.evaluation.recordings import Recordings
 from robosac.scenes import Scene, SceneError, SceneSource, first_scenes
@@ -100,6 +101,8 @@ class Played:
     """Empty unless live."""
     naming: Naming | None = None
     """None where the defence names nobody."""
+    objects: ObjectHistory = field(default_factory=ObjectHistory)
+    """What became of the lies about single objects, if there were any."""
 
     def add(self, frame: EvaluationFrame, matched: Matched, accepted: Collection[str], passes: int) -> None:
         """Add a frame."""
@@ -118,21 +121,21 @@ def play_scene(plan: Plan, scene: Scene, tick: Callable[[], None] = lambda: None
     FaultyDefense
         If a defence fails.
     """
-    what = (plan.detector, scene, plan.seed, plan.pose_error_m)
+    what = (plan.detector, scene, plan.seed, plan.pose_error_m, another_scene(plan.data, "test", scene))
     source = Encounters(*what) if plan.live else Recordings(*what, plan.recordings, plan.data.name)
     played: dict[tuple[Setting, str], Played] = {}
     for setting in plan.extent.settings:
         chosen = attackers(scene, setting.attackers, plan.seed)
         sequence = source.sequence(plan.extent.frames, setting.campaign, chosen, tick)
-        matcher = _Matcher(sequence)
-        played[setting, ORACLE] = _reference(sequence, matcher, lambda frame: frame.honest)
+        matcher, judge_lies = _Matcher(sequence), _Judge(sequence)
+        played[setting, ORACLE] = _reference(sequence, matcher, judge_lies, lambda frame: frame.honest)
         for name, defense in plan.defenses.items():
             rng = np.random.default_rng([plan.seed, scene.number, zlib.crc32(name.encode())])
             try:
-                played[setting, name] = _play(defense, sequence, matcher, chosen, rng)
+                played[setting, name] = _play(defense, sequence, matcher, judge_lies, chosen, rng)
             except FaultyDefense as fault:
                 raise FaultyDefense(f"{name}, {fault}") from fault
-        played[setting, EGO_ONLY] = _reference(sequence, matcher, lambda _: ())
+        played[setting, EGO_ONLY] = _reference(sequence, matcher, judge_lies, lambda _: ())
     return played
 
 
@@ -157,15 +160,38 @@ class _Matcher:
         return self._known[key]
 
 
+class _Judge:
+    """Judges what is answered of the lies of a sequence."""
+
+    def __init__(self, sequence: Sequence[EvaluationFrame]) -> None:
+        self._sequence = sequence
+        self._ideal = [_fused(frame, frame.honest) if frame.lies else np.empty((0, 6)) for frame in sequence]
+        self.undefended = [
+            self(index, Shown(_fused(frame, frame.team))) if frame.lies else () for index, frame in enumerate(sequence)
+        ]
+
+    def __call__(self, index: int, shown: Shown) -> tuple[Judged, ...]:
+        frame = self._sequence[index]
+        return judge(frame.lies, shown, frame.truth, self._ideal[index])
+
+
+def _fused(frame: EvaluationFrame, subset: Collection[str]) -> FloatArray:
+    return frame.prepare(frame.ego, frame.teammates).detect(subset)
+
+
 def _reference(
-    sequence: Sequence[EvaluationFrame], matcher: _Matcher, choose: Callable[[EvaluationFrame], tuple[str, ...]]
+    sequence: Sequence[EvaluationFrame],
+    matcher: _Matcher,
+    judge_lies: _Judge,
+    choose: Callable[[EvaluationFrame], tuple[str, ...]],
 ) -> Played:
     """Fuse what is chosen in each frame, whatever it looks like."""
-    played = Played()
+    played = Played(objects=ObjectHistory(undefended=judge_lies.undefended))
     for index, frame in enumerate(sequence):
         accepted = choose(frame)
-        boxes = frame.prepare(frame.ego, frame.teammates).detect(accepted)
+        boxes = _fused(frame, accepted)
         played.add(frame, matcher(index, boxes), accepted, int(bool(accepted)))
+        played.objects.judged.append(judge_lies(index, Shown(boxes)))
     return played
 
 
@@ -173,17 +199,23 @@ def _play(
     defense: Defense,
     sequence: Sequence[EvaluationFrame],
     matcher: _Matcher,
+    judge_lies: _Judge,
     chosen: Collection[str],
     rng: np.random.Generator,
 ) -> Played:
     """One sequence as a session, with the defence's memory."""
-    played = Played()
+    played = Played(objects=ObjectHistory(undefended=judge_lies.undefended))
     named: list[tuple[str, ...] | None] = []
     for index, (frame, answer) in enumerate(zip(sequence, play(defense, sequence, rng), strict=True)):
         result = answer.result
         played.add(frame, matcher(index, result.boxes), result.accepted, answer.passes)
         played.milliseconds.append(answer.milliseconds)
         named.append(result.named)
+        if frame.lies:
+            played.objects.judged.append(judge_lies(index, Shown.of(result.answer(index, {}, {}))))
+        else:
+            played.objects.judged.append(())
+        played.objects.all_named.append(bool(chosen) and set(chosen) <= set(result.named or ()))
     if any(names is not None for names in named):
         played.naming = _naming(sequence, [frozenset(names or ()) for names in named], chosen)
     return played

@@ -7,7 +7,7 @@ from pathlib import Path
 
 from robosac.evaluation.comparison.pictures import draw_passes, draw_precision
 from robosac.evaluation.comparison.playing import Plan
-from robosac.evaluation.comparison.rows import WINDOWS, Estimate, Figures, NamingFigures, Row
+from robosac.evaluation.comparison.rows import WINDOWS, Estimate, Figures, NamingFigures, ObjectFigures, Row
 from robosac.evaluation.comparison.tables import sections
 from robosac.evaluation.report import Table, write_csv, write_report
 
@@ -23,6 +23,8 @@ PRECISION, PASSES = "precision.png", "passes.png"
 ESTIMATES = ("ap50", "ap70", "ap50_difference", "ap70_difference", "ap70_ratio")
 OVERALL = ("passes_first", "passes_early", "passes_steady", "honest_refused", "milliseconds")
 NAMING = tuple(NamingFigures.__dataclass_fields__)
+SHARES = ("held", "flagged", "confirmed")
+OBJECTS = tuple(ObjectFigures.__dataclass_fields__)
 
 
 def write_comparison(rows: Sequence[Row], plan: Plan, out: Path, command: str) -> Path:
@@ -60,7 +62,18 @@ def _flat(row: Row) -> dict[str, object]:
         suffix = f"_from_{first}" if first else ""
         line |= {f"{name}{suffix}": value for name, value in _figures(row.windows.get(first)).items()}
     line |= {name: _rounded(getattr(row, name)) for name in OVERALL}
-    return line | {name: _rounded(getattr(row.naming, name, None)) for name in NAMING}
+    line |= {name: _rounded(getattr(row.naming, name, None)) for name in NAMING}
+    return line | _objects(row.objects)
+
+
+def _objects(objects: ObjectFigures | None) -> dict[str, object]:
+    line: dict[str, object] = {}
+    for name in OBJECTS:
+        value = getattr(objects, name, None)
+        line[name] = _rounded(value.value if isinstance(value, Estimate) else value)
+        if name in SHARES:
+            line[f"{name}_se"] = _rounded(value.error) if isinstance(value, Estimate) else None
+    return line
 
 
 def _figures(figures: Figures | None) -> dict[str, object]:

@@ -12,6 +12,7 @@ from robosac.boxes import FloatArray
 from robosac.evaluation.average_precision import AveragePrecision
 from robosac.evaluation.comparison.playing import Naming, Played
 from robosac.evaluation.comparison.settings import Setting
+from robosac.evaluation.objects import ObjectHistory, object_rates
 
 EARLY = 5
 """The frames after these count as steady."""
@@ -70,6 +71,31 @@ class NamingFigures:
     honest_named: int
     honest: int
     """Honest teammates that were ever named, and all of them."""
+    sequences_honest_named: int
+    sequences: int
+    """Sequences in which any honest teammate was named, and all of them."""
+
+
+@dataclass(frozen=True)
+class ObjectFigures:
+    """What became of lies about single objects, as `robosac.evaluation.objects.object_rates` counts it."""
+
+    held: Estimate
+    """Share of object frames in which the answer tells the lie."""
+    longest: int
+    """Most successive frames of a sequence in which it tells one and the same."""
+    flagged: Estimate | None
+    confirmed: Estimate | None
+    """Shares of object frames in which the answer contradicts or repairs it, and tells it as confirmed; None from a
+    defence that does not know how boxes stand.
+    """
+    frames_to_flag: float | None
+    sequences_shown: int
+    """Sequences in which a lie holds in the undefended fusion at all."""
+    shown_named: int
+    """Those of them in which all attackers were named."""
+    frames_to_name_shown: float | None
+    """Frames from the first in which it does until they are, the mean over those."""
 
 
 @dataclass(frozen=True)
@@ -94,8 +120,8 @@ class Row:
     true_boxes: float = 0.0
     """A frame."""
     sequences: int = 0
-    wrongly_naming: int = 0
-    """All sequences, and those in which an honest teammate was ever named."""
+    objects: ObjectFigures | None = None
+    """None where nobody lies about single objects."""
 
     @property
     def whole(self) -> Figures:
@@ -152,7 +178,7 @@ def sum_up(
         naming=_naming(naming) if naming else None,
         true_boxes=float(np.mean([frame.truths for played in sequences for frame in played.matched])),
         sequences=len(sequences),
-        wrongly_naming=sum(each.honest_named > 0 for each in naming),
+        objects=_objects([played.objects for played in sequences]),
     )
 
 
@@ -176,7 +202,32 @@ def _naming(sequences: Sequence[Naming]) -> NamingFigures:
         frames_to_name_most=max(after, default=None),
         honest_named=sum(naming.honest_named for naming in sequences),
         honest=sum(naming.honest for naming in sequences),
+        sequences_honest_named=sum(naming.honest_named > 0 for naming in sequences),
+        sequences=len(sequences),
     )
+
+
+def _objects(histories: Sequence[ObjectHistory]) -> ObjectFigures | None:
+    rates = object_rates(histories)
+    if rates is None:
+        return None
+    counts = np.array([history.tally for history in histories], dtype=np.float64)
+    frames, held, flag_known, flagged, standing_known, confirmed = np.vstack([counts.sum(0), counts.sum(0) - counts]).T
+    return ObjectFigures(
+        held=_share(held, frames),
+        longest=rates["longest"],
+        flagged=_share(flagged, flag_known) if flag_known[0] else None,
+        confirmed=_share(confirmed, standing_known) if standing_known[0] else None,
+        frames_to_flag=rates["frames_to_flag"],
+        sequences_shown=rates["sequences_shown"],
+        shown_named=rates["shown_named"],
+        frames_to_name_shown=rates["frames_to_name"],
+    )
+
+
+def _share(part: FloatArray, whole: FloatArray) -> Estimate:
+    """Of all sequences and without each in turn, (1 + n,) both; where nothing is left, the share of all."""
+    return Estimate.of(np.divide(part, whole, out=np.full_like(part, part[0] / whole[0]), where=whole > 0))
 
 
 def _mean(values: Sequence[Any]) -> float | None:

@@ -106,6 +106,8 @@ FULL = Extent(
         erase:1 erase:2 invent:1 invent:2 shift:1 shift:2 erase-still:1 invent-still:1 invent-steady:1 shift-still:1
         pgd@asleep:1 erase@asleep:1 erase@asleep:2 invent@asleep:1 pgd@flicker:1 erase@flicker:1 erase@turns:2
         pgd@covering:2 pgd@covering@asleep:2 pgd@framing:1 honest@false-pose:1
+        ghost:1 ghost:2 ghost-driving:1 ghost-ahead:1 ghosts:1 swarm:1 remove:1 remove:2 remove-many:1 displace:1
+        frozen:1 stale:1 elsewhere:1 copy:1 shift@soft:1 shift@soft:2 shift@soft3:1 erase@soft3:1
     """),
     scenes=40,
     frames=25,

@@ -5,7 +5,7 @@ from __future__ import annotations
 from collections.abc import Callable, Sequence
 
 from robosac.evaluation.comparison.playing import EGO_ONLY, ORACLE
-from robosac.evaluation.comparison.rows import EARLY, WINDOWS, Estimate, Figures, NamingFigures, Row
+from robosac.evaluation.comparison.rows import EARLY, WINDOWS, Estimate, Figures, NamingFigures, ObjectFigures, Row
 from robosac.evaluation.comparison.settings import NOBODY
 from robosac.evaluation.report import Section, Table
 
@@ -30,6 +30,7 @@ def sections(rows: Sequence[Row], precision_picture: str, passes_picture: str) -
         _pivot("Share of honest messages left out", rows, lambda row: _number(row.honest_refused)),
         _pivot("Time of a frame, median, ms", timed, lambda row: _number(row.milliseconds)),
         _quiet([row for row in rows if row.setting == NOBODY]),
+        _objects([row for row in rows if row.objects is not None]),
         _pivot(
             "Naming: sequences with all attackers named / frames it took / honest teammates named",
             naming,
@@ -57,10 +58,40 @@ def _quiet(rows: Sequence[Row]) -> Section:
             "AP70 lost": f"{-row.whole.ap70_difference.value + 0.0:.3f}",
             "passes, later frames": f"{row.passes_steady:.2f}",
             "honest messages left out": _number(row.honest_refused),
+            "honest named": f"{row.naming.honest_named} of {row.naming.honest}" if row.naming else "-",
+            "in sequences": f"{row.naming.sequences_honest_named} of {row.naming.sequences}" if row.naming else "-",
         }
         for row in rows
     ]
     return Section("What it costs when nobody attacks", "", [Table.of(lines)])
+
+
+def _objects(rows: Sequence[Row]) -> Section:
+    text = (
+        "An object frame is one lie about a single object in one frame. The answer *tells* it if it has the ghost, "
+        "misses the erased vehicle where the oracle finds it, or shows the moved one nearer to the lie than to the "
+        "truth. "
+        "*Flagged* are lies that the answer contradicts or repairs. *Shows*: sequences in which the undefended fusion "
+        "tells a lie at all; from its first frame there on frames to name are counted."
+    )
+    return Section("Objects", text, [Table.of([_told(row, row.objects) for row in rows if row.objects])])
+
+
+def _told(row: Row, objects: ObjectFigures) -> dict[str, str]:
+    named = row.naming is not None
+    return {
+        "attack": row.setting.label,
+        "defence": row.defense,
+        "tells the lie": _estimate(objects.held),
+        "longest, frames": str(objects.longest),
+        "flagged": _estimate(objects.flagged),
+        "told as confirmed": _estimate(objects.confirmed),
+        "frames to flag": _number(objects.frames_to_flag),
+        "shows, sequences": str(objects.sequences_shown),
+        "all attackers named in": f"{objects.shown_named} of {objects.sequences_shown}" if named else "-",
+        "frames to name": _number(objects.frames_to_name_shown),
+        "AP50/AP70": _precision(row.whole),
+    }
 
 
 def _naming(defense: str, rows: Sequence[Row]) -> Section:
@@ -68,8 +99,14 @@ def _naming(defense: str, rows: Sequence[Row]) -> Section:
     at = {(row.setting, row.defense): row for row in rows}
     own = [row for row in rows if row.defense == defense]
     lines = [_line(row, at[row.setting, ORACLE], at[row.setting, EGO_ONLY]) for row in own]
-    named, honest = (sum(getattr(row.naming, of, 0) for row in own) for of in ("honest_named", "honest"))
-    text = f"Frames are counted from 0. Honest teammates named, over all attacks: {named} of {honest}."
+    named, honest, spoilt, played = (
+        sum(getattr(row.naming, of, 0) for row in own)
+        for of in ("honest_named", "honest", "sequences_honest_named", "sequences")
+    )
+    text = (
+        f"Frames are counted from 0. Honest teammates named, over all attacks: {named} of {honest}. "
+        f"Sequences with any of them named: {spoilt} of {played}."
+    )
     return Section(f"{defense} in detail", text, [Table.of(lines)])
 
 
@@ -91,6 +128,7 @@ def _line(row: Row, oracle: Row, alone: Row) -> dict[str, str]:
         if naming and naming.frames_to_name_each
         else "-",
         "honest named": f"{naming.honest_named} of {naming.honest}" if naming else "-",
+        "in sequences": f"{naming.sequences_honest_named} of {naming.sequences}" if naming else "-",
     }
 
 

@@ -85,7 +85,7 @@ def _flat(world: str, row: Row, oracle: Row, bare: Row | None, alone: Row) -> di
         "honest_refused": None if row.honest_refused is None else round(row.honest_refused, 5),
         "honest_named": naming.honest_named if naming else None,
         "honest": naming.honest if naming else None,
-        "sequences_honest_named": row.wrongly_naming if naming else None,
+        "sequences_honest_named": naming.sequences_honest_named if naming else None,
         "passes_first": round(row.passes_first, 3),
         "passes_steady": round(row.passes_steady, 3),
     }
@@ -105,7 +105,7 @@ def _shown(world: str, row: Row, oracle: Row, bare: Row | None, alone: Row) -> d
         "AP70 lost": _lost(row.whole.ap70_difference),
         "honest messages left out": "-" if row.honest_refused is None else f"{row.honest_refused:.3f}",
         "honest teammates named": f"{naming.honest_named} of {naming.honest}" if naming else "-",
-        "in sequences": f"{row.wrongly_naming} of {row.sequences}" if naming else "-",
+        "in sequences": f"{naming.sequences_honest_named} of {row.sequences}" if naming else "-",
         "passes: first / later": f"{row.passes_first:.2f} / {row.passes_steady:.2f}",
     }
 

@@ -13,6 +13,7 @@ from robosac.attacks import (
     Campaign,
     GaussianNoise,
     IterativeAttack,
+    Past,
     lacking,
     load_campaign,
 )
@@ -20,6 +21,7 @@ from robosac.attacks.alibi import covering, framing
 from robosac.attacks.campaign import always, asleep, false_pose, flicker, turns
 from robosac.boxes import from_world, pose_matrix
 from robosac.evaluation.frames import Sensed, under_attack
+from robosac.scenes import IntersectionScene
 
 PAIR = ["car-2", "rsu"]
 
@@ -56,9 +58,10 @@ def test_a_false_pose_moves_the_message_along_the_sender_axes():
     assert moved == pytest.approx(1.0)
 
 
-def under(campaign, messages, detector, index=0, attackers=("car-2",)):
-    sensed = Sensed(index, "car-1", messages, np.empty((0, 5)))
-    return under_attack(detector, sensed, attackers, campaign, np.random.default_rng(0))
+def under(campaign, messages, detector, index=0, attackers=("car-2",), past=None):
+    truth = IntersectionScene(seed=3).frame(0).truth("car-1")
+    sensed = Sensed(index, "car-1", messages, truth)
+    return under_attack(detector, sensed, attackers, campaign, np.random.default_rng(0), past)
 
 
 def test_asleep_all_send_what_is_honest(detector, messages):
@@ -179,7 +182,13 @@ def test_what_an_attack_needs_is_enough_and_its_lack_is_said_before(spec, detect
         campaign = replace(campaign, attack=replace(campaign.attack, steps=1))
     enough = Showing(detector, *campaign.needs)
     assert lacking(campaign, enough) is None
-    assert under(campaign, messages, enough).attackers == {"car-2"}
+    names = sorted(messages)
+    others = {
+        n: replace(messages[n], tensors=messages[o].tensors) for n, o in zip(names, names[1:] + names[:1], strict=True)
+    }
+    past = Past(foreign=lambda name, frame: messages["rsu"])
+    under(campaign, others, enough, past=past)
+    assert under(campaign, messages, enough, 1, past=past).attackers == {"car-2"}
     for part in campaign.needs:
         said = lacking(campaign, Showing(detector, *{*campaign.needs} - {part}))
         start = f"{campaign.name} cannot attack the detector intersection-mean: its attack surface lacks {part} ("

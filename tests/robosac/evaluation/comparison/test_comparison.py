@@ -118,12 +118,12 @@ def test_who_names_whom_and_when(plan):
         "nobody": Accuser(),
     }
     at = {row.defense: row.naming for row in compare_defenses(plan(accusers, late))}
-    assert at["everybody"] == NamingFigures(1.0, 2.0, 1, 1, 2.0, 2, 4, 4)
+    assert at["everybody"] == NamingFigures(1.0, 2.0, 1, 1, 2.0, 2, 4, 4, 1, 1)
     assert (at["at once"].frames_to_name, at["at once"].frames_to_name_each) == (1.0, 1.0)
-    assert at["nobody"] == NamingFigures(0.0, None, 0, 1, None, None, 0, 4)
+    assert at["nobody"] == NamingFigures(0.0, None, 0, 1, None, None, 0, 4, 0, 1)
     quiet = Extent((NOBODY,), scenes=1, frames=6)
     (_, calm, _) = compare_defenses(plan({"a": Accuser(accused=team[:2])}, quiet))
-    assert calm.naming == NamingFigures(None, None, 0, 0, None, None, 2, 5)
+    assert calm.naming == NamingFigures(None, None, 0, 0, None, None, 2, 5, 1, 1)
 
 
 def test_a_sleeping_attacker_counts_as_honest_until_it_strikes(plan):
@@ -179,9 +179,9 @@ def test_naming_has_its_own_tables(plan, tmp_path):
         f"{own.ap50.value:.3f} / {own.ap70.value:.3f} | "
         f"{own.ap50.value - ideal.ap50.value:+.3f} / {own.ap70.value - ideal.ap70.value:+.3f} | - | - | "
         f"{rows[1].whole.ap70.value / rows[0].whole.ap70.value:.3f} | {rows[2].whole.ap70.value:.3f} | "
-        "0.0 / 0.0 / 0.00 | 1 of 1 | 2.0, 2 | 4 of 4 |"
+        "0.0 / 0.0 / 0.00 | 1 of 1 | 2.0, 2 | 4 of 4 | 1 of 1 |"
     ) in text
-    assert "Honest teammates named, over all attacks: 9 of 9." in text
+    assert "Honest teammates named, over all attacks: 9 of 9. Sequences with any of them named: 2 of 2." in text
     with (tmp_path / "comparison.csv").open() as file:
         lines = [line for line in csv.DictReader(file) if line["defense"] == "a"]
     assert [(line["honest_named"], line["honest"]) for line in lines] == [("4", "4"), ("5", "5")]

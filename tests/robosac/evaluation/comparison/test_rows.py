@@ -95,4 +95,4 @@ def test_naming_is_summed_over_sequences(played, oracle):
     for one, naming in zip(played, namings, strict=True):
         one.naming = naming
     row = sum_up(NOBODY, "x", played, precisions(oracle))
-    assert row.naming == NamingFigures(0.5, 4.0, 3, 4, 4.0, 7, 1, 9)
+    assert row.naming == NamingFigures(0.5, 4.0, 3, 4, 4.0, 7, 1, 9, 1, 3)

@@ -85,8 +85,10 @@ def test_true_boxes_and_wrong_names_are_counted_by_sequence(detector, tmp_path):
     truth = [len(s.frame(i).truth("car-1")) for s in plan.scenes() for i in range(6)]
     assert all(row.true_boxes == pytest.approx(np.mean(truth)) for row in rows)
     quiet, noisy = (row for row in rows if row.defense == "a")
-    assert (quiet.wrongly_naming, quiet.sequences, quiet.naming.honest_named) == (3, 3, 3)
-    assert noisy.wrongly_naming == noisy.naming.honest_named == wrongly  # where it attacks it is named rightly
+    assert (quiet.naming.sequences_honest_named, quiet.sequences, quiet.naming.honest_named) == (3, 3, 3)
+    assert (
+        noisy.naming.sequences_honest_named == noisy.naming.honest_named == wrongly
+    )  # where it attacks it is named rightly
     write_worlds({"mine": rows}, {"mine": plan}, tmp_path, "the command")
     assert f"| mine | a | {np.mean(truth):.1f} | " in (tmp_path / "worlds.md").read_text()
     assert "| 3 of 15 | 3 of 3 | 0.00 / 0.00 |" in (tmp_path / "worlds.md").read_text()
