@@ -5,14 +5,14 @@ from __future__ import annotations
 import json
 import math
 from collections import deque
-from collections.abc import Iterable, Iterator, Mapping
+from collections.abc import Iterable, Iterator, Mapping, Sequence
 from dataclasses import dataclass
 from typing import Any
 
 import numpy as np
 
 from robosac import wire
-from robosac.answers import TestedHypothesis
+from robosac.answers import ContradictedBox, Support, TestedHypothesis
 from robosac.audit.events import FrameAnswered, RecordError, SessionOpened, TeamChanged, event_on
 from robosac.budget import DomainError
 from robosac.calibrated import calibration_digest, calibration_of
@@ -138,7 +138,10 @@ def replay(decision: LoggedDecision, body: bytes, detector: Preparer, kinds: Kin
         raise ReplayError(f"the log's settings make no defence: {error}") from error
     messages = _read_messages(decision, body, detector)
     wrong = list(_compare_digests(logged, messages))
-    return wrong or list(_compare(logged, _fuse(decision, defense, messages, detector)))
+    if wrong:
+        return wrong
+    made = _fuse(decision, defense, messages, detector)
+    return [*_compare(logged, made), *_compare_provenance(logged, made, decision.session.ego_id)]
 
 
 def _before(answer: FrameAnswered, recent: Iterable[FrameAnswered]) -> PreviousAnswer | None:
@@ -207,6 +210,36 @@ def _compare(logged: FrameAnswered, made: FusionResult) -> Iterator[Difference]:
         yield Difference("boxes", f"{len(made.boxes)} of them, logged {len(logged.boxes)}")
     elif (farthest := float(np.abs(made.boxes - logged.boxes).max(initial=0.0))) > BOX_TOLERANCE:
         yield Difference("boxes", f"up to {farthest:.3g} from those logged")
+
+
+def _compare_provenance(logged: FrameAnswered, made: FusionResult, ego_id: str) -> Iterator[Difference]:
+    """On whose word boxes stand, and which are left out; older versions wrote neither."""
+    supports: list[tuple[str, Sequence[Support] | None, Sequence[Support] | None]] = [
+        ("support", made.support(ego_id), logged.support),
+        ("contradicted", made.left_out(ego_id), logged.contradicted),
+    ]
+    for what, now, then in supports:
+        if what not in logged.model_fields_set:
+            continue
+        if now is None or then is None or len(now) != len(then):
+            if now != then:
+                yield Difference(what, f"{_counted(now)}, logged {_counted(then)}")
+            continue
+        for i, (mine, theirs) in enumerate(zip(now, then, strict=True)):
+            if _whose(mine) != _whose(theirs):
+                yield Difference(what, f"box {i}: {_shown(_whose(mine))}, logged {_shown(_whose(theirs))}")
+            elif isinstance(mine, ContradictedBox) and isinstance(theirs, ContradictedBox):
+                farthest = float(np.abs(np.subtract(mine.box, theirs.box)).max())
+                if farthest > BOX_TOLERANCE:
+                    yield Difference(what, f"box {i}: up to {farthest:.3g} from the one logged")
+
+
+def _whose(support: Support) -> list[Any]:
+    return [support.status.value, list(support.witnesses), list(support.deniers)]
+
+
+def _counted(supports: Sequence[Support] | None) -> str:
+    return "not known" if supports is None else f"that of {len(supports)} boxes"
 
 
 def _compare_hypotheses(logged: FrameAnswered, made: FusionResult) -> Iterator[Difference]:
