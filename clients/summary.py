@@ -213,4 +213,4 @@ def _draw(example: Example, path: Path) -> None:
             draw_boxes(axes, boxes, colour, label)
         frame_axes(axes, title)
     figure.suptitle(f"Scene {frame.scene}, frame {answer.frame}, {frame.ego_id}; boxes from the consensus score on")
-    figure.savefig(path, dpi=90)
+    figure.savefig(path, dpi=90, bbox_inches="tight")
