@@ -57,6 +57,9 @@ class Reason(StrEnum):
     STALE = "stale"
     UNAUTHENTICATED = "unauthenticated"
     REPLAYED = "replayed"
+    IMPLAUSIBLE = "implausible"
+    REPEATED = "repeated"
+    COPIED = "copied"
 
 
 class Distrust(StrEnum):
@@ -161,6 +164,18 @@ class ContradictedBox(Support):
     )
 
 
+class Likeness(Typed):
+    """Two maps that are more alike than those of honest vehicles in traffic; it accuses neither.
+
+    ``other`` sent its map in the frame ``of_frame``; it may be the same vehicle, in another place.
+    """
+
+    vehicle: str
+    other: str
+    of_frame: int
+    correlation: float
+
+
 class RejectedTeammate(Typed):
     """Why an enrolled teammate is not in the answer; evidence follows as further fields."""
 
@@ -209,6 +224,9 @@ class FrameAnswer(Typed):
     attacker_ratio: float | None
     suspicion: dict[str, float] | None = Field(
         None, description="Probability that each teammate attacks, where the defence knows it."
+    )
+    alike: tuple[Likeness, ...] = Field(
+        (), exclude_if=lambda value: not value, description="Maps that are strangely alike, most alike first."
     )
     deadline_met: bool
     degraded_by: Literal["deadline", "fault"] | None = Field(description="What cut the defence short, if anything.")

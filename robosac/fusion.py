@@ -35,6 +35,7 @@ from robosac.faults import describe
 from robosac.previous import PreviousAnswer
 from robosac.provenance import best_first, unfounded
 from robosac.result import FusionResult
+from robosac.screening import Screened, Screening, joined, separated
 
 __all__ = ["FusionResult", "UnverifiedAnswer", "fuse"]
 
@@ -58,6 +59,7 @@ def fuse(  # all that a decision follows from, so that it can be made again
     frame: int = 0,
     previous: PreviousAnswer | None = None,
     deadline: Deadline | None = None,
+    screening: Screening | None = None,
 ) -> FusionResult:
     """Answer one frame.
 
@@ -83,12 +85,16 @@ def fuse(  # all that a decision follows from, so that it can be made again
     deadline : Deadline, optional
         No hypothesis is begun that it has no time for; by default there is time for all. Where nothing is verified or
         trusted, the ego's own perception is computed in any case.
+    screening : Screening, optional
+        Tests of the messages before any of them is fused; whoever fails them is rejected for the frame. What they
+        remember is part of the state. By default there are none.
 
     Returns
     -------
     FusionResult
     """
-    return _FrameRun(detector, defense, ego, frame, previous, deadline or Deadline()).answer(teammates, rng, state)
+    run = _FrameRun(detector, defense, ego, frame, previous, deadline or Deadline(), screening)
+    return run.answer(teammates, rng, state)
 
 
 @dataclass
@@ -101,8 +107,9 @@ class _FrameRun:
     frame: int
     previous: PreviousAnswer | None
     deadline: Deadline
+    screening: Screening | None = None
     timings: dict[str, float] = field(
-        default_factory=lambda: dict.fromkeys(("prepare", "ego_only", "hypotheses", "consensus"), 0.0)
+        default_factory=lambda: dict.fromkeys(("screening", "prepare", "ego_only", "hypotheses", "consensus"), 0.0)
     )
     outcomes: list[Outcome] = field(default_factory=list)
     boxes: dict[Hypothesis, FloatArray] = field(default_factory=dict)
@@ -113,19 +120,29 @@ class _FrameRun:
         team = sorted(teammates)  # the draws must not depend on the order of arrival
         if state is None:
             state = self.defense.initial_state(team)
+        state, memory = separated(state)
+        screened = Screened({}, (), memory)
         try:
-            prepared = self._prepare(teammates)
-            decision = self._converse(prepared, team, state, rng)
+            if self.screening is not None:
+                screened = self._screen(self.screening, memory, teammates)
+            passed = {name: teammates[name] for name in team if name not in screened.refused}
+            prepared = self._prepare(passed)
+            decision = self._converse(prepared, list(passed), state, rng)
             answered = self._assemble(prepared, decision)
         except Exception as error:
             logger.exception("fusion failed; answering with the ego's own perception")
             self.fault = describe(error)
-            rejected = {name: Rejection(Reason.NOT_SAMPLED, {"fault": self.fault}) for name in team}
+            passed = {name: teammates[name] for name in team if name not in screened.refused}
+            rejected = {name: Rejection(Reason.NOT_SAMPLED, {"fault": self.fault}) for name in passed}
             decision = Decision((), Source.EGO_ONLY, rejected, None, state)
             answered = self._assemble(self._prepare({}), decision)
         boxes = answered["boxes"]
+        decided = {part.name: getattr(decision, part.name) for part in fields(Decision)}
+        answered["rejected"] = {**decision.rejected, **screened.refused}
+        answered["state"] = joined(decision.state, screened.memory)
         return FusionResult(
-            **{part.name: getattr(decision, part.name) for part in fields(Decision)} | answered,
+            **decided | answered,
+            alike=screened.alike,
             hypotheses=tuple(self.outcomes),
             deadline_met=self.deadline.is_met,
             out_of_time=self.out_of_time,
@@ -133,6 +150,10 @@ class _FrameRun:
             timings_ms=self.timings,
             previous=PreviousAnswer.of(self.frame, self.ego.pose, boxes, self.previous) if decision.accepted else None,
         )
+
+    def _screen(self, tests: Screening, memory: State, teammates: Mapping[str, Message]) -> Screened:
+        with self._spending("screening"):
+            return tests.screen(memory, self.frame, self.ego, teammates)
 
     def _prepare(self, teammates: Mapping[str, Message]) -> PreparedFrame:
         with self._spending("prepare"):

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 from collections.abc import Mapping
 from dataclasses import dataclass, field
+from typing import Any
 
 import numpy as np
 
@@ -11,12 +12,13 @@ from robosac.answers import (
     ContradictedBox,
     Distrust,
     FrameAnswer,
+    Likeness,
     RejectedTeammate,
     Support,
     TestedHypothesis,
 )
 from robosac.boxes import FloatArray
-from robosac.defenses import Decision, Outcome, Rejection
+from robosac.defenses import EGO, Decision, Outcome, Rejection
 from robosac.previous import PreviousAnswer
 from robosac.provenance import by_name
 
@@ -31,6 +33,8 @@ class FusionResult(Decision):
     ``objects`` and ``contradicted`` are parallel to the boxes.
     """
 
+    alike: tuple[Likeness, ...] = ()
+    """Maps that are strangely alike; the ego is `robosac.defenses.EGO`."""
     boxes: FloatArray
     """(n, 6) float64: x, y, length, width, yaw, score; ego frame, best first."""
     contradicted_boxes: FloatArray = field(default_factory=lambda: np.zeros((0, 6)))
@@ -67,6 +71,18 @@ class FusionResult(Decision):
             for support, box in zip(told, self.contradicted_boxes.tolist(), strict=True)
         )
 
+    def likenesses(self, ego_id: str) -> tuple[Likeness, ...]:
+        """Maps that are strangely alike, of vehicles by their ids."""
+        return tuple(
+            Likeness(
+                vehicle=_called(each.vehicle, ego_id),
+                other=_called(each.other, ego_id),
+                of_frame=each.of_frame,
+                correlation=each.correlation,
+            )
+            for each in self.alike
+        )
+
     def answer(
         self,
         frame: int,
@@ -95,7 +111,10 @@ class FusionResult(Decision):
             accepted=self.accepted,
             rejected={
                 name: RejectedTeammate(
-                    vehicle_id=name, reason=why.reason, distrust=why.distrust or named.get(name), **why.evidence
+                    vehicle_id=name,
+                    reason=why.reason,
+                    distrust=why.distrust or named.get(name),
+                    **_told(why, ego_id),
                 )
                 for name, why in {**left_out, **self.rejected}.items()
             },
@@ -106,7 +125,17 @@ class FusionResult(Decision):
             sampling_steps=self.sampling_steps,
             attacker_ratio=self.attacker_ratio,
             suspicion=None if self.suspicion is None else dict(self.suspicion),
+            alike=self.likenesses(ego_id),
             deadline_met=self.deadline_met,
             degraded_by="fault" if self.fault is not None else "deadline" if self.out_of_time else None,
             timings_ms={stage: round(milliseconds, 3) for stage, milliseconds in timings_ms.items()},
         )
+
+
+def _called(name: str, ego_id: str) -> str:
+    return ego_id if name == EGO else name
+
+
+def _told(why: Rejection, ego_id: str) -> Mapping[str, Any]:
+    """Evidence in which the ego has its id, where it is whom a message is copied from."""
+    return {**why.evidence, "of": ego_id} if why.evidence.get("of") == EGO else why.evidence

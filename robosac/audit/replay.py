@@ -22,6 +22,7 @@ from robosac.detectors import Message, Preparer
 from robosac.faults import in_short
 from robosac.fusion import FusionResult
 from robosac.previous import PreviousAnswer
+from robosac.screening import MEMORY, Bounds, Screening
 from robosac.session import Session
 
 JACCARD_TOLERANCE = 1e-9
@@ -184,11 +185,19 @@ def _compare_digests(logged: FrameAnswered, messages: dict[str, Message]) -> Ite
 def _fuse(decision: LoggedDecision, defense: Defense, messages: dict[str, Message], detector: Preparer) -> FusionResult:
     logged, previous = decision.answer, decision.previous
     saved = {"state": decision.state, "previous": None if previous is None else previous.as_json()}
-    session = Session(detector, decision.session.teammates, defense, saved)
+    session = Session(detector, decision.session.teammates, defense, saved, screening=_screening(decision))
     teammates = dict(messages)
     ego = teammates.pop(decision.session.ego_id)
     deadline = Recorded(len(logged.hypotheses)) if logged.out_of_time else None
     return session.decide(logged.frame, ego, teammates, np.random.default_rng(int(logged.seed, 16)), deadline)
+
+
+def _screening(decision: LoggedDecision) -> Screening | None:
+    """The tests of messages that the frame was put to; what they remember tells that there were any."""
+    if MEMORY not in decision.answer.state:
+        return None
+    known = decision.session.screening or {}
+    return Screening({name: Bounds.from_json(dict(bounds)) for name, bounds in known.items()})
 
 
 def _compare(logged: FrameAnswered, made: FusionResult) -> Iterator[Difference]:
@@ -213,7 +222,10 @@ def _compare(logged: FrameAnswered, made: FusionResult) -> Iterator[Difference]:
 
 
 def _compare_provenance(logged: FrameAnswered, made: FusionResult, ego_id: str) -> Iterator[Difference]:
-    """On whose word boxes stand, and which are left out; older versions wrote neither."""
+    """On whose word boxes stand, which are left out, and whose maps are alike; older versions wrote none of it."""
+    alike = [[each.as_json() for each in both] for both in (made.likenesses(ego_id), logged.alike)]
+    if MEMORY in logged.state and not _agree(*alike):
+        yield Difference("alike", f"{_shown(alike[0])}, logged {_shown(alike[1])}")
     supports: list[tuple[str, Sequence[Support] | None, Sequence[Support] | None]] = [
         ("support", made.support(ego_id), logged.support),
         ("contradicted", made.left_out(ego_id), logged.contradicted),
