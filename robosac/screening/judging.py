@@ -26,7 +26,7 @@ import numpy as np
 from robosac.answers import Likeness, Reason
 from robosac.defenses import EGO, Rejection
 from robosac.detectors import Message
-from robosac.screening.fingerprints import Fingerprint, fingerprints, likeness
+from robosac.screening.fingerprints import Fingerprint, fingerprints, likeness, packed
 from robosac.screening.past import KEPT_FRAMES, Anchor, Past, Place, Sent, recent
 
 MARGIN = 2.0
@@ -182,7 +182,7 @@ class _Seen:
             far = self.moved_from(before.place) > MOVED_M
             if not far or screening._repeated(self) is not None:
                 return before
-        return Anchor(self.frame, self.place, self.print.sketch)
+        return Anchor(self.frame, self.place, packed(self.print.sketch))
 
 
 def _copied(name: str, seen: Mapping[str, _Seen]) -> Rejection | None:

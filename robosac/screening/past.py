@@ -4,10 +4,11 @@ from __future__ import annotations
 
 from collections.abc import Mapping
 from dataclasses import dataclass
+from functools import cached_property
 from typing import Any
 
 from robosac.boxes import FloatArray
-from robosac.screening.fingerprints import packed, unpacked
+from robosac.screening.fingerprints import unpacked
 
 KEPT_FRAMES = 5
 """What was sent is remembered for so many frames."""
@@ -33,7 +34,13 @@ class Anchor:
 
     frame: int
     place: Place
-    sketch: FloatArray
+    text: str
+    """Its sketch, `packed`."""
+
+    @cached_property
+    def sketch(self) -> FloatArray:
+        """Its sketch, (SKETCH,)."""
+        return unpacked(self.text)
 
 
 @dataclass(frozen=True)
@@ -50,14 +57,14 @@ class Past:
             return cls()
         sent = tuple(Sent(digest, first, last, (x, y)) for digest, first, last, x, y in fields["sent"])
         frame, x, y, sketch = fields["anchor"]
-        return cls(sent, Anchor(frame, (x, y), unpacked(sketch)))
+        return cls(sent, Anchor(frame, (x, y), sketch))
 
     def as_json(self) -> dict[str, Any]:
         """JSON values; there must be an anchor."""
         assert self.anchor is not None
         return {
             "sent": [[each.digest, each.first, each.last, *each.place] for each in self.sent],
-            "anchor": [self.anchor.frame, *self.anchor.place, packed(self.anchor.sketch)],
+            "anchor": [self.anchor.frame, *self.anchor.place, self.anchor.text],
         }
 
 
