@@ -20,6 +20,7 @@ from clients import trial
 from clients.client import GatewayClient, OpenedSession, VehicleClient
 from clients.errors import FrameConflict
 from clients.simulation import EgoFrame, Fleet
+from clients.standing import shown
 from clients.summary import FleetSummary
 from robosac import attacks, defenses, detectors
 from robosac.answers import FrameAnswer, Reason
@@ -79,6 +80,7 @@ class _Screen:
                 answer.source.replace("_", " "),
                 names(answer.accepted),
                 names(dissent),
+                shown(answer),
                 str(answer.sampling_steps),
                 f"{best:.2f}",
                 f"{latency_ms:.0f}",
@@ -89,8 +91,19 @@ class _Screen:
 
     def _render(self) -> Group:
         table = Table()
-        for heading in ("scene", "frame", "ego", "source", "accepted", "in dissensus", "steps", "best J", "ms"):
-            is_number = heading in ("scene", "frame", "steps", "best J", "ms")
+        for heading in (
+            "scene",
+            "frame",
+            "ego",
+            "source",
+            "accepted",
+            "in dissensus",
+            "boxes",
+            "steps",
+            "best J",
+            "ms",
+        ):
+            is_number = heading in ("scene", "frame", "boxes", "steps", "best J", "ms")
             table.add_column(heading, justify="right" if is_number else "left")
         for row in self._rows:
             table.add_row(*row)

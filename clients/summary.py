@@ -14,13 +14,14 @@ from rich.console import Console
 from clients import trial
 from clients.lies import Lies
 from clients.simulation import EgoFrame
+from clients.standing import Standings
 from robosac.answers import FrameAnswer
 from robosac.boxes import FloatArray
 from robosac.consensus import at_least
 from robosac.detectors import Detector
 from robosac.evaluation import AveragePrecision
 from robosac.figures import new_figure
-from robosac.scenes.drawing import FOUND_COLOUR, TRUE_COLOUR, draw_boxes, draw_points, frame_axes
+from robosac.scenes.drawing import TRUE_COLOUR, draw_answer, draw_boxes, draw_points, frame_axes
 
 GATEWAY = "gateway"
 BASELINES = ("all benign", "ego only", "no defence")
@@ -28,12 +29,15 @@ BASELINES = ("all benign", "ego only", "no defence")
 
 @dataclass(frozen=True)
 class Example:
-    """A frame for the picture: who asked, what is true, and what came of it; boxes from the consensus score on."""
+    """A frame for the picture: who asked, what is true, and what came of it; ``undefended`` from the consensus
+    score on.
+    """
 
     frame: EgoFrame
     undefended: FloatArray
-    answered: FloatArray
     answer: FrameAnswer
+    score: float
+    """The consensus score."""
 
 
 Met = tuple[int, str, str]
@@ -58,6 +62,7 @@ class FleetSummary:
     named_in: dict[Met, int] = field(default_factory=dict)
     names: bool = False
     lies: Lies = field(default_factory=Lies)
+    standings: Standings = field(default_factory=Standings)
     example: Example | None = None
     _harm: int = -1
 
@@ -105,6 +110,7 @@ class FleetSummary:
             self.named_in.setdefault((frame.scene, frame.ego_id, vehicle), answer.frame)
         self.names |= answer.suspicion is not None
         self.lies.add(frame, answer, received, undefended)
+        self.standings.add(answer)
         for role, members in (("attackers", frame.attackers), ("honest", set(team) - frame.attackers)):
             tally = self.participation.setdefault(role, Counter())
             for vehicle in members:
@@ -120,7 +126,7 @@ class FleetSummary:
         harm = abs(len(found) - len(frame.truth)) * 2 + (answer.source != "ego_only")
         if harm > self._harm:
             self._harm = harm
-            self.example = Example(frame, found, at_least(answer.boxes, score), answer)
+            self.example = Example(frame, found, answer, score)
 
     def as_dict(self) -> dict[str, Any]:
         """Plain values for JSON."""
@@ -133,6 +139,7 @@ class FleetSummary:
             "participation": {role: dict(tally) for role, tally in self.participation.items()},
             "naming": self.naming,
             "objects": self.lies.as_dict(),
+            "boxes": self.standings.as_dict(),
             "sampling_steps": {"mean": float(np.mean(self.steps)), "max": int(np.max(self.steps))},
             "latency_ms": trial.percentiles(self.latencies_ms),
             "deadline_met_share": self.in_time / self.frames,
@@ -177,6 +184,8 @@ class FleetSummary:
             )
         if (told := self.lies.sentence()) is not None:
             console.print(told)
+        if (standings := self.standings.sentence()) is not None:
+            console.print(standings)
         colour = "green" if self.clean_share >= 0.95 else "red"
         console.print(f"[{colour}]No attacker accepted in {self.clean_share:.1%} of the frames.[/{colour}]")
 
@@ -197,19 +206,17 @@ def _draw(example: Example, path: Path) -> None:
     panels = (
         ("True boxes", frame.truth, TRUE_COLOUR, "true"),
         (f"Fusion of all, {attack}", example.undefended, "#b2182b", "found"),
-        (
-            f"Gateway: {answer.source.replace('_', ' ')} with {', '.join(answer.accepted) or 'nobody'}",
-            example.answered,
-            FOUND_COLOUR,
-            "found",
-        ),
+        (f"Gateway: {answer.source.replace('_', ' ')} with {', '.join(answer.accepted) or 'nobody'}", None, "", ""),
     )
     figure = new_figure(21, 7.6)
     for axes, (title, boxes, colour, label) in zip(figure.subplots(1, 3), panels, strict=True):
         draw_points(axes, frame.points)
         if boxes is not frame.truth:
             draw_boxes(axes, frame.truth, TRUE_COLOUR, "true", dashed=True, width=1.0)
-        draw_boxes(axes, boxes, colour, label)
+        if boxes is None:
+            draw_answer(axes, answer, example.score)
+        else:
+            draw_boxes(axes, boxes, colour, label)
         frame_axes(axes, title)
     figure.suptitle(f"Scene {frame.scene}, frame {answer.frame}, {frame.ego_id}; boxes from the consensus score on")
-    figure.savefig(path, dpi=90)
+    figure.savefig(path, dpi=90, bbox_inches="tight")

@@ -10,7 +10,16 @@ from enum import StrEnum
 from typing import Annotated, Any, Literal
 
 import numpy as np
-from pydantic import BaseModel, ConfigDict, Field, PlainSerializer, PlainValidator, WithJsonSchema
+from pydantic import (
+    BaseModel,
+    ConfigDict,
+    Field,
+    PlainSerializer,
+    PlainValidator,
+    ValidationInfo,
+    WithJsonSchema,
+    field_validator,
+)
 
 from robosac.boxes import FloatArray
 
@@ -48,6 +57,9 @@ class Reason(StrEnum):
     STALE = "stale"
     UNAUTHENTICATED = "unauthenticated"
     REPLAYED = "replayed"
+    IMPLAUSIBLE = "implausible"
+    REPEATED = "repeated"
+    COPIED = "copied"
 
 
 class Distrust(StrEnum):
@@ -59,6 +71,21 @@ class Distrust(StrEnum):
     """It is not on the trust list from which the frame was answered."""
     EQUIVOCATION = "equivocation"
     """It sent different messages for the frame."""
+
+
+class Standing(StrEnum):
+    """How a box stands among those who could see the place."""
+
+    CONFIRMED = "confirmed"
+    """The ego saw it, or at least two teammates did."""
+    SINGLE_WITNESS = "single_witness"
+    """One teammate saw it, and nobody else could have: no accusation."""
+    DISPUTED = "disputed"
+    """Somebody who could have seen it did not, but not enough of them to leave it out."""
+    REPAIRED = "repaired"
+    """It is taken from a fusion without a teammate whose joining removes or moves it."""
+    CONTRADICTED = "contradicted"
+    """The ego, or at least two teammates, could have seen it and did not."""
 
 
 def _array_of(*shape: int) -> Any:
@@ -121,6 +148,34 @@ class TestedHypothesis(Typed):
     verdict: Verdict
 
 
+class Support(Typed):
+    """On whose word a box stands. Ids are of vehicles, the ego's among them."""
+
+    status: Standing
+    witnesses: tuple[str, ...] = Field(description="Whose messages show a vehicle there.")
+    deniers: tuple[str, ...] = Field(description="Who could have seen a vehicle there, and shows none.")
+
+
+class ContradictedBox(Support):
+    """A box that is left out of the answer, as it was decoded."""
+
+    box: tuple[float, float, float, float, float, float] = Field(
+        description="x, y, length, width, yaw, score; ego frame, metres and radians"
+    )
+
+
+class Likeness(Typed):
+    """Two maps that are more alike than those of honest vehicles in traffic; it accuses neither.
+
+    ``other`` sent its map in the frame ``of_frame``; it may be the same vehicle, in another place.
+    """
+
+    vehicle: str
+    other: str
+    of_frame: int
+    correlation: float
+
+
 class RejectedTeammate(Typed):
     """Why an enrolled teammate is not in the answer; evidence follows as further fields."""
 
@@ -151,6 +206,12 @@ class FrameAnswer(Typed):
 
     frame: int
     boxes: Boxes = Field(description="x, y, length, width, yaw, score; ego frame, metres and radians, best first")
+    support: tuple[Support, ...] | None = Field(
+        None, description="On whose word each box stands, parallel to the boxes, where the defence knows it."
+    )
+    contradicted: tuple[ContradictedBox, ...] | None = Field(
+        None, description="Boxes that are contradicted and left out, best first, where the defence knows them."
+    )
     source: Source
     accepted: tuple[str, ...]
     rejected: Annotated[
@@ -164,9 +225,20 @@ class FrameAnswer(Typed):
     suspicion: dict[str, float] | None = Field(
         None, description="Probability that each teammate attacks, where the defence knows it."
     )
+    alike: tuple[Likeness, ...] = Field(
+        (), exclude_if=lambda value: not value, description="Maps that are strangely alike, most alike first."
+    )
     deadline_met: bool
     degraded_by: Literal["deadline", "fault"] | None = Field(description="What cut the defence short, if anything.")
     timings_ms: dict[str, float]
+
+    @field_validator("support")
+    @classmethod
+    def _check_parallel(cls, support: tuple[Support, ...] | None, others: ValidationInfo) -> tuple[Support, ...] | None:
+        boxes = others.data.get("boxes")
+        if support is not None and boxes is not None and len(support) != len(boxes):
+            raise ValueError(f"must be parallel to the boxes: {len(support)} for {len(boxes)}")
+        return support
 
     @property
     def named(self) -> tuple[str, ...]:

@@ -3,11 +3,13 @@
 from __future__ import annotations
 
 import hashlib
+import json
 from functools import lru_cache
 from pathlib import Path
 
 from robosac.defenses.group_testing import Calibration, CalibrationError
 from robosac.detectors import DetectorInfo
+from robosac.screening import Bounds, Screening
 
 
 def calibration_of(info: DetectorInfo) -> Calibration:
@@ -54,3 +56,23 @@ def _digest(path: Path, changed: int) -> str:  # noqa: ARG001 (of a changed file
 @lru_cache(maxsize=16)
 def _read(path: Path, changed: int) -> Calibration:  # noqa: ARG001 (a changed file is read again)
     return Calibration.read(path)
+
+
+def screening_for(info: DetectorInfo) -> Screening:
+    """The tests of messages, with what the file beside a detector's weights says of honest ones.
+
+    Where it says nothing, or there is none that belongs to the weights, nothing is known of them.
+    """
+    if info.calibration is None:
+        return Screening()
+    try:
+        return Screening(_bounds(info.calibration, info.calibration.stat().st_mtime_ns, info.weights_digest))
+    except (OSError, KeyError, TypeError, ValueError):
+        return Screening()
+
+
+@lru_cache(maxsize=16)
+def _bounds(path: Path, changed: int, weights_digest: str) -> dict[str, Bounds]:  # noqa: ARG001 (as above)
+    content = json.loads(path.read_text())
+    messages = content.get("messages", {}) if content["weights_digest"] == weights_digest else {}
+    return {name: Bounds.from_json(fields) for name, fields in messages.items()}

@@ -10,11 +10,12 @@ import logging
 from collections.abc import Iterator, Mapping, Sequence
 from contextlib import contextmanager
 from dataclasses import dataclass, field, fields
+from typing import Any
 
 import numpy as np
 import rfc8785
 
-from robosac.answers import Distrust, FrameAnswer, Reason, RejectedTeammate, Source, TestedHypothesis, Verdict
+from robosac.answers import Reason, Source, Verdict
 from robosac.boxes import FloatArray
 from robosac.consensus import at_least, compare
 from robosac.deadline import Deadline
@@ -32,71 +33,19 @@ from robosac.defenses import (
 from robosac.detectors import Message, PreparedFrame, Preparer
 from robosac.faults import describe
 from robosac.previous import PreviousAnswer
+from robosac.provenance import best_first, unfounded
+from robosac.result import FusionResult
+from robosac.screening import Screened, Screening, joined, separated
+
+__all__ = ["FusionResult", "UnverifiedAnswer", "fuse"]
 
 logger = logging.getLogger(__name__)
 
 
 class UnverifiedAnswer(Exception):
-    """A defence tried to answer with, or to trust, teammates that were not in consensus, or left one unexplained."""
-
-
-@dataclass(frozen=True, kw_only=True)
-class FusionResult(Decision):
-    """The answer to one frame: what the defence decided, and what came of it."""
-
-    boxes: FloatArray
-    """(n, 6) float64: x, y, length, width, yaw, score; ego frame, best first."""
-    hypotheses: tuple[Outcome, ...]
-    """In the order tested."""
-    deadline_met: bool
-    """Whether the answer was ready in time."""
-    out_of_time: bool
-    """Whether the defence was cut short to meet the deadline."""
-    fault: str | None
-    """What went wrong inside (`robosac.faults.describe`), if anything; the boxes are then the ego's own."""
-    timings_ms: Mapping[str, float]
-    """By stage: ``prepare``, ``ego_only``, ``hypotheses`` (decoding), ``consensus`` (matching)."""
-    previous: PreviousAnswer | None
-    """What the next frame may be compared with; None after an ego-only answer."""
-
-    @property
-    def sampling_steps(self) -> int:
-        """Hypotheses tested."""
-        return len(self.hypotheses)
-
-    def answer(self, frame: int, left_out: Mapping[str, Rejection], timings_ms: Mapping[str, float]) -> FrameAnswer:
-        """What is answered about the frame. Whoever the defence names is told so.
-
-        Parameters
-        ----------
-        frame : int
-        left_out : mapping of vehicle id to Rejection
-            Those who were not among the teammates of the fusion.
-        timings_ms : mapping of stage to float
-        """
-        named = dict.fromkeys(self.named or (), Distrust.NAMED)
-        return FrameAnswer(
-            frame=frame,
-            boxes=self.boxes,
-            source=self.source,
-            accepted=self.accepted,
-            rejected={
-                name: RejectedTeammate(
-                    vehicle_id=name, reason=why.reason, distrust=why.distrust or named.get(name), **why.evidence
-                )
-                for name, why in {**left_out, **self.rejected}.items()
-            },
-            hypotheses=tuple(
-                TestedHypothesis(teammates=o.teammates, jaccard_index=o.jaccard_index, verdict=o.verdict)
-                for o in self.hypotheses
-            ),
-            sampling_steps=self.sampling_steps,
-            attacker_ratio=self.attacker_ratio,
-            suspicion=None if self.suspicion is None else dict(self.suspicion),
-            deadline_met=self.deadline_met,
-            degraded_by="fault" if self.fault is not None else "deadline" if self.out_of_time else None,
-            timings_ms={stage: round(milliseconds, 3) for stage, milliseconds in timings_ms.items()},
-        )
+    """A defence tried to answer with, or to trust, teammates that were not in consensus, or left one unexplained; or it
+    judged boxes that are not its to answer with.
+    """
 
 
 def fuse(  # all that a decision follows from, so that it can be made again
@@ -110,6 +59,7 @@ def fuse(  # all that a decision follows from, so that it can be made again
     frame: int = 0,
     previous: PreviousAnswer | None = None,
     deadline: Deadline | None = None,
+    screening: Screening | None = None,
 ) -> FusionResult:
     """Answer one frame.
 
@@ -135,12 +85,16 @@ def fuse(  # all that a decision follows from, so that it can be made again
     deadline : Deadline, optional
         No hypothesis is begun that it has no time for; by default there is time for all. Where nothing is verified or
         trusted, the ego's own perception is computed in any case.
+    screening : Screening, optional
+        Tests of the messages before any of them is fused; whoever fails them is rejected for the frame. What they
+        remember is part of the state. By default there are none.
 
     Returns
     -------
     FusionResult
     """
-    return _FrameRun(detector, defense, ego, frame, previous, deadline or Deadline()).answer(teammates, rng, state)
+    run = _FrameRun(detector, defense, ego, frame, previous, deadline or Deadline(), screening)
+    return run.answer(teammates, rng, state)
 
 
 @dataclass
@@ -153,8 +107,9 @@ class _FrameRun:
     frame: int
     previous: PreviousAnswer | None
     deadline: Deadline
+    screening: Screening | None = None
     timings: dict[str, float] = field(
-        default_factory=lambda: dict.fromkeys(("prepare", "ego_only", "hypotheses", "consensus"), 0.0)
+        default_factory=lambda: dict.fromkeys(("screening", "prepare", "ego_only", "hypotheses", "consensus"), 0.0)
     )
     outcomes: list[Outcome] = field(default_factory=list)
     boxes: dict[Hypothesis, FloatArray] = field(default_factory=dict)
@@ -165,19 +120,29 @@ class _FrameRun:
         team = sorted(teammates)  # the draws must not depend on the order of arrival
         if state is None:
             state = self.defense.initial_state(team)
+        state, memory = separated(state)
+        screened = Screened({}, (), memory)
         try:
-            prepared = self._prepare(teammates)
-            decision = self._converse(prepared, team, state, rng)
-            boxes = self._decode(prepared, decision.accepted)
+            if self.screening is not None:
+                screened = self._screen(self.screening, memory, teammates)
+            passed = {name: teammates[name] for name in team if name not in screened.refused}
+            prepared = self._prepare(passed)
+            decision = self._converse(prepared, list(passed), state, rng)
+            answered = self._assemble(prepared, decision)
         except Exception as error:
             logger.exception("fusion failed; answering with the ego's own perception")
             self.fault = describe(error)
-            rejected = {name: Rejection(Reason.NOT_SAMPLED, {"fault": self.fault}) for name in team}
+            passed = {name: teammates[name] for name in team if name not in screened.refused}
+            rejected = {name: Rejection(Reason.NOT_SAMPLED, {"fault": self.fault}) for name in passed}
             decision = Decision((), Source.EGO_ONLY, rejected, None, state)
-            boxes = self._decode(self._prepare({}), ())
+            answered = self._assemble(self._prepare({}), decision)
+        boxes = answered["boxes"]
+        decided = {part.name: getattr(decision, part.name) for part in fields(Decision)}
+        answered["rejected"] = {**decision.rejected, **screened.refused}
+        answered["state"] = joined(decision.state, screened.memory)
         return FusionResult(
-            **{part.name: getattr(decision, part.name) for part in fields(Decision)},
-            boxes=boxes,
+            **decided | answered,
+            alike=screened.alike,
             hypotheses=tuple(self.outcomes),
             deadline_met=self.deadline.is_met,
             out_of_time=self.out_of_time,
@@ -185,6 +150,10 @@ class _FrameRun:
             timings_ms=self.timings,
             previous=PreviousAnswer.of(self.frame, self.ego.pose, boxes, self.previous) if decision.accepted else None,
         )
+
+    def _screen(self, tests: Screening, memory: State, teammates: Mapping[str, Message]) -> Screened:
+        with self._spending("screening"):
+            return tests.screen(memory, self.frame, self.ego, teammates)
 
     def _prepare(self, teammates: Mapping[str, Message]) -> PreparedFrame:
         with self._spending("prepare"):
@@ -218,8 +187,18 @@ class _FrameRun:
             raise UnverifiedAnswer(f"{self.defense.kind} neither accepted nor rejected some of {team}")
         if not trusted.union(*verified).issuperset(decision.trusted):
             raise UnverifiedAnswer(f"{self.defense.kind} trusts {list(decision.trusted)} without a consensus")
+        if doubt := next(unfounded(decision, team, self.boxes), None):
+            raise UnverifiedAnswer(f"{self.defense.kind} {doubt}")
         if self.defense.kind not in shipped():  # those that ship are known to keep JSON, and theirs may be long
             rfc8785.dumps(dict(decision.state))
+
+    def _assemble(self, prepared: PreparedFrame, decision: Decision) -> dict[str, Any]:
+        """The fields of the result that hold boxes, and whose they are; judged ones are checked by now."""
+        if decision.objects is None:
+            return {"boxes": self._decode(prepared, decision.accepted)}
+        objects, boxes = best_first(decision.objects, self.boxes)
+        contradicted, left_out = best_first(decision.contradicted, self.boxes)
+        return {"objects": objects, "boxes": boxes, "contradicted": contradicted, "contradicted_boxes": left_out}
 
     def _test(self, prepared: PreparedFrame, batch: Sequence[Hypothesis]) -> list[Outcome]:
         tested: list[Outcome] = []

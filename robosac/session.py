@@ -3,17 +3,18 @@
 from __future__ import annotations
 
 from collections.abc import Mapping, Sequence
-from typing import Any
+from typing import Any, Literal
 
 import numpy as np
 
-from robosac.calibrated import calibration_of
+from robosac.calibrated import calibration_of, screening_for
 from robosac.deadline import Deadline
 from robosac.defenses import Defense, DefenseSettings, SampleConsensus, State, build
 from robosac.defenses.group_testing import GroupTestingSettings
 from robosac.detectors import Detector, DetectorInfo, Message, Preparer
 from robosac.fusion import FusionResult, fuse
 from robosac.previous import PreviousAnswer
+from robosac.screening import Screening, joined, separated
 
 
 def default_defense(info: DetectorInfo) -> DefenseSettings:
@@ -32,6 +33,18 @@ def defense_for(settings: DefenseSettings | Mapping[str, Any], info: DetectorInf
     return build(settings, lambda: calibration_of(info))
 
 
+def changed_team(defense: Defense, state: State, team: Sequence[str]) -> State:
+    """A session's state after teammates joined or left; ``team`` is the new one.
+
+    Raises
+    ------
+    robosac.budget.DomainError
+        If the defence's settings make no sense for it.
+    """
+    alone, memory = separated(state)
+    return joined(defense.change_team(alone, list(team)), memory)
+
+
 class Session:
     """Answers frame after frame, and remembers between them what the defence knows and what was answered last.
 
@@ -47,11 +60,14 @@ class Session:
         What `save` gave: the session goes on from there.
     rng : numpy.random.Generator, optional
         All randomness of the defence; seeded by the operating system by default, so that nobody can foresee it.
+    screening : Screening, optional
+        Tests of messages before any of them is fused; by default those that the detector is calibrated for. None for
+        no such tests.
 
     Attributes
     ----------
     state : mapping
-        What the defence remembers, JSON values.
+        What the defence and the tests of messages remember, JSON values.
     previous : PreviousAnswer or None
         The latest answer, if anybody was fused into it.
 
@@ -76,8 +92,10 @@ class Session:
         defense: Defense | None = None,
         saved: Mapping[str, Any] | None = None,
         rng: np.random.Generator | None = None,
+        screening: Screening | Literal["calibrated"] | None = "calibrated",
     ) -> None:
         self.detector = detector
+        self.screening = screening_for(detector.info) if screening == "calibrated" else screening
         self.defense = defense or _default(detector)
         self._rng = rng or np.random.default_rng()
         self.state: State = self.defense.initial_state(list(team)) if saved is None else saved["state"]
@@ -133,6 +151,7 @@ class Session:
             frame=frame,
             previous=self.previous,
             deadline=deadline,
+            screening=self.screening,
         )
 
     def remember(self, result: FusionResult) -> None:
@@ -147,7 +166,7 @@ class Session:
         robosac.budget.DomainError
             If the defence's settings make no sense for it.
         """
-        self.state = self.defense.change_team(self.state, list(team))
+        self.state = changed_team(self.defense, self.state, team)
 
     def save(self) -> dict[str, Any]:
         """What the session remembers, JSON values: with it, another one goes on from here.

@@ -69,6 +69,10 @@ def _of_team(answer: FrameAnswered, ego_id: str | None) -> Iterator[str]:
     silent = accepted.union(*(o.teammates for o in answer.hypotheses)) - set(answer.messages)
     if silent:
         yield f"{_listed(silent)} fused without a message"
+    supports = (*(answer.support or ()), *(answer.contradicted or ()))
+    unheard = {name for support in supports for name in (*support.witnesses, *support.deniers)} - set(answer.messages)
+    if unheard:
+        yield f"boxes stand or fall on the word of {_listed(unheard)}, without a message"
     if ego_id is None:
         return
     if ego_id not in answer.messages:

@@ -58,6 +58,14 @@ State = Annotated[dict[str, Any], AfterValidator(_check_state)]
 """A defence's, JSON values."""
 
 
+class MessageBounds(Typed):
+    """What honest messages hold of a tensor, as `robosac.screening.Bounds` has it."""
+
+    largest: float
+    rms: float
+    still: float
+
+
 class SessionOpened(_Event):
     """A session begins: with whom, which detector, which settings."""
 
@@ -69,6 +77,8 @@ class SessionOpened(_Event):
     weights_digest: str
     calibration_digest: str | None = None
     defense: dict[str, Any]
+    screening: dict[str, MessageBounds] | None = None
+    """By tensor: what honest messages hold; None where messages are not tested before they are fused."""
     latency_budget_ms: float
     gather_ms: float
     frame_period_ms: float

@@ -5,14 +5,14 @@ from __future__ import annotations
 import json
 import math
 from collections import deque
-from collections.abc import Iterable, Iterator, Mapping
+from collections.abc import Iterable, Iterator, Mapping, Sequence
 from dataclasses import dataclass
 from typing import Any
 
 import numpy as np
 
 from robosac import wire
-from robosac.answers import TestedHypothesis
+from robosac.answers import ContradictedBox, Support, TestedHypothesis
 from robosac.audit.events import FrameAnswered, RecordError, SessionOpened, TeamChanged, event_on
 from robosac.budget import DomainError
 from robosac.calibrated import calibration_digest, calibration_of
@@ -22,6 +22,7 @@ from robosac.detectors import Message, Preparer
 from robosac.faults import in_short
 from robosac.fusion import FusionResult
 from robosac.previous import PreviousAnswer
+from robosac.screening import MEMORY, Bounds, Screening
 from robosac.session import Session
 
 JACCARD_TOLERANCE = 1e-9
@@ -138,7 +139,10 @@ def replay(decision: LoggedDecision, body: bytes, detector: Preparer, kinds: Kin
         raise ReplayError(f"the log's settings make no defence: {error}") from error
     messages = _read_messages(decision, body, detector)
     wrong = list(_compare_digests(logged, messages))
-    return wrong or list(_compare(logged, _fuse(decision, defense, messages, detector)))
+    if wrong:
+        return wrong
+    made = _fuse(decision, defense, messages, detector)
+    return [*_compare(logged, made), *_compare_provenance(logged, made, decision.session.ego_id)]
 
 
 def _before(answer: FrameAnswered, recent: Iterable[FrameAnswered]) -> PreviousAnswer | None:
@@ -181,11 +185,19 @@ def _compare_digests(logged: FrameAnswered, messages: dict[str, Message]) -> Ite
 def _fuse(decision: LoggedDecision, defense: Defense, messages: dict[str, Message], detector: Preparer) -> FusionResult:
     logged, previous = decision.answer, decision.previous
     saved = {"state": decision.state, "previous": None if previous is None else previous.as_json()}
-    session = Session(detector, decision.session.teammates, defense, saved)
+    session = Session(detector, decision.session.teammates, defense, saved, screening=_screening(decision))
     teammates = dict(messages)
     ego = teammates.pop(decision.session.ego_id)
     deadline = Recorded(len(logged.hypotheses)) if logged.out_of_time else None
     return session.decide(logged.frame, ego, teammates, np.random.default_rng(int(logged.seed, 16)), deadline)
+
+
+def _screening(decision: LoggedDecision) -> Screening | None:
+    """The tests of messages that the frame was put to; what they remember tells that there were any."""
+    if MEMORY not in decision.answer.state:
+        return None
+    known = decision.session.screening or {}
+    return Screening({name: Bounds.from_json(dict(bounds)) for name, bounds in known.items()})
 
 
 def _compare(logged: FrameAnswered, made: FusionResult) -> Iterator[Difference]:
@@ -207,6 +219,39 @@ def _compare(logged: FrameAnswered, made: FusionResult) -> Iterator[Difference]:
         yield Difference("boxes", f"{len(made.boxes)} of them, logged {len(logged.boxes)}")
     elif (farthest := float(np.abs(made.boxes - logged.boxes).max(initial=0.0))) > BOX_TOLERANCE:
         yield Difference("boxes", f"up to {farthest:.3g} from those logged")
+
+
+def _compare_provenance(logged: FrameAnswered, made: FusionResult, ego_id: str) -> Iterator[Difference]:
+    """On whose word boxes stand, which are left out, and whose maps are alike; older versions wrote none of it."""
+    alike = [[each.as_json() for each in both] for both in (made.likenesses(ego_id), logged.alike)]
+    if MEMORY in logged.state and not _agree(*alike):
+        yield Difference("alike", f"{_shown(alike[0])}, logged {_shown(alike[1])}")
+    supports: list[tuple[str, Sequence[Support] | None, Sequence[Support] | None]] = [
+        ("support", made.support(ego_id), logged.support),
+        ("contradicted", made.left_out(ego_id), logged.contradicted),
+    ]
+    for what, now, then in supports:
+        if what not in logged.model_fields_set:
+            continue
+        if now is None or then is None or len(now) != len(then):
+            if now != then:
+                yield Difference(what, f"{_counted(now)}, logged {_counted(then)}")
+            continue
+        for i, (mine, theirs) in enumerate(zip(now, then, strict=True)):
+            if _whose(mine) != _whose(theirs):
+                yield Difference(what, f"box {i}: {_shown(_whose(mine))}, logged {_shown(_whose(theirs))}")
+            elif isinstance(mine, ContradictedBox) and isinstance(theirs, ContradictedBox):
+                farthest = float(np.abs(np.subtract(mine.box, theirs.box)).max())
+                if farthest > BOX_TOLERANCE:
+                    yield Difference(what, f"box {i}: up to {farthest:.3g} from the one logged")
+
+
+def _whose(support: Support) -> list[Any]:
+    return [support.status.value, list(support.witnesses), list(support.deniers)]
+
+
+def _counted(supports: Sequence[Support] | None) -> str:
+    return "not known" if supports is None else f"that of {len(supports)} boxes"
 
 
 def _compare_hypotheses(logged: FrameAnswered, made: FusionResult) -> Iterator[Difference]:

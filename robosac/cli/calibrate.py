@@ -12,9 +12,10 @@ from rich.table import Table
 
 from robosac.attacks import ATTACKS
 from robosac.calibration import Recipe, ReliabilityBin, calibrate
+from robosac.calibration.messages import add, measure
 from robosac.cli.options import DataName, DetectorName, Seed, command, load_detector, progress
-from robosac.detectors import DEFAULT_DETECTOR
-from robosac.scenes import DEFAULT_DATA
+from robosac.detectors import DEFAULT_DETECTOR, Detector
+from robosac.scenes import DEFAULT_DATA, SOURCES, first_scenes
 
 _DEFAULTS = Recipe()
 
@@ -42,6 +43,10 @@ def run(  # the options of a command line
         int, typer.Option(min=1, help="Stretches of two successive frames of each, 2 s apart.")
     ] = _DEFAULTS.stretches_per_scene,
     seed: Seed = _DEFAULTS.seed,
+    messages_only: Annotated[
+        bool,
+        typer.Option("--messages-only", help="Measure only what honest messages hold, and put that into FILE."),
+    ] = False,
 ) -> None:
     """Observe what tests show when it is known who attacks, write the likelihoods, and check them.
 
@@ -51,6 +56,9 @@ def run(  # the options of a command line
     torch.set_num_threads(1)
     console = Console()
     chosen = load_detector(detector)
+    if messages_only:
+        _measure_messages(chosen, data, scenes, out, command(context), console)
+        return
     try:
         recipe = Recipe(
             attacks=tuple(attack or _DEFAULTS.attacks),
@@ -66,12 +74,31 @@ def run(  # the options of a command line
             task = bar.add_task("frames", total=recipe.frames_per_level * len(recipe.pose_errors_m))
             calibration, reliability = calibrate(chosen, recipe, command(context), lambda: bar.advance(task))
         calibration.write(out)
+        _measure_messages(chosen, data, scenes, out, command(context), console)
     except (OSError, ValueError) as error:
         console.print(f"[red]{error}[/red]")
         raise typer.Exit(1) from error
     for error_m, bins in reliability.items():
         _print(console, error_m, bins)
     console.print(f"{out}: {calibration.detector}, weights {calibration.weights_digest:.12}...")
+
+
+def _measure_messages(detector: Detector, data: str, scenes: int, out: Path, made_by: str, console: Console) -> None:
+    """Add what honest messages hold to the calibration in a file."""
+    try:
+        chosen = first_scenes(SOURCES.make(data), "validation", scenes)
+        with progress(console) as bar:
+            task = bar.add_task("messages", total=scenes)
+            measured = measure(detector, chosen, tick=lambda: bar.advance(task))
+        add(out, detector.info.weights_digest, measured, made_by)
+    except (OSError, ValueError) as error:
+        console.print(f"[red]{error}[/red]")
+        raise typer.Exit(1) from error
+    for name, bounds in measured.items():
+        console.print(
+            f"{name}: at most {bounds.largest:g}, root mean square {bounds.rms:g}; "
+            f"successive maps of one that stands still are alike up to {bounds.still:g}"
+        )
 
 
 def _print(console: Console, pose_error_m: float, bins: list[ReliabilityBin]) -> None:

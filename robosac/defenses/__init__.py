@@ -2,17 +2,19 @@
 
 from __future__ import annotations
 
-from robosac.answers import Distrust, Reason, Source, Verdict
+from robosac.answers import Distrust, Reason, Source, Standing, Support, Verdict
 from robosac.defenses.a2cp import A2CP
 from robosac.defenses.conformal import Conformal
 from robosac.defenses.group_testing import GroupTesting
 from robosac.defenses.halving import Halving
 from robosac.defenses.one_by_one import OneByOne
 from robosac.defenses.protocol import (
+    EGO,
     Conversation,
     Decision,
     Defense,
     Hypothesis,
+    JudgedBox,
     Outcome,
     Reference,
     Rejection,
@@ -38,9 +40,11 @@ __all__ = [
     "Defense",
     "DefenseSettings",
     "Distrust",
+    "EGO",
     "Halving",
     "GroupTesting",
     "Hypothesis",
+    "JudgedBox",
     "Kinds",
     "OneByOne",
     "Outcome",
@@ -49,8 +53,10 @@ __all__ = [
     "Rejection",
     "SampleConsensus",
     "Source",
+    "Standing",
     "State",
     "StaticTeam",
+    "Support",
     "Undefended",
     "Verdict",
     "build",

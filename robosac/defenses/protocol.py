@@ -18,11 +18,13 @@ from typing import Any, Protocol, TypeVar
 
 import numpy as np
 
-from robosac.answers import Distrust, Reason, Source, Verdict
+from robosac.answers import Distrust, Reason, Source, Support, Verdict
 from robosac.boxes import FloatArray
 
 Hypothesis = tuple[str, ...]
 State = Mapping[str, Any]
+EGO = ""
+"""The ego among witnesses and deniers: a defence knows only the ids of teammates, and no vehicle is called so."""
 
 
 def remembered(
@@ -121,6 +123,18 @@ class Rejection:
 
 
 @dataclass(frozen=True)
+class JudgedBox:
+    """A box of this frame, and on whose word it stands."""
+
+    subset: Hypothesis
+    """Whose fusion showed it, as it was proposed; empty for the ego alone."""
+    index: int
+    """Its row among the boxes of that fusion, from 0 on."""
+    support: Support
+    """Ids are of teammates, or `EGO`."""
+
+
+@dataclass(frozen=True)
 class Decision:
     """What a defence concludes about a frame."""
 
@@ -137,6 +151,12 @@ class Decision:
     """To be handed to the next frame's conversation; see `remembered`."""
     suspicion: Mapping[str, float] | None = None
     """By teammate id: probability that each teammate of the session attacks; None from a defence that knows none."""
+    objects: tuple[JudgedBox, ...] | None = None
+    """The boxes of the answer, each from the accepted subset or a part of it. None: all boxes of the accepted subset,
+    as they were decoded.
+    """
+    contradicted: tuple[JudgedBox, ...] = ()
+    """Boxes that are left out of ``objects`` and told apart from them."""
 
     @property
     def trusted(self) -> tuple[str, ...]:

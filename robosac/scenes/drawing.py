@@ -2,11 +2,13 @@
 
 from __future__ import annotations
 
+from collections.abc import Mapping
 from pathlib import Path
 from typing import TYPE_CHECKING
 
 import numpy as np
 
+from robosac.answers import FrameAnswer, Standing
 from robosac.boxes import FloatArray, corners, from_world
 from robosac.figures import new_figure
 
@@ -19,6 +21,14 @@ VIEW_M = 32.0
 TRUE_COLOUR = "#1b7837"
 HIDDEN_COLOUR = "#e08214"
 FOUND_COLOUR = "#2166ac"
+STANDING_COLOURS: Mapping[Standing, str] = {
+    Standing.CONFIRMED: "#0072b2",
+    Standing.SINGLE_WITNESS: "#e69f00",
+    Standing.DISPUTED: "#cc79a7",
+    Standing.REPAIRED: "#56b4e9",
+    Standing.CONTRADICTED: "#d55e00",
+}
+"""Of the palette by M. Okabe and K. Ito (Color Universal Design, 2008), which the colour-blind can tell apart."""
 
 
 def draw_points(axes: Axes, points: FloatArray) -> None:
@@ -35,6 +45,22 @@ def draw_boxes(
         closed = np.vstack([outline, outline[:1]])
         text = f"{label} ({len(boxes)})" if i == 0 else None
         axes.plot(closed[:, 0], closed[:, 1], style, color=colour, linewidth=width, label=text)
+
+
+def draw_answer(axes: Axes, answer: FrameAnswer, least_score: float) -> None:
+    """Boxes of an answer from a score on, coloured by how they stand, where that is known; contradicted ones dashed."""
+    boxes, support = answer.boxes, answer.support
+    if support is None:
+        draw_boxes(axes, boxes[boxes[:, 5] >= least_score], FOUND_COLOUR, "found")
+        return
+    out = np.array([box.box for box in answer.contradicted or ()]).reshape(-1, 6)
+    everything = np.vstack([boxes, out])
+    standings = [each.status for each in (*support, *(answer.contradicted or ()))]
+    for standing, colour in STANDING_COLOURS.items():
+        of_it = everything[[each is standing for each in standings]]
+        contradicted = standing is Standing.CONTRADICTED
+        confident = of_it[of_it[:, 5] >= least_score]
+        draw_boxes(axes, confident, colour, standing.value.replace("_", " "), dashed=contradicted, width=1.8)
 
 
 def frame_axes(axes: Axes, title: str, viewer: str = "ego") -> None:

@@ -93,7 +93,7 @@ class Deciding:
         record = await self.sessions.current(asked.caller)
         present, left_out = self._who_takes_part(asked, record)
         result = await self._fuse(asked, record, present)
-        answer = result.answer(asked.frame, left_out, asked.timings)
+        answer = result.answer(asked.frame, left_out, asked.timings, record.ego_id)
         await self._keep(asked, record, present, result, answer)
         self._remember(asked, present, result)
         self._tell(asked, answer, result.fault)

@@ -11,7 +11,7 @@ import structlog
 from robosac.audit import commitment
 from robosac.audit.events import SessionOpened, now
 from robosac.budget import DomainError
-from robosac.calibrated import calibration_digest, calibration_of
+from robosac.calibrated import calibration_digest, calibration_of, screening_for
 from robosac.defenses import DefenseSettings, State
 from robosac.detectors import DetectorInfo
 from robosac.session import default_defense, defense_for
@@ -132,5 +132,6 @@ def _first_record(record: SessionRecord, info: DetectorInfo) -> SessionOpened:
         version=version("robosac"),
         weights_digest=info.weights_digest,
         calibration_digest=calibration_digest(info),
+        screening={name: bounds.as_json() for name, bounds in screening_for(info).bounds.items()},
         next_seed_commitment=commitment(record.seed),
     )

@@ -7,6 +7,7 @@ from dataclasses import dataclass
 
 from robosac.audit.events import TeamChanged, TokenRenewed
 from robosac.budget import DomainError
+from robosac.session import changed_team
 from service.errors import Kind, Refused
 from service.keeping.record import SessionRecord
 from service.keeping.store import Store
@@ -84,7 +85,7 @@ class Teams:
         """Keep a new team of the session ``record``. The session's lock is held."""
         check_size(team, self.settings.max_teammates)
         try:
-            state = caller.live.session.defense.change_team(record.state, team)
+            state = changed_team(caller.live.session.defense, record.state, team)
         except DomainError as error:
             raise Refused(Kind.IMPOSSIBLE_DEFENSE, str(error), "teammates") from error
         event = TeamChanged(

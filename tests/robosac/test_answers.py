@@ -7,12 +7,16 @@ import rfc8785
 from pydantic import ValidationError
 
 from robosac import wire
-from robosac.answers import Distrust, FrameAnswer, Reason, Source, Verdict
+from robosac.answers import Distrust, FrameAnswer, Reason, Source, Standing, Verdict
 from robosac.audit import GENESIS, seal
 
 FIELDS = {
     "frame": 3,
     "boxes": [[1.0, 2.5, 4.0, 2.0, 0.1, 0.9]],
+    "support": [{"status": "repaired", "witnesses": ["ego", "b"], "deniers": []}],
+    "contradicted": [
+        {"status": "contradicted", "witnesses": ["b"], "deniers": ["ego"], "box": [9.5, 2.5, 4.0, 2.0, 0.1, 0.5]}
+    ],
     "source": "consensus",
     "accepted": ["a", "b"],
     "rejected": [
@@ -44,16 +48,25 @@ def test_an_answer_reads_as_python_and_is_the_same_in_json_again():
         assert read.rejected["d"].distrust is Distrust.NAMED
         assert (read.rejected["c"].hypotheses, read.rejected["c"]["lowest_jaccard_index"]) == ([0], 0.125)
         assert read.named == ("d",)
+        assert (read.support[0].status, read.support[0].witnesses) == (Standing.REPAIRED, ("ego", "b"))
+        assert (read.contradicted[0].box[0], read.contradicted[0].deniers) == (9.5, ("ego",))
         with pytest.raises(KeyError):
             read.rejected["e"]["evidence"]
 
 
 def test_what_a_later_version_adds_is_read_past():
-    assert FrameAnswer.model_validate({**FIELDS, "support": []}).as_json() == FIELDS
+    assert FrameAnswer.model_validate({**FIELDS, "weather": []}).as_json() == FIELDS
+
+
+def test_what_a_defence_does_not_know_of_its_boxes_is_null_and_may_be_absent():
+    unknown = {**FIELDS, "support": None, "contradicted": None}
+    older = {name: value for name, value in FIELDS.items() if name not in ("support", "contradicted")}
+    for fields in (unknown, older):
+        assert FrameAnswer.model_validate(fields).as_json() == unknown
 
 
 def test_a_frame_without_boxes_has_an_empty_array():
-    assert FrameAnswer.model_validate({**FIELDS, "boxes": []}).boxes.shape == (0, 6)
+    assert FrameAnswer.model_validate({**FIELDS, "boxes": [], "support": None}).boxes.shape == (0, 6)
 
 
 @pytest.mark.parametrize(
@@ -82,6 +95,23 @@ def test_what_is_no_answer_is_refused(wrong):
         assert refused.value.errors()[0]["loc"][0] == name
     with pytest.raises(ValidationError):
         FrameAnswer.model_validate({key: value for key, value in FIELDS.items() if key != name})
+
+
+@pytest.mark.parametrize(
+    "wrong",
+    [
+        {"support": []},
+        {"support": [{**FIELDS["support"][0], "status": "hearsay"}]},
+        {"support": [{"status": "confirmed"}]},
+        {"contradicted": FIELDS["support"]},
+        {"contradicted": [{**FIELDS["contradicted"][0], "box": [1.0] * 5}]},
+    ],
+)
+def test_what_is_no_support_is_refused(wrong):
+    (name,) = wrong
+    with pytest.raises(ValidationError) as refused:
+        FrameAnswer.model_validate({**FIELDS, **wrong})
+    assert refused.value.errors()[0]["loc"][0] == name
 
 
 def test_a_number_that_json_does_not_have_is_not_changed_into_something_else():

@@ -59,10 +59,19 @@ def test_a_record_is_read_strictly(events, index, changes, where):
 
 def test_what_older_versions_did_not_write_is_not_missed(events):
     answered = dict(events[1])
-    for name in ("fault", "previous_frame", "unlogged_refusals", "suspicion"):
+    for name in ("fault", "previous_frame", "unlogged_refusals", "suspicion", "support", "contradicted"):
         del answered[name]
     read = event_on(json.dumps(answered).encode())
     assert (read.fault, read.previous_frame, read.unlogged_refusals, read.suspicion) == (None, None, {}, None)
+    assert (read.support, read.contradicted) == (None, None)
+
+
+def test_support_is_read_strictly_where_it_is_written(events):
+    good = {"status": "confirmed", "witnesses": ["rsu"], "deniers": []}
+    assert event_on(json.dumps({**events[1], "support": [good]}).encode()).support[0].witnesses == ("rsu",)
+    for wrong in ([], [{**good, "status": "hearsay"}], [{**good, "witnesses": "rsu"}]):
+        with pytest.raises(RecordError, match="support"):
+            event_on(json.dumps({**events[1], "support": wrong}).encode())
 
 
 def test_a_signature_is_bytes_in_python_and_base64_in_json():

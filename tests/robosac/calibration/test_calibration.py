@@ -170,6 +170,7 @@ def test_the_command_writes_a_calibration(tmp_path):
     assert calibration.levels[0].kinds == ("noise", "open")
     assert "--attack noise" in calibration.recipe["command"]
     assert calibration.recipe["reliability"]["0"]
+    assert set(json.loads(out.read_text())["messages"]) == {"features"}
 
 
 def test_the_command_names_an_unknown_attack(tmp_path):

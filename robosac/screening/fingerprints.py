@@ -1,0 +1,162 @@
+"""A message in few numbers: what it takes to tell repetitions and impossible sizes, without keeping maps.
+
+A part of each tensor's values, drawn once for all, stands for the tensor. Its mean is removed, and random signs and
+sums make a sketch of it whose inner products estimate those of the values (a count sketch: M. Charikar, K. Chen, M.
+Farach-Colton, "Finding frequent items in data streams", 2002). The digest is linear modulo ``2 ** 64``: fast, and
+enough to know a message again; it is no proof of anything against somebody who wants two messages to have the same.
+"""
+
+from __future__ import annotations
+
+import base64
+import zlib
+from collections.abc import Mapping
+from dataclasses import dataclass
+from functools import lru_cache
+from typing import Any
+
+import numpy as np
+
+from robosac.boxes import FloatArray
+
+VALUES = 2048
+"""Of each tensor that are looked at; of a smaller one all."""
+SKETCH = 128
+"""Numbers in a sketch: correlations are estimated to within about .08."""
+_STEPS = 127
+_BITS = {"float16": 16, "float32": 32, "float64": 64}
+
+Tensor = np.ndarray[Any, np.dtype[Any]]
+
+
+@dataclass(frozen=True)
+class Fingerprint:
+    """What is kept of a message."""
+
+    digest: str
+    """16 hexadecimal digits; the same bytes have the same."""
+    constant: bool
+    """Whether all values of each tensor are the same, as those of a blind sensor may be."""
+    sizes: Mapping[str, tuple[float, float]]
+    """By tensor: largest absolute value, and root mean square of the values that are looked at."""
+    sketch: FloatArray
+    """(`SKETCH`,) float64 of norm 1; zeros where there is nothing to compare."""
+
+
+def fingerprints(messages: Mapping[str, Mapping[str, Tensor]]) -> dict[str, Fingerprint]:
+    """The fingerprints of a frame's messages.
+
+    Parameters
+    ----------
+    messages : mapping of vehicle to mapping of name to ndarray
+        All with the same tensors, of the same types and shapes.
+
+    Returns
+    -------
+    dict of vehicle to Fingerprint
+    """
+    if not messages:
+        return {}
+    digests, constant = [0] * len(messages), np.ones(len(messages), dtype=bool)
+    sizes: list[dict[str, tuple[float, float]]] = [{} for _ in messages]
+    total = np.zeros((len(messages), SKETCH))
+    for name in sorted(next(iter(messages.values()))):
+        flats = [np.ascontiguousarray(tensors[name]).reshape(-1) for tensors in messages.values()]
+        places, signs = _drawn(name, len(flats[0]))
+        values = np.stack([flat.take(places) for flat in flats]).astype(np.float64)
+        same = (values == values[:, :1]).all(axis=1)  # spares most of them a look at all values
+        constant &= [bool(s and (flat == flat[:1]).all()) for s, flat in zip(same, flats, strict=True)]
+        with np.errstate(over="ignore", invalid="ignore"):  # what is no number comes out as none
+            rms = np.sqrt(np.einsum("ij,ij->i", values, values) / max(values.shape[1], 1))
+            total += _summed(values, signs)
+        for i, flat in enumerate(flats):
+            words = _words(flat)
+            digests[i] += int(np.dot(words, _weights(name, len(words))))
+            sizes[i][name] = (_largest(flat), float(rms[i]))
+    sketches = _coarse(total)
+    return {
+        vehicle: Fingerprint(f"{digests[i] % 2**64:016x}", bool(constant[i]), sizes[i], sketches[i])
+        for i, vehicle in enumerate(messages)
+    }
+
+
+def likeness(one: FloatArray, other: FloatArray) -> float:
+    """The correlation, in [-1, 1], of two messages by their sketches."""
+    return float(one @ other)
+
+
+def packed(sketch: FloatArray) -> str:
+    """A sketch as text."""
+    return base64.b64encode(_steps(sketch).tobytes()).decode()
+
+
+def unpacked(text: str) -> FloatArray:
+    """What `packed` made text of, to the last bit."""
+    steps = np.frombuffer(base64.b64decode(text, validate=True), dtype=np.int8)
+    sketch: FloatArray = _of_norm_1(steps[None].astype(np.float64))[0]
+    return sketch
+
+
+def _words(flat: Tensor) -> np.ndarray[Any, np.dtype[np.uint64]]:
+    if flat.nbytes % 8 == 0:
+        return flat.view(np.uint64)
+    return np.frombuffer(flat.tobytes() + bytes(-flat.nbytes % 8), dtype=np.uint64)
+
+
+def _largest(flat: Tensor) -> float:
+    """The largest absolute value, without a copy of the values: numbers are ordered as their bits are."""
+    if not len(flat):
+        return 0.0
+    bits = _BITS.get(flat.dtype.name)
+    if bits is None:
+        return float(np.abs(flat.astype(np.float64)).max())
+    above = max(int(flat.view(f"i{bits // 8}").max()), 0)
+    below = max(int(flat.view(f"u{bits // 8}").max()) - (1 << bits - 1), 0)
+    return float(np.array([max(above, below)], dtype=f"u{bits // 8}").view(flat.dtype)[0])
+
+
+def _summed(values: FloatArray, signs: FloatArray) -> FloatArray:
+    """The sketches (n, SKETCH) of some values (n, V), their mean removed and their norm 1."""
+    if not values.shape[1]:
+        return np.zeros((len(values), SKETCH))
+    signed = _of_norm_1(values - values.mean(axis=1, keepdims=True)) * signs
+    if over := -signed.shape[1] % SKETCH:
+        signed = np.pad(signed, ((0, 0), (0, over)))
+    summed: FloatArray = signed.reshape(len(values), -1, SKETCH).sum(axis=1)
+    return summed
+
+
+def _coarse(total: FloatArray) -> FloatArray:
+    """Sketches (n, SKETCH) as `packed` keeps them, so that each is the same before and after."""
+    total = np.where(np.isfinite(total).all(axis=1, keepdims=True), total, 0.0)
+    return _of_norm_1(_steps(total).astype(np.float64))
+
+
+def _steps(sketches: FloatArray) -> np.ndarray[Any, np.dtype[np.int8]]:
+    most = np.abs(sketches).max(axis=-1, keepdims=True)
+    steps: np.ndarray[Any, np.dtype[np.int8]] = np.round(sketches * (_STEPS / np.where(most > 0.0, most, 1.0))).astype(
+        np.int8
+    )
+    return steps
+
+
+def _of_norm_1(values: FloatArray) -> FloatArray:
+    """Rows (n, V) of norm 1; those of zeros stay."""
+    norms = np.sqrt(np.einsum("ij,ij->i", values, values))[:, None]
+    scaled: FloatArray = values / np.where(norms > 0.0, norms, 1.0)
+    return scaled
+
+
+@lru_cache(maxsize=32)
+def _weights(name: str, words: int) -> np.ndarray[Any, np.dtype[np.uint64]]:
+    """Odd, so that a change of a single word always shows."""
+    drawn = np.random.default_rng([zlib.crc32(name.encode()), words, 0]).integers(0, 2**64, words, dtype=np.uint64)
+    return drawn | np.uint64(1)
+
+
+@lru_cache(maxsize=32)
+def _drawn(name: str, size: int) -> tuple[np.ndarray[Any, np.dtype[np.int64]], FloatArray]:
+    """Which values are looked at, and the sign that each has in the sketch."""
+    rng = np.random.default_rng([zlib.crc32(name.encode()), size, 1])
+    places = np.sort(rng.choice(size, min(size, VALUES), replace=False)) if size else np.zeros(0, dtype=np.int64)
+    return places, rng.choice([-1.0, 1.0], len(places))

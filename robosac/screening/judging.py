@@ -1,0 +1,265 @@
+"""Cheap tests of messages before any of them is fused: how large they are, and whether somebody sent them before.
+
+A message is reduced to a `Fingerprint`. What is compared is small, so that it can be kept between frames as JSON and
+a decision can be made again from the audit log.
+
+A message is refused only on evidence that cannot be turned against somebody honest:
+
+- its values are far beyond all that honest messages of the detector were seen to hold (``implausible``);
+- it is what its sender sent from another place, byte for byte or closer than two scans of one unchanged place ever are
+  (``repeated``). A parked vehicle cannot fail that;
+- it is, byte for byte, what another vehicle had sent in an earlier frame, or the ego has sent (``copied``).
+
+Two messages that are merely alike are told, and stay in. Nobody can know from the maps who copied. And the maps of an
+honest vehicle that drives on an empty road, between walls or in a platoon are as alike as .99.
+"""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Mapping
+from dataclasses import dataclass, field
+from typing import Any
+
+import numpy as np
+
+from robosac.answers import Likeness, Reason
+from robosac.defenses import EGO, Rejection
+from robosac.detectors import Message
+from robosac.screening.fingerprints import Fingerprint, fingerprints, likeness, packed
+from robosac.screening.past import KEPT_FRAMES, Anchor, Past, Place, Sent, recent
+
+MARGIN = 2.0
+"""A message may be so many times as large as the largest of the calibration: other worlds have other maps."""
+MOVED_M = 3.0
+"""From this far on a sender is somewhere else: well beyond what the error of a parked vehicle's pose makes of it."""
+STEADIER = 4.0
+"""A repetition differs so many times less than two maps of a sender that stands still."""
+NEAR = 0.9
+"""From this correlation on a map that was sent elsewhere is told to be alike; honest ones in traffic reach .65."""
+ALIKE = 0.8
+"""The same for the maps of two vehicles; honest ones in traffic reach .6."""
+MOST_TOLD = 16
+"""Likenesses of a frame that are told, the greatest first."""
+MEMORY = "screening"
+"""Under which a session's state holds what was sent."""
+
+
+@dataclass(frozen=True)
+class Bounds:
+    """What honest messages hold of one tensor."""
+
+    largest: float
+    """Absolute value."""
+    rms: float
+    """Root mean square."""
+    still: float
+    """The greatest correlation of two successive maps of a sender that does not move, in [-1, 1]."""
+
+    @classmethod
+    def from_json(cls, fields: Mapping[str, Any]) -> Bounds:
+        """What `as_json` gave."""
+        return cls(float(fields["largest"]), float(fields["rms"]), float(fields["still"]))
+
+    def as_json(self) -> dict[str, float]:
+        """JSON values."""
+        return dict(vars(self))
+
+
+@dataclass(frozen=True)
+class Screened:
+    """What the tests of a frame's messages showed."""
+
+    refused: Mapping[str, Rejection]
+    """By teammate id."""
+    alike: tuple[Likeness, ...]
+    """The ego is `robosac.defenses.EGO`."""
+    memory: Mapping[str, Any]
+    """To be handed to the next frame's tests; JSON values."""
+
+
+@dataclass(frozen=True)
+class Screening:
+    """The tests, with what is known of honest messages.
+
+    Parameters
+    ----------
+    bounds : mapping of tensor name to Bounds
+        By default nothing is known: then no message is implausible, and only one that is the same byte for byte is
+        refused as a repetition.
+    """
+
+    bounds: Mapping[str, Bounds] = field(default_factory=dict)
+
+    def screen(self, memory: Mapping[str, Any], frame: int, ego: Message, teammates: Mapping[str, Message]) -> Screened:
+        """Test the messages of a frame.
+
+        Parameters
+        ----------
+        memory : mapping
+            What `Screened` held after the frame before; empty at first.
+        frame : int
+        ego : Message
+        teammates : mapping of teammate id to Message
+            Without tensors, as of recorded frames, nothing of a message is tested.
+        """
+        told = {name: message for name, message in sorted(teammates.items()) if message.tensors}
+        if not told:
+            return Screened({}, (), memory)
+        prints = fingerprints({**_comparable(ego, told), **{name: message.tensors for name, message in told.items()}})
+        seen = {
+            name: _Seen(frame, _at(told.get(name, ego)), one, Past.from_json(memory.get(name)))
+            for name, one in prints.items()
+        }
+        refused = {}
+        for name, one in seen.items():
+            if name != EGO and (why := self._implausible(one) or _copied(name, seen) or self._repeated(one)):
+                refused[name] = why
+        kept = {name: one.remembered(self) for name, one in seen.items()}
+        silent = {name: past for name, past in memory.items() if name not in kept and recent(past, frame)}
+        return Screened(refused, _alike(seen), {**silent, **kept})
+
+    def _implausible(self, seen: _Seen) -> Rejection | None:
+        for name, bounds in self.bounds.items():
+            largest, rms = seen.print.sizes.get(name, (0.0, 0.0))
+            if largest <= MARGIN * bounds.largest and rms <= MARGIN * bounds.rms:  # false of what is no number
+                continue
+            shown = {"largest": _finite(largest), "rms": _finite(rms)}
+            most = {"most_largest": MARGIN * bounds.largest, "most_rms": MARGIN * bounds.rms}
+            return Rejection(Reason.IMPLAUSIBLE, {"tensor": name, **shown, **most})
+        return None
+
+    def _repeated(self, seen: _Seen) -> Rejection | None:
+        """A map that its sender sent from elsewhere."""
+        for sent in seen.past.sent:
+            if sent.digest == seen.print.digest and seen.moved_from(sent.place) > MOVED_M:
+                return _repetition(seen, sent.first, sent.place, 1.0)
+        anchor = seen.past.anchor
+        if seen.print.constant:
+            return None
+        if anchor is not None and self.bounds and seen.moved_from(anchor.place) > MOVED_M:
+            correlation = likeness(anchor.sketch, seen.print.sketch)
+            still = max(bounds.still for bounds in self.bounds.values())
+            if 1.0 - correlation < (1.0 - still) / STEADIER:
+                return _repetition(seen, anchor.frame, anchor.place, correlation)
+        return None
+
+
+@dataclass(frozen=True)
+class _Seen:
+    """A vehicle's message of the frame, beside its past."""
+
+    frame: int
+    place: Place
+    print: Fingerprint
+    past: Past
+
+    @property
+    def first_sent(self) -> int:
+        """The frame in which the vehicle sent this very message first."""
+        return min((each.first for each in self.past.sent if each.digest == self.print.digest), default=self.frame)
+
+    def moved_from(self, place: Place) -> float:
+        return math.dist(self.place, place)
+
+    def remembered(self, screening: Screening) -> dict[str, Any]:
+        digest, again = self.print.digest, False
+        sent = []
+        for each in self.past.sent:
+            if each.digest == digest:
+                again = True
+                sent.append(Sent(digest, each.first, self.frame, each.place))
+            elif self.frame - each.last < KEPT_FRAMES:
+                sent.append(each)
+        if not again and not self.print.constant:
+            sent.append(Sent(digest, self.frame, self.frame, self.place))
+        return Past(tuple(sent), self._anchor(screening)).as_json()
+
+    def _anchor(self, screening: Screening) -> Anchor:
+        """The one of before while it is recent and not far; one that repeats itself is kept, to be found out again."""
+        before = self.past.anchor
+        if before is not None and self.frame - before.frame < KEPT_FRAMES:
+            far = self.moved_from(before.place) > MOVED_M
+            if not far or screening._repeated(self) is not None:
+                return before
+        return Anchor(self.frame, self.place, packed(self.print.sketch))
+
+
+def _copied(name: str, seen: Mapping[str, _Seen]) -> Rejection | None:
+    """What another vehicle sent first. Who of two sent it first in one frame nobody knows, but for the ego."""
+    one = seen[name]
+    if one.print.constant:
+        return None
+    since = one.first_sent
+    for other, theirs in seen.items():
+        if other == name:
+            continue
+        if other == EGO and theirs.print.digest == one.print.digest:
+            return Rejection(Reason.COPIED, {"of": EGO, "of_frame": theirs.frame})
+        for sent in theirs.past.sent:
+            if sent.digest == one.print.digest and sent.first < since + (other == EGO):
+                return Rejection(Reason.COPIED, {"of": other, "of_frame": sent.first})
+    return None
+
+
+def _alike(seen: Mapping[str, _Seen]) -> tuple[Likeness, ...]:
+    """Pairs of maps of this frame, and of one of this frame and one sent elsewhere before."""
+    names = list(seen)
+    if not names:
+        return ()
+    now = np.stack([seen[name].print.sketch for name in names])
+    found = []
+    together = now @ now.T
+    for i, j in zip(*np.nonzero(np.triu(together >= ALIKE, 1)), strict=True):
+        found.append((names[i], names[j], seen[names[j]].frame, together[i, j]))
+    anchored = [(name, seen[name].past.anchor) for name in names]
+    before = [(name, anchor) for name, anchor in anchored if anchor is not None]
+    if before:
+        across = now @ np.stack([anchor.sketch for _, anchor in before]).T
+        for i, j in zip(*np.nonzero(across >= ALIKE), strict=True):
+            name, (other, anchor) = names[i], before[j]
+            same = name == other
+            if not same or (across[i, j] >= NEAR and seen[name].moved_from(anchor.place) > MOVED_M):
+                found.append((name, other, anchor.frame, across[i, j]))
+    found.sort(key=lambda entry: -entry[3])
+    return tuple(
+        Likeness(vehicle=a, other=b, of_frame=frame, correlation=round(min(float(c), 1.0), 4))
+        for a, b, frame, c in found[:MOST_TOLD]
+    )
+
+
+def _repetition(seen: _Seen, frame: int, place: Place, correlation: float) -> Rejection:
+    moved = round(seen.moved_from(place), 2)
+    return Rejection(
+        Reason.REPEATED, {"of_frame": frame, "moved_m": moved, "correlation": round(min(correlation, 1.0), 4)}
+    )
+
+
+def _at(message: Message) -> Place:
+    return round(float(message.pose[0, 3]), 2), round(float(message.pose[1, 3]), 2)
+
+
+def _comparable(ego: Message, teammates: Mapping[str, Message]) -> dict[str, Mapping[str, Any]]:
+    """The ego's tensors, if it sends what its teammates send."""
+    layout = next(iter(teammates.values())).tensors
+    own = {name: tensor for name, tensor in ego.tensors.items() if name in layout}
+    same = own.keys() == layout.keys() and all(
+        own[name].shape == tensor.shape and own[name].dtype == tensor.dtype for name, tensor in layout.items()
+    )
+    return {EGO: own} if same else {}
+
+
+def _finite(value: float) -> float | None:
+    return round(value, 4) if math.isfinite(value) else None
+
+
+def separated(state: Mapping[str, Any]) -> tuple[dict[str, Any], dict[str, Any]]:
+    """A session's state as the defence's alone, and what the tests of messages remember."""
+    alone = dict(state)
+    memory = alone.pop(MEMORY, None)
+    return alone, dict(memory) if isinstance(memory, Mapping) else {}
+
+
+def joined(state: Mapping[str, Any], memory: Mapping[str, Any]) -> dict[str, Any]:
+    """The state of both; the defence's alone where nothing is remembered."""
+    return {**state, MEMORY: dict(memory)} if memory else dict(state)

@@ -1,0 +1,74 @@
+"""What is remembered of the messages that a vehicle sent."""
+
+from __future__ import annotations
+
+from collections.abc import Mapping
+from dataclasses import dataclass
+from functools import cached_property
+from typing import Any
+
+from robosac.boxes import FloatArray
+from robosac.screening.fingerprints import unpacked
+
+KEPT_FRAMES = 5
+"""What was sent is remembered for so many frames."""
+Place = tuple[float, float]
+"""x and y in the world, metres, rounded to 1 cm."""
+
+
+@dataclass(frozen=True)
+class Sent:
+    """A message that was sent, perhaps several times."""
+
+    digest: str
+    first: int
+    last: int
+    """Frames."""
+    place: Place
+    """Where it was sent from first."""
+
+
+@dataclass(frozen=True)
+class Anchor:
+    """A map to compare later ones with."""
+
+    frame: int
+    place: Place
+    text: str
+    """Its sketch, `packed`."""
+
+    @cached_property
+    def sketch(self) -> FloatArray:
+        """Its sketch, (SKETCH,)."""
+        return unpacked(self.text)
+
+
+@dataclass(frozen=True)
+class Past:
+    """What is remembered of one vehicle."""
+
+    sent: tuple[Sent, ...] = ()
+    anchor: Anchor | None = None
+
+    @classmethod
+    def from_json(cls, fields: Mapping[str, Any] | None) -> Past:
+        """What `as_json` gave; nothing of a vehicle that is new."""
+        if fields is None:
+            return cls()
+        sent = tuple(Sent(digest, first, last, (x, y)) for digest, first, last, x, y in fields["sent"])
+        frame, x, y, sketch = fields["anchor"]
+        return cls(sent, Anchor(frame, (x, y), sketch))
+
+    def as_json(self) -> dict[str, Any]:
+        """JSON values; there must be an anchor."""
+        assert self.anchor is not None
+        return {
+            "sent": [[each.digest, each.first, each.last, *each.place] for each in self.sent],
+            "anchor": [self.anchor.frame, *self.anchor.place, self.anchor.text],
+        }
+
+
+def recent(past: Mapping[str, Any], frame: int) -> bool:
+    """Whether a vehicle that is not in this frame has sent something lately; ``past`` is as JSON."""
+    last: int = max((entry[2] for entry in past["sent"]), default=past["anchor"][0])
+    return frame - last < KEPT_FRAMES
