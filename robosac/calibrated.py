@@ -1,14 +1,17 @@
-"""The calibration that belongs to a detector: beside its weights, once `robosac.calibration` has made it."""
+"""What belongs to a detector beside its weights, once `robosac.calibration` has made it: calibration and witness."""
 
 from __future__ import annotations
 
 import hashlib
 import json
+from dataclasses import replace
 from functools import lru_cache
 from pathlib import Path
 
 from robosac.defenses.group_testing import Calibration, CalibrationError
 from robosac.detectors import DetectorInfo
+from robosac.detectors.weights_file import WeightsError
+from robosac.detectors.witness import Witness
 from robosac.screening import Bounds, Screening
 
 
@@ -18,7 +21,7 @@ def calibration_of(info: DetectorInfo) -> Calibration:
     Raises
     ------
     CalibrationError
-        If there is none, it is damaged, or it belongs to other weights.
+        If there is none, it is damaged, or it belongs to other weights; or the witness beside it is or does.
     """
     if info.calibration is None:
         raise CalibrationError(
@@ -35,27 +38,58 @@ def calibration_of(info: DetectorInfo) -> Calibration:
             f"{info.calibration.name} belongs to weights with the digest {calibration.weights_digest:.12}..., not to "
             f"{info.name} with {info.weights_digest:.12}...: calibrate again"
         )
-    return calibration
+    try:
+        return replace(calibration, witnessed=witness_of(info) is not None)
+    except (OSError, WeightsError) as error:
+        raise CalibrationError(str(error)) from error
 
 
 def calibration_digest(info: DetectorInfo) -> str | None:
-    """SHA-256 (hexadecimal) of the file beside a detector's weights; None if there is none to be read."""
+    """SHA-256 (hexadecimal) of the calibration beside a detector's weights, and of the witness, if there is one, after
+    it. None if there is no calibration to be read.
+    """
     if info.calibration is None:
         return None
     try:
-        return _digest(info.calibration, info.calibration.stat().st_mtime_ns)
+        files = [info.calibration, *([info.witness] if info.witness is not None else ())]
+        return _digest(*((path, path.stat().st_mtime_ns) for path in files))
     except OSError:
         return None
 
 
+def witness_of(info: DetectorInfo) -> Witness | None:
+    """The witness network beside a detector's weights; None if there is none.
+
+    Raises
+    ------
+    robosac.detectors.weights_file.WeightsError
+        If it is damaged, or belongs to other weights.
+    OSError
+        If it cannot be read.
+    """
+    if info.witness is None:
+        return None
+    return _open(info.witness, info.witness.stat().st_mtime_ns, info)
+
+
 @lru_cache(maxsize=16)
-def _digest(path: Path, changed: int) -> str:  # noqa: ARG001 (of a changed file it is another)
-    return hashlib.sha256(path.read_bytes()).hexdigest()
+def _digest(*files: tuple[Path, int]) -> str:  # with the times of their last changes
+    return hashlib.sha256(b"".join(path.read_bytes() for path, _ in files)).hexdigest()
 
 
 @lru_cache(maxsize=16)
 def _read(path: Path, changed: int) -> Calibration:  # noqa: ARG001 (a changed file is read again)
     return Calibration.read(path)
+
+
+_witnesses: dict[Path, tuple[int, str, Witness]] = {}
+
+
+def _open(path: Path, changed: int, info: DetectorInfo) -> Witness:
+    known = _witnesses.get(path)
+    if known is None or known[:2] != (changed, info.weights_digest):
+        known = _witnesses[path] = (changed, info.weights_digest, Witness.open(path, info))
+    return known[2]
 
 
 def screening_for(info: DetectorInfo) -> Screening:

@@ -17,9 +17,11 @@ import rfc8785
 
 from robosac.answers import Reason, Source, Verdict
 from robosac.boxes import FloatArray
+from robosac.calibrated import witness_of
 from robosac.consensus import at_least, compare
 from robosac.deadline import Deadline
 from robosac.defenses import (
+    EGO,
     Decision,
     Defense,
     Hypothesis,
@@ -31,11 +33,13 @@ from robosac.defenses import (
     trusted_in,
 )
 from robosac.detectors import Message, PreparedFrame, Preparer
+from robosac.detectors.base import Testifying
 from robosac.faults import describe
 from robosac.previous import PreviousAnswer
 from robosac.provenance import best_first, unfounded
 from robosac.result import FusionResult
 from robosac.screening import Screened, Screening, joined, separated
+from robosac.testimony import Testimony
 
 __all__ = ["FusionResult", "UnverifiedAnswer", "fuse"]
 
@@ -109,10 +113,13 @@ class _FrameRun:
     deadline: Deadline
     screening: Screening | None = None
     timings: dict[str, float] = field(
-        default_factory=lambda: dict.fromkeys(("screening", "prepare", "ego_only", "hypotheses", "consensus"), 0.0)
+        default_factory=lambda: dict.fromkeys(
+            ("screening", "prepare", "testimony", "ego_only", "hypotheses", "consensus"), 0.0
+        )
     )
     outcomes: list[Outcome] = field(default_factory=list)
     boxes: dict[Hypothesis, FloatArray] = field(default_factory=dict)
+    testimony: Testimony | None = None
     out_of_time: bool = False
     fault: str | None = None
 
@@ -127,6 +134,7 @@ class _FrameRun:
                 screened = self._screen(self.screening, memory, teammates)
             passed = {name: teammates[name] for name in team if name not in screened.refused}
             prepared = self._prepare(passed)
+            self._hear(passed)
             decision = self._converse(prepared, list(passed), state, rng)
             answered = self._assemble(prepared, decision)
         except Exception as error:
@@ -158,6 +166,17 @@ class _FrameRun:
     def _prepare(self, teammates: Mapping[str, Message]) -> PreparedFrame:
         with self._spending("prepare"):
             return self.detector.prepare(self.ego, teammates)
+
+    def _hear(self, teammates: Mapping[str, Message]) -> None:
+        """Ask the witness what each message says by itself, if the defence wants to know."""
+        if not getattr(self.defense, "asks_witnesses", False):
+            return
+        with self._spending("testimony"):
+            if isinstance(self.detector, Testifying):
+                said = self.detector.testify(self.ego, teammates)
+                self.testimony = None if said is None else said.of({EGO, *teammates})
+            elif (witness := witness_of(self.detector.info)) is not None:
+                self.testimony = witness.testify(EGO, {EGO: self.ego, **teammates})
 
     def _converse(self, prepared: PreparedFrame, team: list[str], state: State, rng: np.random.Generator) -> Decision:
         conversation = self.defense.converse(team, state, rng)
@@ -211,7 +230,8 @@ class _FrameRun:
             with self._spending("consensus"):
                 comparison = compare(reference, self._confident(boxes), self.defense.consensus_threshold)
             index, verdict = comparison.jaccard_index, comparison.verdict
-            tested.append(Outcome(subset, index, verdict, boxes, reference, self.ego.pose, self.frame))
+            seen = (boxes, reference, self.ego.pose, self.frame, self.testimony, self.boxes.get(()))
+            tested.append(Outcome(subset, index, verdict, *seen))
             self.outcomes.append(tested[-1])
         return tested
 

@@ -53,6 +53,17 @@ class FusionResult(Decision):
     """What the next frame may be compared with; None after an ego-only answer."""
 
     @property
+    def named(self) -> tuple[str, ...] | None:
+        """Teammates held to be attackers by the defence, or by the tests of messages in this frame; None from a defence
+        that names nobody, where these name nobody either.
+        """
+        by_defense = super().named
+        refused = [name for name, why in self.rejected.items() if why.distrust is Distrust.NAMED]
+        if by_defense is None and not refused:
+            return None
+        return tuple(dict.fromkeys([*(by_defense or ()), *refused]))
+
+    @property
     def sampling_steps(self) -> int:
         """Hypotheses tested."""
         return len(self.hypotheses)

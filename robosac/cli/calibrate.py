@@ -81,6 +81,8 @@ def run(  # the options of a command line
     for error_m, bins in reliability.items():
         _print(console, error_m, bins)
     console.print(f"{out}: {calibration.detector}, weights {calibration.weights_digest:.12}...")
+    if chosen.info.witness is None:
+        console.print("Single objects can be judged, too, once robosac witness has made NAME.witness.safetensors.")
 
 
 def _measure_messages(detector: Detector, data: str, scenes: int, out: Path, made_by: str, console: Console) -> None:

@@ -25,6 +25,7 @@ OWN = {
     "reproduce": "robosac.cli.reproduce:run",
     "compare": "robosac.cli.compare:run",
     "calibrate": "robosac.cli.calibrate:run",
+    "witness": "robosac.cli.witness:run",
     "convert-checkpoint": "robosac.cli.convert:run",
     "audit": "robosac.cli.audit:app",
 }

@@ -20,6 +20,7 @@ import numpy as np
 
 from robosac.answers import Distrust, Reason, Source, Support, Verdict
 from robosac.boxes import FloatArray
+from robosac.testimony import Testimony
 
 Hypothesis = tuple[str, ...]
 State = Mapping[str, Any]
@@ -107,6 +108,12 @@ class Outcome:
     """(4, 4): world_from_sensor of the ego. None where it is not known."""
     frame: int = field(default=0, compare=False, repr=False)
     """Its number; frames of successive numbers are one frame period apart."""
+    testimony: Testimony | None = field(default=None, compare=False, repr=False)
+    """What each message of the frame says by itself, the ego's under `EGO`; the same in all outcomes of a frame. None
+    where the detector has no witness, or the defence does not ask for it.
+    """
+    alone: FloatArray | None = field(default=None, compare=False, repr=False)
+    """(k, 6): all that the ego alone sees, with scores; ego frame. None where it was not decoded."""
 
 
 @dataclass(frozen=True)
@@ -176,7 +183,10 @@ Conversation = Asking[Decision]
 
 
 class Defense(Protocol):
-    """A defence's settings and its conversation. Implementations are immutable."""
+    """A defence's settings and its conversation. Implementations are immutable.
+
+    One that has a true ``asks_witnesses`` is given testimony with every outcome, where the detector has a witness.
+    """
 
     @property
     def kind(self) -> str:

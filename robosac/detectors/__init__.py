@@ -17,6 +17,7 @@ from robosac.detectors.base import (
     TensorSpec,
     blank,
     calibration_beside,
+    witness_beside,
 )
 from robosac.lazy import lazily
 
@@ -56,5 +57,6 @@ __all__ = [
     "available",
     "blank",
     "calibration_beside",
+    "witness_beside",
     "load",
 ]

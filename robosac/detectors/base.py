@@ -19,6 +19,8 @@ from robosac.boxes import FloatArray
 if TYPE_CHECKING:
     import torch
 
+    from robosac.testimony import Testimony
+
 Role = Literal["ego", "teammate"]
 
 
@@ -52,11 +54,21 @@ class DetectorInfo:
     """Boxes from this score on take part in the consensus test."""
     calibration: Path | None = None
     """The file of likelihoods for group testing that lies beside the weights."""
+    witness: Path | None = None
+    """The file of the network that reads single messages (`robosac.detectors.witness`), beside the weights too."""
+    mirrored: bool = False
+    """Whether columns of the maps in messages run along minus x."""
 
 
 def calibration_beside(weights: Path) -> Path | None:
     """``NAME.calibration.json`` beside the weights ``NAME.safetensors``, if there is one."""
     path = weights.with_suffix(".calibration.json")
+    return path if path.is_file() else None
+
+
+def witness_beside(weights: Path) -> Path | None:
+    """``NAME.witness.safetensors`` beside the weights ``NAME.safetensors``, if there is one."""
+    path = weights.with_suffix(".witness.safetensors")
     return path if path.is_file() else None
 
 
@@ -141,6 +153,14 @@ class Preparer(Protocol):
 
         The messages must already be checked against `info`.
         """
+
+
+@runtime_checkable
+class Testifying(Protocol):
+    """What gives testimony of its own, in the place of the witness beside the weights: a recording does."""
+
+    def testify(self, ego: Message, teammates: Mapping[str, Message]) -> Testimony | None:
+        """What each message says by itself, the ego's under `robosac.defenses.EGO`; None if that is not known."""
 
 
 class Encoder(Preparer, Protocol):

@@ -11,7 +11,7 @@ import numpy as np
 import torch
 
 from robosac.boxes import FloatArray
-from robosac.detectors.base import DetectorInfo, Message, TensorSpec, calibration_beside
+from robosac.detectors.base import DetectorInfo, Message, TensorSpec, calibration_beside, witness_beside
 from robosac.detectors.decoding import cell_centres, decode_boxes
 from robosac.detectors.map_fusion import FEATURES, Decode, Heads, MapFusionDetector, Maps
 from robosac.detectors.network import CHANNELS, MAP, MeanFusionNetwork, fold_batchnorm
@@ -50,7 +50,7 @@ class EmbeddedDetector(MapFusionDetector):
         tensors, recipe = read_weights(weights)
         digest = hashlib.sha256(weights.read_bytes()).hexdigest()
         try:
-            self._build(tensors, recipe, digest, calibration_beside(weights))
+            self._build(tensors, recipe, digest, weights)
         except RuntimeError as error:
             raise WeightsError(f"{weights} does not fit the network of {self.name}: {error}") from error
 
@@ -65,7 +65,7 @@ class EmbeddedDetector(MapFusionDetector):
         return detector
 
     def _build(
-        self, tensors: Mapping[str, torch.Tensor], recipe: dict[str, Any], digest: str, calibration: Path | None
+        self, tensors: Mapping[str, torch.Tensor], recipe: dict[str, Any], digest: str, weights: Path | None
     ) -> None:
         network = MeanFusionNetwork()
         network.load_state_dict({name: tensor.float() for name, tensor in tensors.items()})
@@ -82,7 +82,8 @@ class EmbeddedDetector(MapFusionDetector):
             cell_m=2 * AREA_M / MAP,
             weights_digest=digest,
             consensus_score=_number(recipe, "consensus_score", 1.0),
-            calibration=calibration,
+            calibration=calibration_beside(weights) if weights else None,
+            witness=witness_beside(weights) if weights else None,
         )
 
     def encode(self, points: FloatArray, pose: FloatArray) -> Message:

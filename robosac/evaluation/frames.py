@@ -13,12 +13,14 @@ from robosac.answers import Verdict
 from robosac.attacks import Attack, Campaign
 from robosac.attacks.situation import Foreign, Lie, Past
 from robosac.boxes import FloatArray, pose_matrix
+from robosac.calibrated import witness_of
 from robosac.consensus import DEFAULT_THRESHOLD, at_least, compare
-from robosac.defenses import Defense
+from robosac.defenses import EGO, Defense
 from robosac.detectors import Detector, DetectorInfo, Message, PreparedFrame
 from robosac.detectors.base import for_role
 from robosac.fusion import FusionResult, fuse
 from robosac.scenes import Frame, Scene, SceneError, SceneSource, Split, seconds_apart
+from robosac.testimony import Testimony
 
 Subset = frozenset[str]
 YAW_PER_METRE = np.deg2rad(2.0)
@@ -61,6 +63,11 @@ class EvaluationFrame:
         """As the detector does."""
         return self.detector.prepare(ego, teammates)
 
+    def testify(self, ego: Message, teammates: Mapping[str, Message]) -> Testimony | None:
+        """As the detector's witness does."""
+        witness = witness_of(self.info)
+        return None if witness is None else witness.testify(EGO, {EGO: ego, **teammates})
+
 
 @dataclass(frozen=True)
 class DecodedOnce(EvaluationFrame):
@@ -73,6 +80,15 @@ class DecodedOnce(EvaluationFrame):
     def of(cls, frame: EvaluationFrame) -> DecodedOnce:
         """The same frame; nothing of it is decoded yet."""
         return cls(**{name: getattr(frame, name) for name in EvaluationFrame.__dataclass_fields__})
+
+    @cached_property
+    def heard(self) -> Testimony | None:
+        """What the witness makes of all messages, read once."""
+        return super().testify(self.ego, self.teammates)
+
+    def testify(self, ego: Message, teammates: Mapping[str, Message]) -> Testimony | None:  # noqa: ARG002 (always the same)
+        """What has been heard."""
+        return self.heard
 
     @cached_property
     def _prepared(self) -> PreparedFrame:

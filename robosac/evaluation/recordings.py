@@ -6,7 +6,7 @@ import hashlib
 import json
 import os
 import re
-from collections.abc import Collection, Iterator, Mapping, Sequence
+from collections.abc import Callable, Iterator, Mapping, Sequence
 from dataclasses import dataclass, field
 from itertools import combinations
 from pathlib import Path
@@ -16,16 +16,17 @@ import numpy as np
 
 from robosac.attacks.situation import Lie
 from robosac.boxes import FloatArray
+from robosac.defenses import EGO
 from robosac.detectors import Detector, Message
 from robosac.evaluation.encounters import NOBODY_ACTS, Act, Encounters
 from robosac.evaluation.frames import DecodedOnce, EvaluationFrame, Subset
 from robosac.scenes import DEFAULT_DATA
 
-FORMAT = 1
+FORMAT = 2
 
 
 def record(frame: EvaluationFrame, unattacked: DecodedOnce | None = None) -> DecodedOnce:
-    """Decode all subsets of a frame's teammates, ``2 ** S`` of them, and leave out what its messages hold.
+    """Decode all subsets of a frame's teammates, ``2 ** S`` of them.
 
     Boxes are rounded to float32, as files hold them.
 
@@ -41,22 +42,15 @@ def record(frame: EvaluationFrame, unattacked: DecodedOnce | None = None) -> Dec
             boxes[subset] = unattacked.detect(subset)
         else:
             boxes[subset] = prepared.detect(sorted(subset)).astype(np.float32).astype(np.float64)
-    return recorded(frame.detector, frame.ego.pose, frame.team, frame.attackers, frame.truth, boxes, frame.lies)
+    return decoded(frame, boxes)
 
 
-def recorded(
-    detector: Detector,
-    pose: FloatArray,
-    team: Sequence[str],
-    attackers: Collection[str],
-    truth: FloatArray,
-    boxes: dict[Subset, FloatArray],
-    lies: Sequence[Lie] = (),
-) -> DecodedOnce:
-    """A frame of which nothing is known but the ego's pose, true boxes, lies, and the boxes of all subsets."""
-    empty = Message(pose, {})
-    sent = dict.fromkeys(team, empty)
-    return DecodedOnce(detector, empty, {}, sent, frozenset(attackers), truth, boxes, lies=tuple(lies))
+def decoded(frame: EvaluationFrame, boxes: dict[Subset, FloatArray]) -> DecodedOnce:
+    """A frame of which the boxes of all subsets are known."""
+    nothing: dict[str, Message] = {}
+    return DecodedOnce(
+        frame.detector, frame.ego, nothing, frame.teammates, frame.attackers, frame.truth, boxes, lies=frame.lies
+    )
 
 
 @dataclass
@@ -78,15 +72,18 @@ class Recordings(Encounters):
         path = None if self.folder is None else self.folder / self._file(act)
         known = self._recorded.setdefault(act, {})
         if not known and path is not None and path.exists():
-            known.update(load(path, self.detector))
+            known.update(load(path, self.detector, self._unattacked))
         missing = [index for index in indices if index not in known]
         if missing:
-            unattacked = [None] * len(missing) if act == NOBODY_ACTS else self.met(NOBODY_ACTS, missing)
+            unattacked = [None] * len(missing) if act == NOBODY_ACTS else self._unattacked(missing)
             for index, frame, honest in zip(missing, super().met(act, missing), unattacked, strict=True):
                 known[index] = record(frame, honest)
             if path is not None:
-                save(path, known)
+                save(path, known, whole=act == NOBODY_ACTS)
         yield from (known[index] for index in indices)
+
+    def _unattacked(self, indices: Sequence[int]) -> list[DecodedOnce]:
+        return list(self.met(NOBODY_ACTS, indices))
 
     def _file(self, act: Act) -> str:
         info, scene = self.detector.info, self.scene.number
@@ -96,14 +93,31 @@ class Recordings(Encounters):
         return f"{scene}-{re.sub('[^A-Za-z0-9-]', '-', act.attack)}-{len(act.acting)}-{digest[:16]}.npz"
 
 
-def save(path: Path, frames: Mapping[int, DecodedOnce]) -> None:
-    """Write frames of one team, by their numbers, to an ``.npz`` file, which takes its place at once."""
+def save(path: Path, frames: Mapping[int, DecodedOnce], whole: bool) -> None:
+    """Write frames of one team, by their numbers, to an ``.npz`` file, which takes its place at once.
+
+    What honest messages hold is written only if it is to be the ``whole``: the others are those of the same frame
+    without an attack.
+    """
     ordered = sorted(frames.items())
     head = [
-        {"index": i, "attackers": sorted(f.attackers), "team": list(f.team), "lies": [_told(lie) for lie in f.lies]}
+        {
+            "index": i,
+            "attackers": sorted(f.attackers),
+            "team": list(f.team),
+            "poses": {name: message.pose.ravel().tolist() for name, message in f.teammates.items()},
+            "lies": [_told(lie) for lie in f.lies],
+        }
         for i, f in ordered
     ]
     boxes = [frame.boxes[subset] for _, frame in ordered for subset in subsets(frame.team)]
+    tensors: dict[str, Any] = {
+        f"{index}/{name}/{tensor}": values
+        for index, frame in ordered
+        for name, message in _messages(frame).items()
+        if whole or name in frame.attackers
+        for tensor, values in message.tensors.items()
+    }
     partial = path.with_name(f"{path.stem}.{os.getpid()}.npz")
     np.savez_compressed(
         partial,
@@ -113,23 +127,44 @@ def save(path: Path, frames: Mapping[int, DecodedOnce]) -> None:
         truths=np.array([len(f.truth) for _, f in ordered]),
         boxes=np.concatenate(boxes).astype(np.float32),
         counts=np.array([len(each) for each in boxes]),
+        **tensors,
     )
     partial.replace(path)
 
 
-def load(path: Path, detector: Detector) -> dict[int, DecodedOnce]:
-    """Frames that `save` wrote, by their numbers; ``detector`` decoded them."""
+def load(
+    path: Path, detector: Detector, unattacked: Callable[[Sequence[int]], list[DecodedOnce]]
+) -> dict[int, DecodedOnce]:
+    """Frames that `save` wrote, by their numbers; ``detector`` decoded them.
+
+    ``unattacked`` gives the frames of these numbers without an attack.
+    """
     with np.load(path) as file:
         head = json.loads(str(file["head"]))
         poses, truths = file["pose"], np.split(file["truth"], np.cumsum(file["truths"])[:-1])
         boxes = iter(np.split(file["boxes"].astype(np.float64), np.cumsum(file["counts"])[:-1]))
+        held: dict[tuple[int, str], dict[str, Any]] = {}
+        for key in file.files:
+            if key.count("/") == 2:
+                index, name, tensor = key.split("/")
+                held.setdefault((int(index), name), {})[tensor] = file[key]
+    whole = all((entry["index"], EGO) in held for entry in head)
+    honest = [None] * len(head) if whole else unattacked([entry["index"] for entry in head])
     frames = {}
-    for entry, pose, truth in zip(head, poses, truths, strict=True):
-        team = entry["team"]
-        decoded = {subset: next(boxes) for subset in subsets(team)}
-        lies = [_heard(lie) for lie in entry.get("lies", ())]  # recordings from before attacks on objects tell none
-        frames[entry["index"]] = recorded(detector, pose, team, entry["attackers"], truth, decoded, lies)
+    for entry, pose, truth, plain in zip(head, poses, truths, honest, strict=True):
+        index, team = entry["index"], entry["team"]
+        known = {} if plain is None else {name: message.tensors for name, message in _messages(plain).items()}
+        known |= {name: tensors for (number, name), tensors in held.items() if number == index}
+        sent = {name: Message(np.array(entry["poses"][name]).reshape(4, 4), known[name]) for name in team}
+        lies = tuple(_heard(lie) for lie in entry["lies"])
+        attackers = frozenset(entry["attackers"])
+        frame = EvaluationFrame(detector, Message(pose, known[EGO]), {}, sent, attackers, truth, lies=lies)
+        frames[index] = decoded(frame, {subset: next(boxes) for subset in subsets(team)})
     return frames
+
+
+def _messages(frame: EvaluationFrame) -> dict[str, Message]:
+    return {EGO: frame.ego, **frame.teammates}
 
 
 def _told(lie: Lie) -> dict[str, Any]:

@@ -12,7 +12,7 @@ import numpy as np
 from robosac.boxes import FloatArray, IntArray, from_world, pose_matrix
 from robosac.scenes.base import Split, View
 from robosac.scenes.lidar import Lidar
-from robosac.scenes.splits import TEST_SEEDS, VALIDATION_SEEDS
+from robosac.scenes.splits import TEST_SEEDS, TRAINING_SEEDS, VALIDATION_SEEDS
 from robosac.scenes.world import CAR_SENSOR_HEIGHT_M, RSU_HEIGHT_M, Traffic, build_traffic
 
 FRAME_PERIOD_S = 0.2
@@ -168,3 +168,7 @@ class Synthetic:
     def scenes(self, split: Split) -> Sequence[IntersectionScene]:
         """A thousand scenes."""
         return [IntersectionScene(seed) for seed in (TEST_SEEDS if split == "test" else VALIDATION_SEEDS)]
+
+    def training_scenes(self) -> Sequence[IntersectionScene]:
+        """Those from the first training seeds on."""
+        return [IntersectionScene(seed) for seed in TRAINING_SEEDS[:1_000]]

@@ -18,12 +18,12 @@ from __future__ import annotations
 
 import math
 from collections.abc import Mapping
-from dataclasses import dataclass, field
+from dataclasses import dataclass, field, replace
 from typing import Any
 
 import numpy as np
 
-from robosac.answers import Likeness, Reason
+from robosac.answers import Distrust, Likeness, Reason
 from robosac.defenses import EGO, Rejection
 from robosac.detectors import Message
 from robosac.screening.fingerprints import Fingerprint, fingerprints, likeness, packed
@@ -39,6 +39,8 @@ NEAR = 0.9
 """From this correlation on a map that was sent elsewhere is told to be alike; honest ones in traffic reach .65."""
 ALIKE = 0.8
 """The same for the maps of two vehicles; honest ones in traffic reach .6."""
+NAMED_AFTER = 3
+"""Refused messages from which on their sender is named as an attacker, while it sends such."""
 MOST_TOLD = 16
 """Likenesses of a frame that are told, the greatest first."""
 MEMORY = "screening"
@@ -114,8 +116,9 @@ class Screening:
         refused = {}
         for name, one in seen.items():
             if name != EGO and (why := self._implausible(one) or _copied(name, seen) or self._repeated(one)):
-                refused[name] = why
-        kept = {name: one.remembered(self) for name, one in seen.items()}
+                often = one.past.refused + 1 >= NAMED_AFTER
+                refused[name] = replace(why, distrust=Distrust.NAMED) if often else why
+        kept = {name: one.remembered(self, name in refused) for name, one in seen.items()}
         silent = {name: past for name, past in memory.items() if name not in kept and recent(past, frame)}
         return Screened(refused, _alike(seen), {**silent, **kept})
 
@@ -162,7 +165,7 @@ class _Seen:
     def moved_from(self, place: Place) -> float:
         return math.dist(self.place, place)
 
-    def remembered(self, screening: Screening) -> dict[str, Any]:
+    def remembered(self, screening: Screening, refused: bool) -> dict[str, Any]:
         digest, again = self.print.digest, False
         sent = []
         for each in self.past.sent:
@@ -173,7 +176,7 @@ class _Seen:
                 sent.append(each)
         if not again and not self.print.constant:
             sent.append(Sent(digest, self.frame, self.frame, self.place))
-        return Past(tuple(sent), self._anchor(screening)).as_json()
+        return Past(tuple(sent), self._anchor(screening), self.past.refused + refused).as_json()
 
     def _anchor(self, screening: Screening) -> Anchor:
         """The one of before while it is recent and not far; one that repeats itself is kept, to be found out again."""

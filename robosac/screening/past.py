@@ -49,6 +49,8 @@ class Past:
 
     sent: tuple[Sent, ...] = ()
     anchor: Anchor | None = None
+    refused: int = 0
+    """Messages that were refused."""
 
     @classmethod
     def from_json(cls, fields: Mapping[str, Any] | None) -> Past:
@@ -57,7 +59,7 @@ class Past:
             return cls()
         sent = tuple(Sent(digest, first, last, (x, y)) for digest, first, last, x, y in fields["sent"])
         frame, x, y, sketch = fields["anchor"]
-        return cls(sent, Anchor(frame, (x, y), sketch))
+        return cls(sent, Anchor(frame, (x, y), sketch), int(fields.get("refused", 0)))
 
     def as_json(self) -> dict[str, Any]:
         """JSON values; there must be an anchor."""
@@ -65,6 +67,7 @@ class Past:
         return {
             "sent": [[each.digest, each.first, each.last, *each.place] for each in self.sent],
             "anchor": [self.anchor.frame, *self.anchor.place, self.anchor.text],
+            **({"refused": self.refused} if self.refused else {}),
         }
 
 

@@ -20,7 +20,7 @@ if TYPE_CHECKING:
     from opentelemetry.trace import Tracer
 
 _ENDPOINTS = ("OTEL_EXPORTER_OTLP_TRACES_ENDPOINT", "OTEL_EXPORTER_OTLP_ENDPOINT")
-_STAGES = ("receive", "gather", "queue", "prepare", "ego_only", "hypotheses", "consensus", "store")
+_STAGES = ("receive", "gather", "queue", "prepare", "testimony", "ego_only", "hypotheses", "consensus", "store")
 
 
 def provider_from_environment() -> TracerProvider | None:

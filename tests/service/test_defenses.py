@@ -177,7 +177,7 @@ async def test_group_testing_names_the_attacker_and_tells_its_suspicion(served, 
     assert all("car-2" not in answer.accepted for answer in answers)
     last = answers[-1].rejected["car-2"]
     assert (last.reason, last.distrust, answers[-1].named) == ("distrusted", "named", ("car-2",))
-    assert {item["test"] for item in last["evidence"]} <= {"ego", "pair", "change"}
+    assert {item["test"] for item in last["evidence"]} <= {"ego", "pair", "change", "objects"}
     body = wire.pack_frame(9, ego_message, attacked)
     result = (await served.post(session, "frames", body)).json()
     state = (await served.http.get(path, headers=bearer)).json()

@@ -64,7 +64,7 @@ def expected_information(known: Knowledge, subsets: BoolArray, decoded: BoolArra
         boxes = np.array([crowd(memory.shown[key]) for key in subset_keys[again].tolist()])
         told = known.model.change_information(sizes[again], boxes, alone[again])
         bits[again] += once * told * dilution(sizes[again])
-    return bits + _of_pairs(known, subsets, decoded)
+    return (bits + _of_pairs(known, subsets, decoded)) * memory.steadiness.trust
 
 
 def _of_pairs(known: Knowledge, subsets: BoolArray, decoded: BoolArray) -> FloatArray:

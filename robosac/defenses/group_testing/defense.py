@@ -13,9 +13,10 @@ from robosac.consensus import DEFAULT_THRESHOLD
 from robosac.defenses.group_testing.candidates import unresolved
 from robosac.defenses.group_testing.evidence import Evidence
 from robosac.defenses.group_testing.frame import JudgedFrame
+from robosac.defenses.group_testing.inspection import Inspection
 from robosac.defenses.group_testing.knowledge import Knowledge, remember
 from robosac.defenses.group_testing.memory import Memory
-from robosac.defenses.group_testing.model import Calibration, CalibrationError, EvidenceModel
+from robosac.defenses.group_testing.model import LIE, Calibration, CalibrationError, EvidenceModel
 from robosac.defenses.group_testing.posterior import Hazards, Posterior
 from robosac.defenses.protocol import Conversation, Reference, State, named_in, trusted_in
 from robosac.defenses.sampling import MAX_BUDGET
@@ -57,6 +58,16 @@ class GroupTestingSettings(DefenseSettings):
         f"{COMPARABLE_PERIOD_MS:g}.",
     )
 
+    judge_objects: bool = Field(
+        True, description="Whether single objects are judged by testimony, if the detector has a witness."
+    )
+    keep_contradicted: bool = Field(
+        False, description="Whether boxes that are contradicted stay in the answer, marked; by default they are apart."
+    )
+    inspections: int = Field(
+        4, ge=0, le=MAX_BUDGET, description="Most further hypotheses a frame to see who is behind a false object."
+    )
+
     def at_period(self, frame_period_ms: float) -> Self:
         """With ``compare_frames`` decided."""
         if self.compare_frames is not None:
@@ -81,7 +92,8 @@ class GroupTestingSettings(DefenseSettings):
         if calibration is None:
             raise CalibrationError("group_testing needs the calibration of a detector")
         decided = self.at_calibration(calibration)
-        return GroupTesting(calibration.at(decided.pose_error_m or 0.0), decided)
+        model = calibration.at(decided.pose_error_m or 0.0)
+        return GroupTesting(model.with_lies() if calibration.witnessed and decided.judge_objects else model, decided)
 
 
 @dataclass(frozen=True)
@@ -95,10 +107,20 @@ class GroupTesting:
        search.
     3. A decoded subset is evidence by what it keeps, moves and adds compared with the ego alone and with each part and
        superset decoded in this frame (`geometry.measure`), and by what comes and goes in it since the frame before, if
-       it was decoded there too (`geometry.changes`). A repeated test weighs less.
-    4. The answer is the decoded subset of greatest utility that is in consensus with the ego, or all trusted.
-    5. A teammate is named (``distrusted``) once its probability passes ``naming_bound`` and at least two different
-       subsets speak against it; it is cleared when the probability falls below a half.
+       it was decoded there too (`geometry.changes`). A repeated test weighs less. So does what speaks against somebody
+       where the ego itself is less steady than where the likelihoods were calibrated (`Steadiness.trust`).
+    4. Where there is testimony, up to ``inspections`` further subsets are decoded: to ask those again that are left
+       out, and to see without whom an object is right that is wrong in the answer (`Inspection.next_test`). Lies raise
+       a teammate's level (`lies.RULES`) and its probability.
+    5. The answer is the decoded subset of greatest utility that is in consensus with the ego, or all trusted. Each box
+       of it is judged by testimony: left out, repaired, or kept with its status (`standing.judge`).
+    6. A teammate is named (``distrusted``) once it lied about objects too often and its probability is at least a half;
+       or once its probability passes ``naming_bound``, at least two different subsets speak against it, and its own
+       fusions are much less steady than the ego's perception (`Steadiness.names`). It is cleared when the probability
+       falls below a half.
+
+    Without testimony step 4 and the judging of step 5 fall away, and whoever is named is named for suspicion and
+    unsteadiness together.
 
     An ego that sees fewer than two boxes gives no verdict: its consensus is none, and the answer falls back on the
     trust list (source ``trusted``). Teammates get onto that list by having been in consensus, and stay while their
@@ -117,6 +139,11 @@ class GroupTesting:
     """
     evidence: type[Evidence] = Evidence
     """Reads the outcomes; another one than `Evidence` where they are drawn and not decoded."""
+
+    @property
+    def asks_witnesses(self) -> bool:
+        """Whether objects are judged by testimony."""
+        return LIE in self.model.kinds
 
     @property
     def consensus_threshold(self) -> float:
@@ -151,7 +178,7 @@ class GroupTesting:
         return remember(posterior, memory, *kept)
 
     def converse(self, team: Sequence[str], state: State, rng: np.random.Generator) -> Conversation:
-        """Steps 1 to 5, one hypothesis a batch."""
+        """Steps 1 to 6, one hypothesis a batch."""
         settings = self.settings
         posterior, memory = self._revive(state)
         self._welcome(posterior, memory, team)
@@ -162,15 +189,24 @@ class GroupTesting:
         known = Knowledge(self.model, posterior, memory)
         evidence = self.evidence(known, compare_frames=settings.compare_frames is not False)
         judged = JudgedFrame(known, evidence, tuple(team), frozenset(trusted_in(state)))
-        for passes in range(settings.first_budget if first else settings.budget, 0, -1):
-            subset = judged.next_test(rng, passes)
+        named = frozenset(named_in(state) or ())
+        inspection = Inspection(known, memory.lies, tuple(team), named, settings.keep_contradicted)
+        passes, inspections = settings.first_budget if first else settings.budget, settings.inspections
+        while True:
+            subset = judged.next_test(rng, passes) if passes > 0 else None
+            passes -= 1
+            if subset is None:
+                passes, inspections = 0, inspections - 1
+                subset = inspection.next_test(judged.best_answer()) if inspections >= 0 else None
             if subset is None:
                 break
             tested = yield [subset]
             if not tested:
                 break
-            evidence.learn(tested[0])
-        return judged.decide(frozenset(named_in(state) or ()), settings.naming_bound)
+            evidence.learn(tested[0], inspection.learn(tested[0]))
+        inspection.conclude(judged.best_answer())
+        evidence.compare_singles()
+        return judged.decide(named, settings.naming_bound, inspection)
 
     def _prior(self, team: Sequence[str]) -> Posterior:
         return Posterior(len(self.model.kinds), self.settings.attack_prior, self.settings.attacker_prior, team)

@@ -17,9 +17,12 @@ from robosac.defenses.group_testing.geometry import MIN_WITNESSES, PairMeasure, 
 from robosac.defenses.group_testing.knowledge import Knowledge
 from robosac.defenses.group_testing.memory import CHANGE_REPEAT, EGO_REPEAT, PAIR_REPEAT, WORTH_KEEPING, keys
 from robosac.defenses.group_testing.model import CLEAN, pair_bin
+from robosac.defenses.group_testing.objects import Shown
 from robosac.defenses.protocol import Hypothesis, Outcome
 
 _REPEATS = {"ego": EGO_REPEAT, "pair": PAIR_REPEAT, "change": CHANGE_REPEAT}
+NOBODY = 0
+"""The key of the ego alone."""
 _CERTAIN = 1e-9
 _TINY = 1e-300
 
@@ -70,20 +73,24 @@ class Evidence:
         self._compare_frames = compare_frames
         if not compare_frames:
             known.memory.shown = {}
+        self._checked: dict[Hypothesis, Shown | None] = {}
         self.outcomes: list[Outcome] = []
         self.shown: dict[int, FloatArray] = {}
         self.ego_sees = self.ego_witnesses = True
 
-    def learn(self, outcome: Outcome) -> None:
+    def learn(self, outcome: Outcome, shown: Shown | None = None) -> None:
         """Take in a decoded subset: the pairs it makes with the ego alone and with what this frame has shown already,
-        and what has changed in it since the frame before.
+        and what has changed in it since the frame before. ``shown`` is the same, checked by testimony.
         """
+        self._checked[outcome.teammates] = shown
         if outcome.frame != self._known.memory.shown_in + 1:  # nothing to compare with, nor to be promised
             self._known.memory.shown = {}
         self.ego_sees = outcome.reference is not None and len(outcome.reference) >= MIN_WITNESSES
+        if not self.outcomes and self._compare_frames:
+            self._begin(outcome)
         findings = self._pairs(outcome)
         if outcome.reference is not None and outcome.boxes is not None:
-            pair = self.measure(outcome.reference, outcome.boxes)
+            pair = self.measure(outcome.reference, outcome.boxes, self._vouched(outcome, outcome.teammates))
             self.ego_witnesses = pair is not None
             if pair is not None:
                 values = {"jaccard_index": round(outcome.jaccard_index, 4)}
@@ -92,6 +99,29 @@ class Evidence:
         self.outcomes.append(outcome)
         for finding in findings:
             self._apply(finding)
+
+    def compare_singles(self) -> None:
+        """Let those be judged whose own fusion was decoded in this frame and the one before; the frame is over."""
+        before, now = self._known.memory.shown, self.shown
+        singles = {}
+        for outcome in self.outcomes:
+            if len(outcome.teammates) == 1:
+                (key,) = self._known.keys(self._known.rows([outcome.teammates])).tolist()
+                if key in before and key in now:
+                    singles[outcome.teammates[0]] = self._flicker(before[key], now[key])
+        self._known.memory.steadiness.learn(singles)
+
+    def _begin(self, first: Outcome) -> None:
+        """Let the ego alone be compared with the frame before."""
+        before, alone = self._known.memory.shown.get(NOBODY), None
+        if first.alone is not None and first.pose is not None:
+            self.shown[NOBODY] = self.followed(first.alone, first.pose)
+            alone = None if before is None else self._flicker(before, self.shown[NOBODY])
+        self._known.memory.steadiness.begin(alone)
+
+    def _flicker(self, before: FloatArray, now: FloatArray) -> tuple[int, int]:
+        """Boxes of a fusion, and those that came or went."""
+        return max(crowd(before), crowd(now)), self.changes(before, now)
 
     def _pairs(self, outcome: Outcome) -> list[_Finding]:
         found = []
@@ -102,10 +132,15 @@ class Evidence:
                 continue
             if small.boxes is None or large.boxes is None:
                 continue
-            pair = self.measure(small.boxes, large.boxes)
+            pair = self.measure(small.boxes, large.boxes, self._vouched(large, joining))
             if pair is not None:
                 found.append((small.teammates, joining, pair))
         return [self._finding(a, d, pair, 1 / math.sqrt(len(found)), {}) for a, d, pair in found]
+
+    def _vouched(self, outcome: Outcome, joining: Hypothesis) -> BoolArray | None:
+        """Which boxes (n,) of a fusion others than the joining support; None where there is no testimony."""
+        shown = self._checked[outcome.teammates]
+        return None if shown is None else shown.vouched(joining)
 
     def _changes(self, outcome: Outcome) -> list[_Finding]:
         if not self._compare_frames or outcome.boxes is None or outcome.pose is None:
@@ -115,7 +150,8 @@ class Evidence:
         before = self._known.memory.shown.get(key)
         if before is None or max(crowd(before), crowd(now)) < MIN_WITNESSES:
             return []
-        boxes, changed = crowd(now), self.changes(before, now)
+        boxes = crowd(now)
+        changed = self._known.memory.steadiness.unexpected(boxes, self.changes(before, now))
         likelihood = self._known.model.change(len(outcome.teammates), boxes, changed)
         values = {"boxes": boxes, "changes": changed}
         return [_Finding("change", (), outcome.teammates, np.log(likelihood), 1.0, values)]
@@ -146,8 +182,10 @@ class Evidence:
         )
         of_a, of_d = self._known.keys(rows)[:, None]
         (key,) = (keys(of_d, of_a) if finding.test == "change" else keys(of_a, of_d)).tolist()
+        against = attacked > clean
         weight = finding.weight * float(dilution(np.array([len(finding.a) + len(finding.d)]))[0])
-        return weight * memory.weigh(key, _REPEATS[finding.test], 1 if attacked > clean else -1)
+        weight *= memory.steadiness.trust if against else 1.0
+        return weight * memory.weigh(key, _REPEATS[finding.test], 1 if against else -1)
 
     def _keep(self, finding: _Finding, ratios: FloatArray) -> None:
         """Keep a finding as evidence on those (S,) whose log-odds it moved by these ratios."""

@@ -11,6 +11,7 @@ from robosac.answers import Reason, Source, Verdict
 from robosac.defenses.group_testing import choice
 from robosac.defenses.group_testing.candidates import WITNESSES, candidates, cleared
 from robosac.defenses.group_testing.evidence import Evidence
+from robosac.defenses.group_testing.inspection import Inspection
 from robosac.defenses.group_testing.knowledge import Knowledge, remember
 from robosac.defenses.group_testing.posterior import EXACT
 from robosac.defenses.protocol import Decision, Hypothesis, Outcome, Rejection, explain_rejections
@@ -78,7 +79,11 @@ class JudgedFrame:
         chosen = int(best[rng.integers(len(best))])
         return known.names(options[chosen], self._team) if value[chosen] > 0 else None
 
-    def decide(self, named_before: frozenset[str], naming_bound: float) -> Decision:
+    def best_answer(self) -> Hypothesis:
+        """The decoded subset that would be answered now."""
+        return self._best_answer()[0]
+
+    def decide(self, named_before: frozenset[str], naming_bound: float, inspection: Inspection) -> Decision:
         """The answer, whom to trust, and whom to name; the frame is over."""
         memory, outcomes = self._known.memory, self._evidence.outcomes
         suspicion = self._known.suspicion()
@@ -88,8 +93,7 @@ class JudgedFrame:
         named = [
             name
             for name, p in suspicion.items()
-            if (p > naming_bound and memory.subsets_against(name) >= SUBSETS_TO_NAME)
-            or (name in named_before and p >= CLEARED_BELOW)
+            if p >= CLEARED_BELOW and (name in named_before or self._is_attacker(name, p > naming_bound))
         ]
         believed = self._trusted.union(*(o.teammates for o in outcomes if self._verified(o)))
         trusted = [name for name, p in suspicion.items() if name in believed and p <= TRUSTED_BELOW]
@@ -99,7 +103,17 @@ class JudgedFrame:
         memory.frame += 1
         ratio = sum(suspicion.values()) / len(suspicion) if suspicion else None
         state = remember(self._known.posterior, memory, trusted, named)
-        return Decision(accepted, source, rejected, ratio, state, suspicion)
+        objects, contradicted = inspection.judged(accepted) or (None, ())
+        return Decision(accepted, source, rejected, ratio, state, suspicion, objects, contradicted)
+
+    def _is_attacker(self, name: str, certain: bool) -> bool:
+        """Whether a teammate is to be named: it lied about objects too often, or it is suspected for certain by several
+        tests and its own fusions are too unsteady.
+        """
+        memory = self._known.memory
+        if memory.lies.names(name):
+            return True
+        return certain and memory.subsets_against(name) >= SUBSETS_TO_NAME and memory.steadiness.names(name)
 
     def _best_answer(self) -> tuple[Hypothesis, float, Source]:
         """Of the decoded subsets that may be answered, the most useful; the ego alone if none is of use."""

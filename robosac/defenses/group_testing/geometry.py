@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from dataclasses import dataclass
+from typing import Any
 
 import numpy as np
 
@@ -20,10 +21,10 @@ MIN_WITNESSES = 2
 """With fewer boxes to survive there is no evidence."""
 
 
-ALONG_M = 3.0
+ALONG_M = 4.5
 ACROSS_M = 0.8
 TURN_RAD = 0.4
-"""How far a vehicle gets from one frame to the next, along itself (15 m/s at 5 Hz) and across, and how far it turns."""
+"""How far a vehicle gets from one frame to the next, along itself (22 m/s at 5 Hz) and across, and how far it turns."""
 
 
 @dataclass(frozen=True)
@@ -36,12 +37,14 @@ class PairMeasure:
     """v, boxes that overlap nothing of before."""
 
 
-def measure(smaller: FloatArray, larger: FloatArray) -> PairMeasure | None:
+def measure(
+    smaller: FloatArray, larger: FloatArray, vouched: np.ndarray[Any, np.dtype[np.bool_]] | None = None
+) -> PairMeasure | None:
     """Compare the boxes (n, 6) of a fusion with those (m, 6) of the same fusion and more messages.
 
     ``g = 1 - mean over boxes b of the smaller, score >= .5, of max IoU(b, boxes of the larger, score >= .15)``: honest
     messages leave others' boxes where they are. ``v`` counts boxes of the larger, score >= .3, that touch no box of the
-    smaller with score >= .1.
+    smaller with score >= .1, and that nobody else has ``vouched`` for (m,).
 
     Returns
     -------
@@ -53,7 +56,7 @@ def measure(smaller: FloatArray, larger: FloatArray) -> PairMeasure | None:
         return None
     survivors = larger[larger[:, 5] >= SURVIVOR_SCORE]
     kept = pairwise_iou(witnesses, survivors).max(axis=1).mean() if len(survivors) else 0.0
-    claimed = larger[larger[:, 5] >= NEW_SCORE]
+    claimed = larger[(larger[:, 5] >= NEW_SCORE) & (True if vouched is None else ~vouched)]
     known = smaller[smaller[:, 5] >= KNOWN_SCORE]
     overlap = pairwise_iou(claimed, known).max(axis=1, initial=0.0)
     return PairMeasure(1.0 - float(kept), int((overlap == 0.0).sum()))

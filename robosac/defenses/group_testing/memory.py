@@ -11,6 +11,8 @@ from typing import Any
 import numpy as np
 
 from robosac.boxes import FloatArray
+from robosac.defenses.group_testing.lies import Lies
+from robosac.defenses.group_testing.steadiness import Steadiness
 
 REPEAT_MEMORY = 60
 """Frames after which a test counts as new."""
@@ -61,6 +63,9 @@ class Memory:
     """
     shown_in: int = 0
     """That frame's number, as its outcomes gave it."""
+    lies: Lies = field(default_factory=Lies)
+    """About objects."""
+    steadiness: Steadiness = field(default_factory=Steadiness)
 
     def weights(self, tests: KeyArray, rho: float) -> FloatArray:
         """Expected weights of tests (n,): ``1 - rho ** k`` if a test was made k frames ago already, else 1."""
@@ -104,6 +109,8 @@ class Memory:
     def leave(self, teammate: str, suspicion: float) -> None:
         """Remember who left."""
         self.evidence.pop(teammate, None)
+        self.lies.forget(teammate)
+        self.steadiness.levels.pop(teammate, None)
         self.left.pop(teammate, None)
         self.left[teammate] = (suspicion, self.frame)
         while len(self.left) > MAX_LEFT:
@@ -125,6 +132,8 @@ class Memory:
             "left": {name: [p, f] for name, (p, f) in self.left.items()},
             "shown": {f"{key:016x}": boxes.tolist() for key, boxes in self.shown.items()},
             "shown_in": self.shown_in,
+            "lies": self.lies.to_state(),
+            "steadiness": self.steadiness.to_state(),
         }
 
     @classmethod
@@ -138,4 +147,6 @@ class Memory:
             # neither is in the states of older versions
             shown={int(key, 16): np.reshape(boxes, (-1, 4)) for key, boxes in state.get("shown", {}).items()},
             shown_in=int(state.get("shown_in", 0)),
+            lies=Lies.from_state(state["lies"]) if "lies" in state else Lies(),
+            steadiness=Steadiness.from_state(state["steadiness"]) if "steadiness" in state else Steadiness(),
         )

@@ -18,6 +18,10 @@ from robosac.defenses.group_testing.geometry import PairMeasure
 FORMAT = 3
 OPEN = "open"
 """The kind of attack that nothing was calibrated for: any outcome of an attacked fusion is as likely as any other."""
+LIE = "lie"
+"""The kind of attack that changes single objects: whole fusions look as if nobody attacked, and only evidence on
+objects tells of it.
+"""
 LOSS_EDGES = (0.03, 0.045, 0.06, 0.075, 0.09, 0.11, 0.13, 0.16, 0.2, 0.28, 0.4)
 NOVELTY_EDGES = (1, 2, 3, 5, 7, 9, 12, 16)
 CROWD_EDGES = (16, 21, 26, 31, 36, 41)
@@ -81,7 +85,7 @@ class EvidenceModel:
     pose_error_m: float
     """Standard deviation of the teammates' positions that it was calibrated at, metres."""
     kinds: tuple[str, ...]
-    """Kinds of attack, `OPEN` last."""
+    """Kinds of attack, `OPEN` among them."""
     pairs: FloatArray
     """(CLEAN + 3 K, len(SIZES), BINS): each last axis sums to 1."""
     changes: FloatArray
@@ -105,6 +109,12 @@ class EvidenceModel:
                 raise CalibrationError(f"{name} must have the shape {shape}, got {table.shape}")
             if not (table > 0).all() or abs(table.sum(axis=-1) - 1).max() > _TOLERANCE:
                 raise CalibrationError(f"{name} must hold positive probabilities that sum to 1")
+
+    def with_lies(self) -> EvidenceModel:
+        """The same likelihoods, and those of the kind `LIE`, which are the unattacked ones."""
+        pairs = np.concatenate([self.pairs, np.repeat(self.pairs[:1], CELLS, axis=0)])
+        changes = np.concatenate([self.changes, self.changes[:1]])
+        return EvidenceModel(self.pose_error_m, (*self.kinds, LIE), pairs, changes, self.coarse)
 
     @cached_property
     def _by_size(self) -> FloatArray:
@@ -185,6 +195,8 @@ class Calibration:
     """How it was made; JSON values."""
     levels: tuple[EvidenceModel, ...]
     """Ascending pose error."""
+    witnessed: bool = False
+    """Whether the detector has a witness, so that single objects can be judged; not kept in the file."""
 
     def at(self, pose_error_m: float) -> EvidenceModel:
         """The level with the least pose error not below this one, metres.

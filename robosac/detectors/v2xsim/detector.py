@@ -16,7 +16,7 @@ import numpy as np
 import torch
 
 from robosac.boxes import FloatArray
-from robosac.detectors.base import DetectorInfo, Message, TensorSpec, calibration_beside
+from robosac.detectors.base import DetectorInfo, Message, TensorSpec, calibration_beside, witness_beside
 from robosac.detectors.map_fusion import FEATURES, Decode, Heads, MapFusionDetector, Maps
 from robosac.detectors.v2xsim.anchors import SCORE_THRESHOLD, detections, geometry
 from robosac.detectors.v2xsim.network import CHANNELS, MAP, V2XSimNetwork, select_published
@@ -110,6 +110,8 @@ class V2XSimDetector(MapFusionDetector):
             weights_digest=hashlib.sha256(weights.read_bytes()).hexdigest(),
             consensus_score=float(self.recipe.get("consensus_score", SCORE_THRESHOLD)),
             calibration=calibration_beside(weights),
+            witness=witness_beside(weights),
+            mirrored=self.mirrored,
         )
 
     def encode(self, points: FloatArray, pose: FloatArray) -> Message:

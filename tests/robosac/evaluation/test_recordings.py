@@ -4,7 +4,7 @@ import numpy as np
 import pytest
 
 from robosac.boxes import pose_matrix
-from robosac.defenses import A2CP, Halving, OneByOne, SampleConsensus, StaticTeam, Undefended
+from robosac.defenses import A2CP, EGO, Halving, OneByOne, SampleConsensus, StaticTeam, Undefended
 from robosac.detectors import Message
 from robosac.evaluation.encounters import acts
 from robosac.evaluation.frames import EvaluationFrame, misplaced
@@ -44,17 +44,32 @@ def test_what_no_attacker_touches_is_taken_from_the_honest_frame(recorded):
     assert frame.honest == ("car-3", "rsu")
 
 
-def test_frames_survive_a_file(recorded, tmp_path):
+@pytest.mark.parametrize("whole", [True, False])
+def test_frames_survive_a_file(whole, recorded, tmp_path):
+    """In a file that is not whole, honest messages are those of the same frames without an attack."""
     honest, frame, _ = recorded
-    save(tmp_path / "x.npz", {7: frame, 3: honest})
-    again = load(tmp_path / "x.npz", frame.detector)
+    save(tmp_path / "x.npz", {7: frame, 3: honest}, whole=whole)
+    asked = []
+    again = load(tmp_path / "x.npz", frame.detector, lambda indices: asked.extend(indices) or [honest, honest])
+    assert asked == ([] if whole else [3, 7])
     assert {index: f.attackers for index, f in again.items()} == {3: frozenset(), 7: {"car-2"}}
     for before, after in ((honest, again[3]), (frame, again[7])):
         assert after.team == TEAM
-        np.testing.assert_array_equal(after.ego.pose, before.ego.pose)
         np.testing.assert_array_equal(after.truth, before.truth)
         for subset, boxes in before.boxes.items():
             np.testing.assert_array_equal(after.detect(subset), boxes)
+        for sent, kept in ((before.ego, after.ego), *((before.teammates[n], after.teammates[n]) for n in TEAM)):
+            np.testing.assert_array_equal(kept.pose, sent.pose)
+            np.testing.assert_array_equal(kept.tensors["features"], sent.tensors["features"])
+
+
+def test_a_recording_gives_testimony_of_the_messages_it_keeps(recorded):
+    honest, frame, _ = recorded
+    said, before = (each.testify(each.ego, each.teammates) for each in (frame, honest))
+    assert said.agents == (EGO, *TEAM)
+    assert frame.testify(frame.ego, {}) is said  # read once
+    np.testing.assert_array_equal(said.of(["rsu"]).maps, before.of(["rsu"]).maps)
+    assert not np.array_equal(said.of(["car-2"]).maps, before.of(["car-2"]).maps)
 
 
 def same(one, other):
@@ -78,6 +93,16 @@ class Counting:
 
     def __getattr__(self, name):
         return getattr(self._detector, name)
+
+
+class Undecodable(Counting):
+    """The detector, with a decoder that fails."""
+
+    def detect(self, teammates=()):
+        raise ArithmeticError
+
+    def prepare(self, ego, teammates):
+        return self
 
 
 @pytest.fixture
@@ -193,8 +218,8 @@ def test_state_goes_from_frame_to_frame(recorded):
 
 def test_a_fault_is_no_answer(recorded):
     honest, _, _ = recorded
-    broken = replace(honest, boxes={frozenset(): honest.detect()})
-    with pytest.raises(FaultyDefense, match="frame 0: KeyError"):
+    broken = replace(honest, detector=Undecodable(honest.detector), boxes={frozenset(): honest.detect()})
+    with pytest.raises(FaultyDefense, match="frame 0: ArithmeticError"):
         play(SampleConsensus(collaborators=1), [broken], np.random.default_rng(0))
 
 

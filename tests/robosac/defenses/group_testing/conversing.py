@@ -23,10 +23,10 @@ TEAM = ("car-2", "car-3", "car-4", "car-5", "rsu")
 SEEN = np.array([[10.0 * i, 5.0, 4.0, 2.0, 0.0, 0.9] for i in range(8)])
 
 
-def shifted(subset: tuple[str, ...]) -> np.ndarray:
-    """Every box moved by 1.3 m, for each subset somewhere else."""
+def shifted(subset: tuple[str, ...], frame: int = 0) -> np.ndarray:
+    """Every box moved by .7 to 1.9 m, for each subset somewhere else, and from frame to frame to another side."""
     angle = sum(map(ord, "".join(subset)))
-    return SEEN + [1.3 * np.cos(angle), 1.3 * np.sin(angle), 0, 0, 0, 0]
+    return SEEN + [1.3 * np.cos(angle), 1.3 * np.sin(angle) + 0.6 * (-1) ** frame, 0, 0, 0, 0]
 
 
 def make_model(kinds=("pgd", "erase", OPEN)) -> EvidenceModel:
@@ -50,23 +50,28 @@ def normal(table: np.ndarray) -> np.ndarray:
     return table / table.sum(axis=-1, keepdims=True)
 
 
-def outcome(subset: tuple[str, ...], attackers: Collection[str], *, reference=SEEN) -> Outcome:
-    """What a detector would show: attackers move every box, and agree little with the ego."""
+def outcome(subset: tuple[str, ...], attackers: Collection[str], frame: int = 0, *, reference=SEEN) -> Outcome:
+    """What a detector would show: attackers move every box, and agree little with the ego, which stands still."""
     dirty = not set(attackers).isdisjoint(subset)
     index, verdict = (0.12, Verdict.DISSENSUS) if dirty else (0.93, Verdict.CONSENSUS)
     if not len(reference):
         index, verdict = (0.0, Verdict.DISSENSUS)
-    return Outcome(subset, index, verdict, shifted(subset) if dirty else SEEN, reference)
+    boxes = shifted(subset, frame) if dirty else SEEN
+    return Outcome(subset, index, verdict, boxes, reference, np.eye(4), frame, alone=reference)
 
 
 def run_frame(defense, state, team, attackers, rng, most=100, judge=outcome):
-    """One frame; after ``most`` outcomes the time is up. The decision and what was tested."""
+    """One frame; after ``most`` outcomes the time is up. The decision and what was tested.
+
+    ``judge`` gives the outcome of a subset, by the attackers and the frame's number in the session.
+    """
     conversation = defense.converse(team, state, rng)
+    frame = state["memory"]["frame"]
     tested = []
     try:
         batch = next(conversation)
         while True:
-            outcomes = [judge(subset, attackers) for subset in batch] if len(tested) < most else []
+            outcomes = [judge(subset, attackers, frame) for subset in batch] if len(tested) < most else []
             tested += outcomes
             batch = conversation.send(outcomes)
     except StopIteration as stop:

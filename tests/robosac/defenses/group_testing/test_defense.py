@@ -1,4 +1,6 @@
 import json
+from dataclasses import replace
+from functools import partial
 
 import numpy as np
 import pytest
@@ -18,9 +20,35 @@ def test_attackers_are_named_and_everybody_else_is_used(bad, rng):
     assert named(decision) == set(bad)
     assert set(decision.suspicion) == set(TEAM)
     assert set(decision.state["trusted"]) == set(TEAM) - set(bad)
-    assert len(tested[0]) <= 7
-    assert max(map(len, tested[1:])) <= 4
+    assert len(tested[0]) <= 7 + 4
+    assert max(map(len, tested[1:])) <= 4 + 4
     assert len(tested[-1]) < 4
+
+
+@pytest.mark.parametrize(("inspections", "first", "later"), [(0, 7, 4), (2, 9, 6)])
+def test_those_excluded_are_asked_again_beyond_the_budget(inspections, first, later, rng):
+    """Alone and beside the answer, in each frame: so that they are named or cleared."""
+    bad = {"car-2", "car-4", "car-5"}
+    decision, tested = run(with_settings(inspections=inspections), bad, 8, rng)
+    assert len(tested[0]) <= first
+    assert max(map(len, tested[1:])) <= later
+    assert bad.isdisjoint(decision.accepted)
+    assert (named(decision) == bad) == (inspections > 0)
+
+
+def test_who_stays_where_it_is_is_left_out_and_not_named(rng):
+    """What is odd about a teammate may be the world: to be named, its own fusions have to flicker beside the ego's."""
+    decision, _ = run(DEFENSE, ["car-3"], 8, rng, judge=lambda subset, bad, frame: still(outcome(subset, bad), frame))
+    assert decision.suspicion["car-3"] > 0.95
+    assert set(decision.accepted) == set(TEAM) - {"car-3"}
+    assert named(decision) == set()
+    apart, _ = run(with_settings(compare_frames=False), ["car-3"], 8, rng)
+    assert apart.suspicion["car-3"] > 0.95
+    assert named(apart) == set()
+
+
+def still(shown, frame):
+    return replace(shown, frame=frame)
 
 
 def test_the_evidence_on_a_named_attacker_is_given_item_by_item(rng):
@@ -50,11 +78,11 @@ def test_an_ego_without_confident_boxes_is_no_witness(rng):
     """What it says of a first subset, no other alone can be held against: those tested later hold it, or are in it."""
     unsure = np.copy(SEEN)
     unsure[:, 5] = 0.3
-    apart = []
+    defense, apart = with_settings(inspections=0), []
     for reference in (SEEN, unsure):
         _, (first, *later) = run_frame(
-            DEFENSE,
-            DEFENSE.initial_state(TEAM),
+            defense,
+            defense.initial_state(TEAM),
             TEAM,
             ["car-2", "car-3"],
             rng,
@@ -91,18 +119,22 @@ def test_a_hijacked_teammate_is_found_and_one_that_recovers_is_used_again(rng):
 
 
 def test_an_attacker_that_spoils_what_an_honest_one_joins_is_blamed_itself(rng):
-    """It agrees with the ego, and moves boxes only where others are in the fusion."""
+    """It agrees with the ego, and moves boxes only where others are in the fusion: alone it is steady, so that it is
+    left out, and not named.
+    """
 
-    def judge(subset, attackers):
+    def judge(subset, attackers, frame):
         spoiled = "car-2" in subset and len(subset) > 1
-        return Outcome(subset, 0.93, Verdict.CONSENSUS, shifted(subset) if spoiled else SEEN, SEEN)
+        boxes = shifted(subset, frame) if spoiled else SEEN
+        return Outcome(subset, 0.93, Verdict.CONSENSUS, boxes, SEEN, np.eye(4), frame, alone=SEEN)
 
     state = DEFENSE.initial_state(TEAM)
     for _ in range(15):
         decision, _ = run_frame(DEFENSE, state, TEAM, [], rng, judge=judge)
         state = decision.state
-        assert named(decision) <= {"car-2"}
-    assert named(decision) == {"car-2"}
+        assert named(decision) == set()
+    assert {name for name, p in decision.suspicion.items() if p > 0.5} == {"car-2"}
+    assert set(decision.accepted) == set(TEAM) - {"car-2"}
 
 
 class Flitting:
@@ -111,17 +143,17 @@ class Flitting:
     def __init__(self, frames=range(100), attackers=("car-4",)):
         self.frames, self.attackers, self.tests = frames, attackers, 0
 
-    def outcome(self, frame, subset):
+    def judge(self, frame, subset, *_):
         pose = pose_matrix(3.0 * frame, 0.0, 0.0, 0.0)
         added = np.array([[50.0, 20.0 + 9 * i + 2 * (frame % 3), 4.0, 2.0, 0.0, 0.9] for i in range(6)])
         flitting = not set(self.attackers).isdisjoint(subset)
-        boxes = from_world(np.vstack([SEEN, added]) if flitting else SEEN, pose)
-        return Outcome(subset, 0.5, Verdict.CONSENSUS, boxes, from_world(SEEN, pose), pose, frame)
+        boxes, seen = from_world(np.vstack([SEEN, added]) if flitting else SEEN, pose), from_world(SEEN, pose)
+        return Outcome(subset, 0.5, Verdict.CONSENSUS, boxes, seen, pose, frame, alone=seen)
 
     def last(self, defense, count=12):
         rng, state = np.random.default_rng(0), defense.initial_state(TEAM)
         for _, frame in zip(range(count), self.frames, strict=False):
-            decision, tested = run_frame(defense, state, TEAM, [], rng, judge=lambda s, _, f=frame: self.outcome(f, s))
+            decision, tested = run_frame(defense, state, TEAM, [], rng, judge=partial(self.judge, frame))
             self.tests += len(tested)
             state = json.loads(json.dumps(decision.state))
         return decision
@@ -129,6 +161,7 @@ class Flitting:
 
 def test_boxes_that_come_and_go_give_an_attacker_away():
     decision = Flitting().last(DEFENSE)
+    assert named(decision) == {"car-4"}
     assert max(decision.suspicion, key=decision.suspicion.get) == "car-4"
     assert decision.suspicion["car-4"] > 0.9
     assert set(decision.accepted) == set(TEAM) - {"car-4"}
@@ -141,9 +174,10 @@ def test_boxes_that_come_and_go_give_an_attacker_away():
 def test_only_what_the_latest_frame_showed_is_kept():
     world, rng, state = Flitting(), np.random.default_rng(0), DEFENSE.initial_state(TEAM)
     for frame in range(3):
-        decision, tested = run_frame(DEFENSE, state, TEAM, [], rng, judge=lambda s, _, f=frame: world.outcome(f, s))
+        decision, tested = run_frame(DEFENSE, state, TEAM, [], rng, judge=partial(world.judge, frame))
         state = decision.state
-        assert (len(state["memory"]["shown"]), state["memory"]["shown_in"]) == (len(tested), frame)
+        memory = state["memory"]
+        assert (len(memory["shown"]), memory["shown_in"]) == (len(tested) + 1, frame)  # and the ego alone
     unseen, _ = run_frame(DEFENSE, state, TEAM, [], rng, most=0)
     assert unseen.state["memory"]["shown"] == {}
 
@@ -180,7 +214,9 @@ def test_an_empty_fusion_has_nothing_that_could_change():
                 TEAM,
                 [],
                 np.random.default_rng(0),
-                judge=lambda subset, _, here=here: Outcome(subset, 0.0, Verdict.DISSENSUS, SEEN[:0], SEEN[:0], *here),
+                judge=lambda subset, _, __, here=here: Outcome(
+                    subset, 0.0, Verdict.DISSENSUS, SEEN[:0], SEEN[:0], *here
+                ),
             )
             state = decision.state
         return decision.suspicion

@@ -10,11 +10,13 @@ from robosac.defenses.group_testing.model import (
     CLEAN,
     CROWD_BINS,
     CROWD_EDGES,
+    LIE,
     SIZES,
     CalibrationError,
     EvidenceModel,
     size_row,
 )
+from robosac.defenses.group_testing.posterior import Posterior
 from tests.robosac.defenses.group_testing.conversing import make_model
 
 KINDS = 3
@@ -93,6 +95,39 @@ def test_what_changes_promise_is_the_mutual_information(model, rng):
         expected.append(mutual_information(table, cell))
     assert model.change_information(sizes, boxes, cells) == pytest.approx(expected)
     assert max(expected) > 0.1
+
+
+def test_lies_look_like_nobody_attacks(model, rng):
+    """Whatever a whole fusion shows, it says nothing of lies: for the other kinds all is as before."""
+    lying = model.with_lies()
+    assert lying.kinds == (*model.kinds, LIE)
+    a, d = rng.integers(0, 9, 12), rng.integers(1, 9, 12)
+    tables = lying.tables(a, d)
+    np.testing.assert_array_equal(tables[:, :ROWS], model.tables(a, d))
+    np.testing.assert_array_equal(tables[:, ROWS:], np.repeat(tables[:, :1], CELLS, axis=1))
+    likelihood = lying.change(2, CROWD_EDGES[1], CHANGE_EDGES[2])
+    np.testing.assert_array_equal(likelihood[:ROWS], model.change(2, CROWD_EDGES[1], CHANGE_EDGES[2]))
+    np.testing.assert_array_equal(likelihood[ROWS:], likelihood[:CELLS])
+
+
+def test_honest_looks_clear_nobody_of_lies():
+    """They raise the odds of "clean" and of a lie alike, and lower those of the other kinds."""
+    model = make_model().with_lies()
+    posterior = Posterior(len(model.kinds), 0.5, 0.25, ["a", "b"])
+    rows = np.array([[False, False], [True, False]])
+
+    def cells():
+        found = posterior.cells(*posterior.masks(rows)[:, :, None].swapaxes(0, 1))[0]
+        return found[:CLEAN].sum(), found[CLEAN:].reshape(-1, CELLS).sum(axis=1)
+
+    clean, kinds = cells()
+    best = int(model.tables(np.array([0]), np.array([1]))[0, 0].argmax())
+    for _ in range(3):
+        posterior.update(*rows, np.log(model.tables(np.array([0]), np.array([1]))[0, :, best]))
+    after, left = cells()
+    lie, pgd = model.kinds.index(LIE), model.kinds.index("pgd")
+    assert left[lie] / after == pytest.approx(kinds[lie] / clean)
+    assert left[pgd] / after < 0.1 * kinds[pgd] / clean
 
 
 @pytest.mark.parametrize("table", ["pairs", "changes"])

@@ -7,7 +7,7 @@ from robosac.defenses import GroupTesting, Outcome
 from robosac.defenses.group_testing import OPEN, GroupTestingSettings
 from robosac.defenses.group_testing.memory import FORGETTING_FRAMES
 from tests.robosac.defenses.group_testing.conversing import SEEN, TEAM, make_model, outcome, run_frame
-from tests.robosac.defenses.group_testing.sessions import DEFENSE, named, run
+from tests.robosac.defenses.group_testing.sessions import DEFENSE, named, run, with_settings
 
 
 def test_what_an_older_version_remembered_is_taken_over(rng):
@@ -18,7 +18,7 @@ def test_what_an_older_version_remembered_is_taken_over(rng):
 
 
 def test_an_ego_that_sees_nothing_falls_back_on_whom_it_trusts(rng):
-    def blind(subset, attackers):
+    def blind(subset, attackers, frame):
         return Outcome(subset, 0.0, Verdict.DISSENSUS, SEEN[:0], SEEN[:0])
 
     first, _ = run(DEFENSE, [], 1, rng, judge=blind)
@@ -33,7 +33,7 @@ def test_an_ego_that_sees_nothing_falls_back_on_whom_it_trusts(rng):
 
 
 def test_one_box_is_too_little_for_a_consensus(rng):
-    def nearly_blind(subset, attackers):
+    def nearly_blind(subset, attackers, frame):
         return Outcome(subset, 1.0, Verdict.CONSENSUS, SEEN[:1], SEEN[:1])
 
     decision, _ = run(DEFENSE, [], 3, rng, judge=nearly_blind)
@@ -91,7 +91,7 @@ def test_fifty_teammates(rng):
         state = json.loads(json.dumps(decision.state))
         assert bad.isdisjoint(decision.accepted)
         seen |= set(decision.state["named"])
-    assert len(tested) <= 4
+    assert len(tested) <= 4 + 4
     assert seen == bad
     assert len(json.dumps(state)) < 100_000
 
@@ -101,15 +101,19 @@ TWENTY = tuple(f"v{i:02d}" for i in range(20))
 
 def test_twenty_teammates_with_four_attackers(rng):
     bad = {"v03", "v04", "v11", "v17"}
-    decision, tested = run(DEFENSE, bad, 9, rng, team=TWENTY)
+    decision, _ = run(DEFENSE, bad, 9, rng, team=TWENTY)
     assert named(decision) == bad
     assert bad.isdisjoint(decision.accepted)
-    assert all(len(o.teammates) <= 10 for frame in tested[:3] for o in frame)
+
+
+def test_a_search_among_twenty_teammates_takes_small_subsets(rng):
+    _, tested = run(with_settings(inspections=0), {"v03", "v04", "v11", "v17"}, 3, rng, team=TWENTY)
+    assert all(len(o.teammates) <= 10 for frame in tested for o in frame)
 
 
 def test_a_larger_team_tests_first_and_answers_with_what_is_clean(rng):
     """Where that fails and the time is up, with whom it trusts; a small team answers first."""
-    known, _ = run(DEFENSE, {"v00"}, 1, rng, team=TWENTY)
+    known, _ = run(with_settings(inspections=0), {"v00"}, 1, rng, team=TWENTY)
     doubtful = {name for name, p in known.suspicion.items() if p > 0.1}
     assert len(doubtful) > 4
     for bad in (set(), doubtful):
@@ -143,8 +147,8 @@ def test_settings_out_of_range(settings):
 
 
 def test_outcomes_without_boxes_tell_nothing(rng):
-    def bare(subset, attackers):
-        full = outcome(subset, attackers)
+    def bare(subset, attackers, frame):
+        full = outcome(subset, attackers, frame)
         return Outcome(full.teammates, full.jaccard_index, full.verdict, None, SEEN)
 
     before = DEFENSE.initial_state(TEAM)["suspicion"]

@@ -1,0 +1,131 @@
+"""Places of a scan for a witness to learn from: where vehicles are, where none is, and how well each was observed."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+
+import numpy as np
+
+from robosac.boxes import FloatArray, pairwise_iou
+from robosac.scenes import Frame, View
+
+STANDARD = (4.5, 1.9, 1.55)
+"""Length, width and height of the car that might stand in a place, metres."""
+OBSERVED_HITS = 6
+"""A place is observed if so many returns would have come from a car that stood there."""
+FREE_PLACES = 48
+"""Free places drawn of a scan."""
+LANE_SHARE = 0.7
+"""Share of them on the line along which some vehicle heads; the others are anywhere."""
+LANE_REACH_M = 24.0
+LANE_JITTER_M = 0.5
+CLEARANCE_M = 0.5
+"""Free places keep this far from all vehicles."""
+JITTER_M = 0.25
+"""Standard deviation of where a place is asked about beside where it is, along both axes."""
+OWN_BODY_M = 3.5
+"""Nothing is asked about so close to the sensor."""
+GROUND_QUANTILE = 0.1
+"""Share of the returns that lie at the ground or below it, at least."""
+
+
+@dataclass(frozen=True)
+class Places:
+    """Places of one scan, in the sensor's frame."""
+
+    at: FloatArray
+    """(n, 2): x, y, metres."""
+    vehicle: FloatArray
+    """(n,): 1 where a vehicle is centred, 0 where none is."""
+    hits: FloatArray
+    """(n,): returns that would have come from a car there."""
+    box: FloatArray
+    """(n, 5): the vehicle; zeros where there is none."""
+
+
+def places(frame: Frame, agent: str, half_extent_m: float, rng: np.random.Generator) -> Places:
+    """Draw places of what one agent senses.
+
+    Parameters
+    ----------
+    frame : Frame
+    agent : str
+    half_extent_m : float
+        Only places within +- this are of interest, along both axes.
+    rng : numpy.random.Generator
+    """
+    view, truth = frame.views[agent], frame.truth(agent)[:, :5]
+    inside = (np.abs(truth[:, :2]) < half_extent_m - 1).all(axis=1) & (np.hypot(*truth[:, :2].T) > OWN_BODY_M)
+    vehicles, free = truth[inside], _free(truth, half_extent_m, rng)
+    boxes = np.concatenate(
+        [vehicles, np.column_stack([free[:, :2], np.tile(STANDARD[:2], (len(free), 1)), free[:, 2]])]
+    )
+    is_vehicle = np.arange(len(boxes)) < len(vehicles)
+    return Places(
+        at=boxes[:, :2] + rng.normal(0.0, JITTER_M, (len(boxes), 2)),
+        vehicle=is_vehicle.astype(np.float64),
+        hits=hits(view, boxes).astype(np.float64),
+        box=np.where(is_vehicle[:, None], boxes, 0.0),
+    )
+
+
+def hits(view: View, boxes: FloatArray) -> FloatArray:
+    """How many returns (n,) of a scan would have come from cars at these boxes (n, 5), sensor's frame.
+
+    A return counts if its ray, up to the return itself or a little beyond, meets the box of a car `STANDARD` high that
+    stands on the ground. So it does if it came from something in the box, or behind it.
+    """
+    points = np.asarray(view.points, dtype=np.float64)
+    if not len(points) or not len(boxes):
+        return np.zeros(len(boxes))
+    ground = float(np.quantile(points[:, 2], GROUND_QUANTILE))
+    reach = np.hypot(points[:, 0], points[:, 1])
+    slope = points[:, 2] / np.maximum(reach, 1e-9)
+    azimuth = np.arctan2(points[:, 1], points[:, 0])
+    counted = np.zeros(len(boxes))
+    for index, (x, y, length, width, yaw) in enumerate(boxes[:, :5]):
+        far, radius = np.hypot(x, y), np.hypot(length, width) / 2
+        apart = np.abs((azimuth - np.arctan2(y, x) + np.pi) % (2 * np.pi) - np.pi)
+        near = np.flatnonzero((apart < np.arcsin(min(1.0, radius / max(far, radius)))) & (reach > far - radius))
+        cos, sin = np.cos(azimuth[near] - yaw), np.sin(azimuth[near] - yaw)
+        start = -(np.cos(yaw) * x + np.sin(yaw) * y), np.sin(yaw) * x - np.cos(yaw) * y
+        enter, leave = _slab(start[0], cos, length / 2), _slab(start[1], sin, width / 2)
+        first = np.maximum(enter[0], leave[0])
+        last = np.minimum(np.minimum(enter[1], leave[1]), reach[near] + 0.2)
+        low, high = slope[near] * first - ground, slope[near] * last - ground
+        meets = (first < last) & (first > 0) & (np.minimum(low, high) < STANDARD[2]) & (np.maximum(low, high) > 0.1)
+        counted[index] = meets.sum()
+    return counted
+
+
+def _slab(start: float, direction: FloatArray, half: float) -> tuple[FloatArray, FloatArray]:
+    """Where rays from ``start`` are between -half and +half: from, to."""
+    safe = np.where(np.abs(direction) < 1e-9, 1e-9, direction)
+    a, b = (-half - start) / safe, (half - start) / safe
+    return np.minimum(a, b), np.maximum(a, b)
+
+
+def _free(vehicles: FloatArray, half_extent_m: float, rng: np.random.Generator) -> FloatArray:
+    """Places (n, 3) with a heading where no vehicle is."""
+    anywhere = np.column_stack(
+        [rng.uniform(-half_extent_m, half_extent_m, (4 * FREE_PLACES, 2)), rng.uniform(-np.pi, np.pi, 4 * FREE_PLACES)]
+    )
+    found = [anywhere]
+    if len(vehicles):
+        chosen = vehicles[rng.integers(len(vehicles), size=4 * FREE_PLACES)]
+        along = rng.uniform(-LANE_REACH_M, LANE_REACH_M, len(chosen))
+        aside = rng.normal(0.0, LANE_JITTER_M, len(chosen))
+        cos, sin = np.cos(chosen[:, 4]), np.sin(chosen[:, 4])
+        x, y = chosen[:, 0] + along * cos - aside * sin, chosen[:, 1] + along * sin + aside * cos
+        found.append(np.column_stack([x, y, chosen[:, 4]]))
+    kept = []
+    wanted = (FREE_PLACES - round(LANE_SHARE * FREE_PLACES), round(LANE_SHARE * FREE_PLACES))
+    grown = vehicles + np.array([0.0, 0.0, 2 * CLEARANCE_M, 2 * CLEARANCE_M, 0.0])
+    for options, count in zip(found, wanted, strict=False):
+        cars = np.column_stack([options[:, :2], np.tile(STANDARD[:2], (len(options), 1)), options[:, 2]])
+        apart = pairwise_iou(cars, grown).max(axis=1, initial=0.0) == 0.0
+        inside = (np.abs(options[:, :2]) < half_extent_m - 1).all(axis=1) & (
+            np.hypot(options[:, 0], options[:, 1]) > OWN_BODY_M
+        )
+        kept.append(options[apart & inside][:count])
+    return np.concatenate(kept)

@@ -1,0 +1,95 @@
+"""What all testimony says of boxes, and of places without one.
+
+A box claims that a vehicle is there. It is checked by what each agent's own message says of the place (`Testimony`).
+Whoever may have made the box up cannot speak for it: a claim is denied or supported by the others.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Collection
+from dataclasses import dataclass
+
+import numpy as np
+
+from robosac.boxes import FloatArray, IntArray
+from robosac.defenses.group_testing.distribution import BoolArray
+from robosac.testimony import Testimony
+
+SUPPORTS = 3.0
+"""An agent supports a place from this L on."""
+DENIES = -4.0
+"""An agent denies a place from this L on downwards."""
+WEIGHTY = 6.0
+"""Testimony of several agents decides from this sum of L on, in either direction."""
+AROUND_M = 0.6
+"""L of a box is the greatest within so far along and across of its centre: a place a little off is no denial."""
+_STEPS = np.array([[0.0, 0.0], [1.0, 0.0], [-1.0, 0.0], [0.0, 1.0], [0.0, -1.0]])
+
+
+@dataclass(frozen=True)
+class Claims:
+    """Boxes, and what each witness says of them."""
+
+    boxes: FloatArray
+    """(n, 6): ego frame."""
+    witnesses: tuple[str, ...]
+    """Whose testimony counts, `robosac.defenses.EGO` first."""
+    likelihood: FloatArray
+    """(witnesses, n): L of each box."""
+
+    @classmethod
+    def of(cls, boxes: FloatArray, heard: Testimony) -> Claims:
+        """Look up boxes (n, 6)."""
+        cos, sin = np.cos(boxes[:, 4]), np.sin(boxes[:, 4])
+        along, across = np.stack([cos, sin], axis=-1), np.stack([-sin, cos], axis=-1)
+        around = boxes[:, None, :2] + AROUND_M * (
+            _STEPS[None, :, :1] * along[:, None] + _STEPS[None, :, 1:] * across[:, None]
+        )
+        found = heard.likelihood(around.reshape(-1, 2)).reshape(len(heard.agents), len(boxes), len(_STEPS))
+        return cls(boxes, heard.agents, found.max(axis=2))
+
+    def without(self, agents: Collection[str]) -> Claims:
+        """The same boxes, and what the other witnesses say of them."""
+        kept = [i for i, name in enumerate(self.witnesses) if name not in agents]
+        return Claims(self.boxes, tuple(self.witnesses[i] for i in kept), self.likelihood[kept])
+
+    @property
+    def supporting(self) -> BoolArray:
+        """Who (witnesses, n) supports which box."""
+        return self.likelihood >= SUPPORTS
+
+    @property
+    def denying(self) -> BoolArray:
+        """Who (witnesses, n) denies which box."""
+        return self.likelihood <= DENIES
+
+    def contradicted(self, suspect: str | None = None, weighty: float = WEIGHTY) -> BoolArray:
+        """Which boxes (n,) are contradicted, whoever supports them.
+
+        The sum of L without the suspect (by default without the teammate who supports a box most) is at most
+        ``-weighty``, and
+        the ego denies it, or two teammates do. What the ego itself supports is not contradicted.
+        """
+        heard = self if suspect is None else self.without([suspect])
+        rest = heard.likelihood.sum(axis=0)
+        if suspect is None:
+            rest = rest - np.maximum(self.likelihood[1:].max(axis=0, initial=0.0), 0.0)
+        denied: BoolArray = (rest <= -weighty) & two_witnesses(heard.denying) & ~self.supporting[0]
+        return denied
+
+
+def two_witnesses(speaking: BoolArray) -> BoolArray:
+    """Which places (n,) the ego, or two teammates, speak of: ``speaking`` (witnesses, n), the ego first."""
+    enough: BoolArray = speaking[0] | (speaking[1:].sum(axis=0) >= 2)
+    return enough
+
+
+def peaks(total: FloatArray, among: BoolArray) -> IntArray:
+    """Rows and columns (n, 2) of the places ``among`` those of a map (H, W) that are the greatest of the 5 x 5 around
+    them.
+    """
+    rows, columns = np.nonzero(among)
+    padded = np.pad(total, 2, constant_values=-np.inf)
+    around = np.lib.stride_tricks.sliding_window_view(padded, (5, 5))[rows, columns].max(axis=(1, 2), initial=-np.inf)
+    greatest = total[rows, columns] >= around
+    return np.stack([rows[greatest], columns[greatest]], axis=1)

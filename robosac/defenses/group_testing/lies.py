@@ -1,0 +1,123 @@
+"""What is remembered of each teammate's lies about objects, and when they are too many for chance."""
+
+from __future__ import annotations
+
+from collections.abc import Mapping
+from dataclasses import dataclass, field
+from typing import Any
+
+import numpy as np
+
+from robosac.boxes import FloatArray
+
+
+@dataclass(frozen=True)
+class Rule:
+    """How often an honest teammate may seem to lie in one way.
+
+    In each frame a level goes up by ``gain`` for each lie, of which at most ``most`` count, and down by ``drift``; it
+    is never below 0 (a cumulative sum: Page, Continuous Inspection Schemes, Biometrika 41, 1954).
+    """
+
+    gain: float
+    most: int
+    drift: float
+    names: float
+    """Level from which on it is named."""
+    weights: tuple[tuple[float, float], ...]
+    """At each of these levels, when first reached, the logarithm of the likelihood ratio that it adds to suspicion."""
+
+
+RULES: Mapping[str, Rule] = {
+    "ghost": Rule(1.5, 1, 0.5, 3.0, ((1.0, 5.0), (2.0, 2.0), (3.0, 3.0))),
+    "gone": Rule(1.5, 1, 0.5, 3.0, ((1.0, 2.5), (2.0, 3.0), (3.0, 4.0))),
+    "moved": Rule(1.0, 1, 0.3, 2.0, ((0.7, 2.0), (1.4, 3.0), (2.1, 4.0))),
+    "conflict": Rule(1.0, 3, 0.5, 6.0, ((3.0, 2.0), (4.5, 4.0), (6.0, 4.0))),
+}
+QUIET_FRAMES = 6
+LONGEST_QUIET = 24
+"""A place where something seemed wrong, but nobody had the effect, is left alone for so many frames, at first and at
+most.
+"""
+RECENT_FRAMES = 3
+"""Who was left out in so many frames is left out after the others."""
+QUIET_M = 3.0
+"""Places nearer than this are one, metres."""
+MOST_QUIET = 32
+
+
+@dataclass
+class Lies:
+    """Mutable while a frame is judged."""
+
+    levels: dict[str, dict[str, tuple[float, float]]] = field(default_factory=dict)
+    """By teammate and kind: the level, and the highest since it was 0."""
+    quiet: list[tuple[float, float, int, int]] = field(default_factory=list)
+    """Places left alone: x, y (world, metres), the frame of the session until which, and for how many frames."""
+
+    left_out: dict[str, int] = field(default_factory=dict)
+    """By teammate: the frame of the session in which an answer was last decoded without it, to see what it does."""
+
+    def recently_left_out(self, teammate: str, frame: int) -> bool:
+        """Whether it was left out in this frame or one just before."""
+        return frame - self.left_out.get(teammate, -RECENT_FRAMES) < RECENT_FRAMES
+
+    def add(self, teammate: str, counts: Mapping[str, int]) -> float:
+        """Take in the lies of a frame by kind; what new levels add to the teammate's suspicion."""
+        known = self.levels.setdefault(teammate, {})
+        weight = 0.0
+        for kind, rule in RULES.items():
+            before, highest = known.get(kind, (0.0, 0.0))
+            level = max(0.0, before + rule.gain * min(counts.get(kind, 0), rule.most) - rule.drift)
+            weight += sum(w for step, w in rule.weights if highest < step <= level)
+            known.pop(kind, None)
+            if level:
+                known[kind] = (round(level, 4), round(max(level, highest), 4))
+        if not known:
+            del self.levels[teammate]
+        return weight
+
+    def names(self, teammate: str) -> bool:
+        """Whether it lied too often."""
+        return any(level >= RULES[kind].names for kind, (level, _) in self.levels.get(teammate, {}).items())
+
+    def worst(self, teammate: str) -> float:
+        """The level of the kind nearest to being named for, as a share."""
+        return max((level / RULES[k].names for k, (level, _) in self.levels.get(teammate, {}).items()), default=0.0)
+
+    def is_quiet(self, place: FloatArray, frame: int) -> bool:
+        """Whether a place (2,), world, is left alone."""
+        return any(until >= frame and _near(x, y, place) for x, y, until, _ in self.quiet)
+
+    def leave_alone(self, place: FloatArray, frame: int) -> None:
+        """Leave a place (2,), world, alone for some frames: each time for twice as many."""
+        before = [entry for entry in self.quiet if _near(entry[0], entry[1], place)]
+        frames = min(LONGEST_QUIET, max((2 * entry[3] for entry in before), default=QUIET_FRAMES))
+        others = [e for e in self.quiet if e not in before and frame - e[2] <= LONGEST_QUIET][-MOST_QUIET + 1 :]
+        self.quiet = [*others, (round(float(place[0]), 2), round(float(place[1]), 2), frame + frames, frames)]
+
+    def forget(self, teammate: str) -> None:
+        """It left."""
+        self.levels.pop(teammate, None)
+        self.left_out.pop(teammate, None)
+
+    def to_state(self) -> dict[str, Any]:
+        """JSON values that `from_state` reads."""
+        return {
+            "levels": {name: {kind: list(pair) for kind, pair in of.items()} for name, of in self.levels.items()},
+            "quiet": [list(entry) for entry in self.quiet],
+            "left_out": self.left_out,
+        }
+
+    @classmethod
+    def from_state(cls, state: Mapping[str, Any]) -> Lies:
+        """What `to_state` wrote."""
+        return cls(
+            {name: {kind: (float(a), float(b)) for kind, (a, b) in of.items()} for name, of in state["levels"].items()},
+            [(float(x), float(y), int(until), int(frames)) for x, y, until, frames in state["quiet"]],
+            {str(name): int(frame) for name, frame in state["left_out"].items()},
+        )
+
+
+def _near(x: float, y: float, place: FloatArray) -> bool:
+    return bool(np.hypot(x - place[0], y - place[1]) < QUIET_M)

@@ -1,0 +1,241 @@
+"""What a fusion does to single objects, checked by testimony: ghosts, objects gone, objects moved.
+
+Whole fusions can look honest while one object is false. So each box of a fusion is checked by what the messages say of
+its place, each by itself, and so are places where the messages say that a vehicle stands and the fusion shows none.
+What is wrong there is blamed on a teammate only if it is not so in the same fusion without it: that takes both
+witnesses and an effect.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Collection
+from dataclasses import dataclass
+from functools import cached_property
+
+import numpy as np
+
+from robosac.boxes import FloatArray, IntArray, pairwise_iou
+from robosac.defenses.group_testing.claims import DENIES, SUPPORTS, WEIGHTY, Claims, peaks, two_witnesses
+from robosac.defenses.group_testing.distribution import BoolArray
+from robosac.defenses.protocol import Hypothesis
+from robosac.testimony import Testimony
+
+SHOWN_SCORE = 0.3
+"""Boxes from this score on claim something."""
+CRISP_SCORE = 0.5
+GONE_EFFECT = 1.5
+"""A box is gone by somebody's fault if it had such a score, and has so much less now: faint ones come and go."""
+BLAMED_SUM = 8.0
+"""Somebody is to blame for a crisp box that the others contradict with this sum of L: more than the word of one."""
+PLACED_SCORE = 0.4
+"""Boxes from this score on have to be in their place."""
+THERE_SCORE = 0.15
+"""Where a box has this score or more, something is shown."""
+CERTAIN = 4.0
+"""From this L on, two teammates or the ego know that a vehicle stands in a place."""
+REACH_M = 2.2
+"""A box is at a place if it is centred so near."""
+RIM_M = 1.2
+"""A place so near a box belongs to it."""
+EFFECT = 1.0
+"""Logarithm of the odds of a box by which it has to grow or shrink."""
+AWAY = 2.5
+"""A box is out of place if it is so many times farther from where witnesses see the vehicle than they may err."""
+AWAY_EFFECT = 0.5
+SLACK_ALONG_M = 0.15
+SLACK_ACROSS_M = 0.1
+"""Added to what a witness says it may err: senders are not quite where they say."""
+_LOWEST = 0.05
+
+
+@dataclass(frozen=True)
+class Lie:
+    """Something wrong with one object in a fusion."""
+
+    kind: str
+    """``ghost``, ``gone`` or ``moved``."""
+    place: FloatArray
+    """(2,): ego frame, metres."""
+
+
+class Hearing:
+    """What all messages of a frame say, and what decoded fusions are worth by that.
+
+    Parameters
+    ----------
+    testimony : Testimony
+    unheard : collection of str
+        Those whose testimony counts for nothing.
+    """
+
+    def __init__(self, testimony: Testimony, unheard: Collection[str]) -> None:
+        self.everybody = testimony
+        self.heard = testimony.of([name for name in testimony.agents if name not in unheard])
+
+    @cached_property
+    def standing(self) -> FloatArray:
+        """Places (k, 2) where a vehicle stands: the ego, or two teammates, say so, and all together without the one who
+        denies it most.
+        """
+        over = np.clip(self.heard.over_ego, -WEIGHTY, WEIGHTY)
+        total = over.sum(axis=0) - np.minimum(over[1:].min(axis=0, initial=0.0), 0.0)
+        rows, columns = peaks(total, two_witnesses(over >= CERTAIN) & (total >= WEIGHTY)).T
+        places = self.heard.ego_places()[rows, columns]
+        supporting = (over[:, rows, columns] >= CERTAIN)[..., None]
+        seen = np.where(supporting, self.heard.sighting(places).centre, 0.0).sum(axis=0)
+        centres: FloatArray = seen / np.maximum(supporting.sum(axis=0), 1)
+        standing: FloatArray = centres[np.hypot(*(centres - places).T) <= REACH_M]
+        return standing
+
+
+class Shown:
+    """A decoded fusion, checked.
+
+    Parameters
+    ----------
+    teammates : tuple of str
+        Who is fused.
+    boxes : (n, 6) ndarray
+        Ego frame.
+    hearing : Hearing
+        Of the frame.
+    """
+
+    def __init__(self, teammates: Hypothesis, boxes: FloatArray, hearing: Hearing) -> None:
+        self.teammates = teammates
+        self.boxes = boxes
+        self._hearing = hearing
+        self._testimony = hearing.heard
+        self.claims = Claims.of(boxes, hearing.heard)
+
+    @cached_property
+    def _away(self) -> FloatArray:
+        """How far (witnesses, n) each box is from where a witness sees the vehicle, in units of what it may err; not a
+        number where it does not support the box.
+        """
+        seen = self._testimony.sighting(self.boxes[:, :2])
+        off = seen.centre - self.boxes[None, :, :2]
+        cos, sin = np.cos(self.boxes[:, 4]), np.sin(self.boxes[:, 4])
+        along, across = off[..., 0] * cos + off[..., 1] * sin, off[..., 1] * cos - off[..., 0] * sin
+        away = np.maximum(np.abs(along) / (seen.along + SLACK_ALONG_M), np.abs(across) / (seen.across + SLACK_ACROSS_M))
+        return np.where(self.claims.supporting, away, np.nan)
+
+    def away(self, suspect: str | None = None) -> FloatArray:
+        """How far (n,) each box is from where witnesses see it, the lower median of at least two; 0 with fewer. The
+        suspect is no witness.
+        """
+        others = np.array([name != suspect for name in self.claims.witnesses])
+        away = np.sort(np.where(np.isnan(self._away[others]), np.inf, self._away[others]), axis=0)
+        seeing = np.isfinite(away).sum(axis=0)
+        middle: FloatArray = away[np.maximum(seeing - 1, 0) // 2, np.arange(len(self.boxes))]
+        return np.where(seeing >= 2, middle, 0.0)
+
+    @cached_property
+    def _everybody(self) -> Claims:
+        return Claims.of(self.boxes, self._hearing.everybody)
+
+    def own(self, suspect: str | None) -> FloatArray:
+        """What a suspect's own message says of each box (n,); 0 without a suspect."""
+        if suspect is None:
+            return np.zeros(len(self.boxes))
+        own: FloatArray = self._everybody.likelihood[self._everybody.witnesses.index(suspect)]
+        return own
+
+    @cached_property
+    def ghosts(self) -> BoolArray:
+        """Boxes (n,) that are shown and contradicted."""
+        return self.claims.contradicted() & (self.boxes[:, 5] >= SHOWN_SCORE)
+
+    @cached_property
+    def displaced(self) -> BoolArray:
+        """Boxes (n,) that are out of place."""
+        return (self.away() >= AWAY) & (self.boxes[:, 5] >= PLACED_SCORE) & ~self.ghosts
+
+    @cached_property
+    def holes(self) -> FloatArray:
+        """Places (k, 2) where a vehicle stands by testimony, and nothing is shown."""
+        places = self._hearing.standing
+        return places[~self._covered(places)]
+
+    def vouched(self, joining: Hypothesis) -> BoolArray:
+        """Which boxes (n,) somebody supports who is not among the joining: nothing that these may have made up."""
+        supported: BoolArray = np.atleast_1d(self.claims.without(joining).supporting.any(axis=0))
+        return supported
+
+    @cached_property
+    def lies(self) -> list[Lie]:
+        """All that may be wrong."""
+        found = [Lie("ghost", box[:2]) for box in self.boxes[self.ghosts]]
+        found += [Lie("moved", box[:2]) for box in self.boxes[self.displaced]]
+        return found + [Lie("gone", place) for place in self.holes]
+
+    def odds_at(self, places: FloatArray) -> FloatArray:
+        """Logarithm of the odds (n,) of the best box at each place (n, 2)."""
+        score = np.maximum(self.boxes[:, 5], _LOWEST)
+        near = np.hypot(*np.moveaxis(places[:, None] - self.boxes[None, :, :2], -1, 0)) <= REACH_M
+        best = np.where(near, score, _LOWEST).max(axis=1, initial=_LOWEST)
+        best = np.minimum(best, 1 - 1e-6)
+        odds: FloatArray = np.log(best / (1 - best))
+        return odds
+
+    def _covered(self, places: FloatArray) -> BoolArray:
+        """Whether places (n, 2) lie in boxes, or at their rims."""
+        boxes = self.boxes[self.boxes[:, 5] >= THERE_SCORE]
+        off = places[:, None] - boxes[None, :, :2]
+        cos, sin = np.cos(boxes[:, 4]), np.sin(boxes[:, 4])
+        along, across = off[..., 0] * cos + off[..., 1] * sin, off[..., 1] * cos - off[..., 0] * sin
+        inside = (np.abs(along) <= boxes[:, 2] / 2 + RIM_M) & (np.abs(across) <= boxes[:, 3] / 2 + RIM_M)
+        covered: BoolArray = np.atleast_1d(inside.any(axis=1))
+        return covered
+
+
+def effects(joined: Shown, without: Shown, suspect: str | None) -> list[Lie]:
+    """What is wrong in a fusion, and is not in the same fusion without the suspect.
+
+    - ``ghost``: a contradicted box whose odds without it are less by a factor of e;
+    - ``gone``: a box without it where the others support a vehicle, and nothing is shown with it;
+    - ``moved``: a box that is out of place, and without it less so.
+
+    Where the suspect's own message speaks for what the others say, it is no lie of its own: fusion makes such errors by
+    itself, above all in places that a detector was not made for.
+    """
+    found = []
+    ghosts = joined.claims.contradicted(suspect, BLAMED_SUM) & (joined.boxes[:, 5] >= CRISP_SCORE)
+    ghosts &= joined.own(suspect) > DENIES
+    grown = joined.boxes[ghosts]
+    drop = joined.odds_at(grown[:, :2]) - without.odds_at(grown[:, :2])
+    found += [Lie("ghost", box[:2]) for box in grown[drop >= EFFECT]]
+    lost = without.boxes[gone(joined, without, suspect)]
+    drop = without.odds_at(lost[:, :2]) - joined.odds_at(lost[:, :2])
+    blamed = without.own(suspect)[gone(joined, without, suspect)] < SUPPORTS
+    found += [Lie("gone", box[:2]) for box in lost[(lost[:, 5] >= CRISP_SCORE) & (drop >= GONE_EFFECT) & blamed]]
+    away, other = joined.away(suspect), without.away(suspect)
+    for index in np.flatnonzero((away >= AWAY) & (joined.boxes[:, 5] >= PLACED_SCORE) & ~ghosts):
+        same = _at(without, joined.boxes[index])
+        if same is not None and 0.0 < other[same] <= away[index] - AWAY_EFFECT:
+            found.append(Lie("moved", joined.boxes[index, :2]))
+    return found
+
+
+def gone(joined: Shown, without: Shown, suspect: str | None) -> IntArray:
+    """Boxes, by their places in ``without``, that are gone in ``joined`` although others support them."""
+    claims = without.claims
+    others = np.array([name != suspect for name in claims.witnesses])
+    supported = two_witnesses(claims.supporting & others[:, None])
+    supported &= claims.likelihood[others].sum(axis=0) >= WEIGHTY
+    there = joined.boxes[joined.boxes[:, 5] >= THERE_SCORE]
+    overlap = pairwise_iou(without.boxes, there).max(axis=1, initial=0.0)
+    rise = without.odds_at(without.boxes[:, :2]) - joined.odds_at(without.boxes[:, :2])
+    lost: IntArray = np.flatnonzero(
+        supported & (overlap < 0.05) & (without.boxes[:, 5] >= SHOWN_SCORE) & (rise >= EFFECT)
+    )
+    return lost
+
+
+def _at(shown: Shown, box: FloatArray) -> int | None:
+    """The box of a fusion that overlaps another one most."""
+    if not len(shown.boxes):
+        return None
+    overlap = pairwise_iou(box[None], shown.boxes)[0]
+    best = int(overlap.argmax())
+    return best if overlap[best] > 0.05 else None

@@ -1,0 +1,86 @@
+"""How each box of an answer stands: on whose word, against whose, or taken from a fusion without whoever spoiled it."""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+
+import numpy as np
+
+from robosac.answers import Standing, Support
+from robosac.boxes import FloatArray
+from robosac.defenses.group_testing.claims import DENIES, SUPPORTS
+from robosac.defenses.group_testing.objects import AWAY_EFFECT, Shown, gone
+from robosac.defenses.protocol import EGO, JudgedBox
+
+SAME_M = 2.5
+"""A box of another fusion, centred so near, stands for the same vehicle."""
+Judged = tuple[tuple[JudgedBox, ...], tuple[JudgedBox, ...]]
+"""Boxes of an answer, and those that are contradicted."""
+
+
+def judge(answer: Shown, decoded: Sequence[Shown]) -> Judged:
+    """Judge the boxes of an answer.
+
+    1. A contradicted box is left out.
+    2. A box that is out of place is taken from the part of the answer that has it nearest to its place.
+    3. A vehicle that a part of the answer shows, and the answer has lost although it stands by testimony, is taken from
+       there.
+    4. Any other box is ``confirmed`` by the ego, or by two teammates whom nobody denies; ``disputed`` if somebody
+       denies it; else ``single_witness``.
+
+    Parameters
+    ----------
+    answer : Shown
+    decoded : sequence of Shown
+        All that was decoded in the frame.
+    """
+    parts = [shown for shown in decoded if shown.teammates and set(shown.teammates) < set(answer.teammates)]
+    kept: dict[tuple[tuple[str, ...], int], JudgedBox] = {}
+    left_out: list[JudgedBox] = []
+
+    def keep(shown: Shown, index: int, status: Standing | None = None) -> None:
+        kept.setdefault((shown.teammates, index), _judged(shown, index, status))
+
+    away, contradicted, displaced = answer.away(), answer.claims.contradicted(), answer.displaced
+    repaired: list[FloatArray] = []
+    for index, box in enumerate(answer.boxes):
+        better = _in_place(box, float(away[index]), parts) if displaced[index] else None
+        if contradicted[index]:
+            left_out.append(_judged(answer, index, Standing.CONTRADICTED))
+        elif better is not None:
+            part, at = better
+            keep(part, at, Standing.REPAIRED)
+            repaired.append(part.boxes[at, :2])
+        else:
+            keep(answer, index)
+    for part in parts:
+        for at in gone(answer, part, None).tolist():
+            place = part.boxes[at, :2]
+            if all(np.hypot(*(place - other)) > SAME_M for other in repaired):
+                keep(part, at, Standing.REPAIRED)
+                repaired.append(place)
+    return tuple(kept.values()), tuple(left_out)
+
+
+def _judged(shown: Shown, index: int, status: Standing | None) -> JudgedBox:
+    claims = shown.claims
+    said = list(zip(claims.witnesses, claims.likelihood[:, index].tolist(), strict=True))
+    witnesses = tuple(name for name, value in said if value >= SUPPORTS)
+    deniers = tuple(name for name, value in said if value <= DENIES)
+    if status is None:
+        if EGO in witnesses or (len(witnesses) >= 2 and not deniers):
+            status = Standing.CONFIRMED
+        else:
+            status = Standing.DISPUTED if deniers else Standing.SINGLE_WITNESS
+    return JudgedBox(shown.teammates, index, Support(status=status, witnesses=witnesses, deniers=deniers))
+
+
+def _in_place(box: FloatArray, away: float, parts: Sequence[Shown]) -> tuple[Shown, int] | None:
+    """The box of a part that stands for this one and is least out of place."""
+    best: tuple[float, Shown, int] | None = None
+    for part in parts:
+        for at in np.flatnonzero(np.hypot(*(part.boxes[:, :2] - box[:2]).T) < SAME_M).tolist():
+            other = float(part.away()[at])
+            if 0.0 < other <= away - AWAY_EFFECT and (best is None or other < best[0]):
+                best = (other, part, at)
+    return None if best is None else best[1:]

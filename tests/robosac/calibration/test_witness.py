@@ -1,0 +1,156 @@
+"""A witness learns a world in which everything observed is plain to see."""
+
+from dataclasses import replace
+
+import numpy as np
+import pytest
+import torch
+
+from robosac.calibration.places import OBSERVED_HITS, Places
+from robosac.calibration.witness import Lesson, WitnessRecipe, lessons, train, training_scenes, usual_size
+from robosac.calibration.witness_check import check
+from robosac.detectors import DetectorInfo, TensorSpec
+from robosac.detectors.witness import Layout, Witness, WitnessNetwork
+from robosac.scenes import IntersectionScene, SceneError
+
+CELLS, HALF_EXTENT_M = 12, 12.0  # cells of 2 m
+RECIPE = WitnessRecipe(epochs=15, batch=8, learning_rate=1e-2, seed=1)
+
+
+def layout(mirrored=False):
+    tensors = {"teammate": {"map": TensorSpec("float16", (3, CELLS, CELLS))}}
+    area = (-HALF_EXTENT_M, -HALF_EXTENT_M, HALF_EXTENT_M, HALF_EXTENT_M)
+    return Layout.of(DetectorInfo("plain", tensors, area, 2.0, "0", 0.5, mirrored=mirrored), 1.0)
+
+
+def lesson(rng, mirrored=False):
+    """Four vehicles and a dozen free places. The half ahead is observed: there the map shows what is where."""
+    at = rng.uniform(-10.5, 10.5, (60, 2))
+    apart = []
+    for place in at:
+        if all(np.abs(place - other).max() > 4.2 for other in apart):
+            apart.append(place)
+    at = np.array(apart)
+    vehicle = (np.arange(len(at)) < len(at) // 2).astype(float)
+    hits = np.where(at[:, 0] > 0, 40.0, 0.0)
+    centres = np.arange(CELLS) * 2.0 - HALF_EXTENT_M + 1
+    x, y = np.meshgrid(centres, centres)
+    shown = np.zeros((3, CELLS, CELLS))
+    shown[1] = x > 0
+    for px, py in at[(vehicle > 0) & (hits > 0)]:
+        near = (np.abs(x - px) < 2) & (np.abs(y - py) < 2)
+        shown[0][near], shown[2][near] = (x - px)[near] + 3, (y - py)[near] + 3
+    box = np.where(vehicle[:, None] > 0, np.column_stack([at, np.tile([4.5, 1.9, 0.0], (len(at), 1))]), 0.0)
+    sent = torch.from_numpy(shown[..., ::-1].copy() if mirrored else shown).half()
+    return Lesson(sent, 1.6, Places(at, vehicle, hits, box))
+
+
+def world(seed, count, **options):
+    rng = np.random.default_rng(seed)
+    return [lesson(rng, **options) for _ in range(count)]
+
+
+@pytest.fixture(scope="module")
+def trained():
+    told = []
+    witness = train(layout(), world(1, 120), RECIPE, lambda *step: told.append(step))
+    return witness, told
+
+
+def test_a_plain_world_is_learned(trained):
+    witness, told = trained
+    figures = check(witness, world(2, 40))
+    assert figures.places > 200
+    assert figures.vehicles_supported > 0.9
+    assert figures.free_denied > 0.8
+    assert figures.vehicles_denied < 0.02
+    assert figures.free_supported < 0.05
+    assert max(figures.off_along_m, figures.off_across_m) < 0.5
+    assert [step for step, _, _ in told] == list(range(1, 15 * 15 + 1))
+    assert told[-1][2] < 0.5 * told[0][2]
+
+
+def test_an_untrained_witness_knows_nothing():
+    torch.manual_seed(0)
+    here = layout()
+    figures = check(Witness(WitnessNetwork(here.channels, here.upsampling), here), world(2, 10))
+    assert figures.vehicles_supported < 0.5
+    assert figures.free_denied < 0.5
+
+
+def test_where_nothing_is_observed_nothing_is_said(trained):
+    """What stands there is as likely as not, in the lessons too."""
+    witness, _ = trained
+    unobserved = [np.abs(said_of(witness, each)[each.places.hits < OBSERVED_HITS]) for each in world(3, 20)]
+    observed = [np.abs(said_of(witness, each)[each.places.hits >= OBSERVED_HITS]) for each in world(3, 20)]
+    assert np.median(np.concatenate(unobserved)) < 1.0
+    assert np.median(np.concatenate(observed)) > 3.0
+
+
+def said_of(witness, each):
+    message = witness.layout.scaled(each.map[None].float())
+    maps = witness.read(message, [each.height_m]).numpy()[0, 0]
+    column, row = ((each.places.at + HALF_EXTENT_M) / (2 * HALF_EXTENT_M) * maps.shape[0]).astype(int).T
+    return maps[row, column]
+
+
+def test_mirrored_maps_are_learned_alike():
+    short = replace(RECIPE, epochs=1)
+    plain = train(layout(), world(1, 16), short, lambda *_: None)
+    mirrored = train(layout(mirrored=True), world(1, 16, mirrored=True), short, lambda *_: None)
+    for name, values in plain.network.state_dict().items():
+        assert torch.equal(mirrored.network.state_dict()[name], values)
+
+
+def test_the_same_seed_trains_the_same_witness(trained):
+    short = replace(RECIPE, epochs=1)
+    one, again, other = (
+        train(layout(), world(1, 16), r, lambda *_: None) for r in (short, short, replace(short, seed=2))
+    )
+    weights = [witness.network.state_dict()["head.weight"] for witness in (one, again, other)]
+    assert torch.equal(weights[0], weights[1])
+    assert not torch.equal(weights[0], weights[2])
+
+
+class Kept:
+    """A source with scenes for validation only, or for training, too."""
+
+    name = "kept"
+
+    def __init__(self, training=None):
+        if training is not None:
+            self.training_scenes = lambda: training
+
+    def scenes(self, split):
+        assert split == "validation"
+        return [0, 1, 2, 3]
+
+
+def test_scenes_are_those_kept_for_training_or_the_last_ones_of_validation():
+    assert training_scenes(Kept(), 2) == [2, 3]
+    assert training_scenes(Kept([7, 8, 9]), 2) == [7, 8]
+    with pytest.raises(SceneError, match="kept has 4 scenes to train on; 5 are wanted"):
+        training_scenes(Kept(), 5)
+
+
+def test_lessons_are_all_agents_messages_and_what_is_there(detector):
+    scene, ticks = IntersectionScene(1600), []
+    size = usual_size(detector, scene)
+    here = Layout.of(detector.info, size)
+    recipe = replace(RECIPE, frames_per_scene=2)
+    learned = lessons(detector, here, [scene], recipe, lambda: ticks.append(1))
+    assert (len(learned), len(ticks)) == (2 * len(scene.frame(0).views), 2)
+    assert all(each.map.shape == (here.channels, here.height, here.width) for each in learned)
+    assert {round(each.height_m, 2) for each in learned} == {
+        round(float(view.pose[2, 3]), 2) for view in scene.frame(0).views.values()
+    }
+    scaled = torch.stack([here.scaled(each.map.float()) for each in learned])
+    assert 0.5 < float(scaled.pow(2).mean().sqrt()) < 2.0
+
+
+@pytest.mark.parametrize(
+    "settings", [{"data": ()}, *({name: 0} for name in ("scenes", "epochs", "batch", "frames_per_scene"))]
+)
+def test_recipes_that_cannot_be(settings):
+    with pytest.raises(ValueError, match="must be at least 1"):
+        WitnessRecipe(**settings)

@@ -1,0 +1,100 @@
+"""What others say of a box, and when that is a contradiction."""
+
+import numpy as np
+import pytest
+
+from robosac.boxes import pose_matrix
+from robosac.defenses.group_testing.claims import AROUND_M, DENIES, SUPPORTS, Claims, peaks, two_witnesses
+from robosac.testimony import MOST
+from tests.robosac.testifying import SPREAD_M, saying
+
+PLACE = (10.0, 4.0)
+BOX = np.array([[*PLACE, 4.5, 1.9, 0.3, 0.9]])
+YES, NO = 6.0, -7.0
+
+
+def claim(ego, *teammates):
+    """What the ego and teammates "a", "b", ... say of one box."""
+    said = dict(zip(("", *"abcde"), (ego, *teammates), strict=False))
+    return Claims.of(BOX, saying({name: [(*PLACE, value)] for name, value in said.items()}))
+
+
+@pytest.mark.parametrize(
+    ("said", "contradicted"),
+    [
+        ((NO, YES), True),  # the ego's word is enough
+        ((NO, 0.0, YES), True),
+        ((0.0, NO, YES), False),  # one against one
+        ((0.0, NO, NO, YES), True),
+        ((0.0, NO, NO, YES, YES), True),  # who supports it most may have made it up
+        ((0.0, NO, NO, YES, YES, YES), False),
+        ((YES, NO, NO, NO, 0.0), False),  # the ego sees it
+        ((0.0, 0.0, 0.0), False),
+        ((0.0, -5.0, 0.0, -0.5), False),  # too little in all
+        ((0.0, -4.5, -4.5, YES), True),
+        ((-3.5, -3.5, -3.5, YES), False),  # nobody denies it by itself
+    ],
+)
+def test_a_box_is_contradicted_by_the_ego_or_by_two(said, contradicted):
+    assert claim(*said).contradicted().tolist() == [contradicted]
+
+
+def test_a_suspects_own_word_is_left_out_whatever_it_is():
+    liar_denies = claim(0.0, NO, NO, 0.0)
+    assert liar_denies.contradicted().tolist() == [True]
+    assert liar_denies.contradicted("a").tolist() == [False]  # only "b" is left to deny it
+    assert liar_denies.contradicted("c").tolist() == [True]
+    vouches = claim(0.0, NO, NO, YES, YES, YES)
+    assert vouches.contradicted().tolist() == [False]
+    assert vouches.contradicted("c").tolist() == [False]  # "d" and "e" have still vouched for it
+    assert vouches.without(["c", "d"]).contradicted().tolist() == [True]
+
+
+def test_without_some_their_word_counts_for_nothing():
+    claims = claim(0.0, NO, NO, YES)
+    rest = claims.without(["a", "c"])
+    assert rest.witnesses == ("", "b")
+    assert rest.denying.tolist() == [[False], [True]]
+    assert rest.supporting.tolist() == [[False], [False]]
+    assert rest.contradicted().tolist() == [False]
+
+
+@pytest.mark.parametrize(
+    ("value", "supports", "denies"), [(SUPPORTS + 0.1, 1, 0), (2.9, 0, 0), (-3.9, 0, 0), (DENIES - 0.1, 0, 1)]
+)
+def test_who_speaks_for_and_against(value, supports, denies):
+    claims = claim(0.0, value)
+    assert (claims.supporting.sum(), claims.denying.sum()) == (supports, denies)
+
+
+def test_a_place_a_little_off_is_no_denial():
+    """Of what is said around a centre, along and across the box, the best counts."""
+    off = PLACE + (SPREAD_M + 0.9 * AROUND_M) * np.array([np.cos(0.3), np.sin(0.3)])
+    heard = saying({"": [(*PLACE, NO), (*off, YES)], "a": [(*PLACE, NO)]})
+    claims = Claims.of(BOX, heard)
+    assert claims.likelihood[0, 0] > heard.likelihood(BOX[:, :2])[0, 0] + 1
+    assert claims.likelihood[1, 0] == pytest.approx(-MOST)
+
+
+def test_claims_are_looked_up_where_each_witness_stands():
+    poses = {"a": pose_matrix(20.0, 4.0, 1.6, np.pi)}
+    claims = Claims.of(BOX, saying({"": [], "a": [(*PLACE, YES)]}, poses))
+    assert claims.likelihood[:, 0] == pytest.approx([0.0, YES], abs=0.1)
+
+
+def test_no_boxes_make_no_claims():
+    claims = Claims.of(BOX[:0], saying({"": [], "a": []}))
+    assert claims.contradicted().shape == (0,)
+    assert claims.likelihood.shape == (2, 0)
+
+
+def test_the_ego_or_two_teammates_are_two_witnesses():
+    speaking = np.array([[1, 0, 0, 0], [0, 1, 1, 0], [0, 0, 1, 0]], dtype=bool)
+    assert two_witnesses(speaking).tolist() == [True, False, True, False]
+
+
+def test_peaks_are_the_greatest_around():
+    total = np.zeros((9, 9))
+    total[2, 2], total[2, 4], total[2, 5], total[8, 8] = 5.0, 4.0, 4.5, 1.0
+    assert peaks(total, total >= 1.0).tolist() == [[2, 2], [2, 5], [8, 8]]
+    assert peaks(total, np.zeros((9, 9), dtype=bool)).shape == (0, 2)

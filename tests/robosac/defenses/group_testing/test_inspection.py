@@ -1,0 +1,225 @@
+"""Sessions in which one object is false: who is asked, who is blamed, and how each box stands."""
+
+import json
+
+import numpy as np
+import pytest
+
+from robosac.answers import Standing, Verdict
+from robosac.defenses import EGO, Outcome
+from robosac.defenses.group_testing import GroupTesting, GroupTestingSettings
+from tests.robosac.defenses.group_testing.conversing import TEAM, make_model, run_frame
+from tests.robosac.testifying import saying
+
+MODEL = make_model().with_lies()
+DEFENSE = GroupTesting(MODEL)
+SEEN = np.array([[x, y, 4.5, 1.9, 0.0, 0.9] for x in (-22.4, -7.4, 7.6, 22.6) for y in (-12.3, 12.7)])
+"""What everybody sees."""
+PLACE = np.array([10.4, 2.3])
+CAR = np.array([[*PLACE, 4.5, 1.9, 0.0, 0.9]])
+YES, NO = 5.5, -7.0
+LIAR = "car-4"
+
+
+class World:
+    """Cars that everybody sees, and one place over which they differ.
+
+    Parameters
+    ----------
+    said : mapping of agent to float
+        L of the place, the ego's under "".
+    shows : callable
+        A subset -> the boxes (n, 6) that its fusion shows there.
+    """
+
+    def __init__(self, said, shows):
+        known = {name: [(x, y, YES) for x, y in SEEN[:, :2]] for name in (EGO, *TEAM)}
+        for name, value in said.items():
+            known[name].append((*PLACE, value))
+        self.testimony = saying(known)
+        self.shows = shows
+
+    def judge(self, subset, _, frame):
+        boxes = np.vstack([SEEN, self.shows(subset)])
+        told = {"testimony": self.testimony, "alone": SEEN}
+        return Outcome(subset, 0.93, Verdict.CONSENSUS, boxes, SEEN, np.eye(4), frame, **told)
+
+    def play(self, frames, defense=DEFENSE, quiet=0):
+        """Decisions, and the boxes of each subset decoded, of frames after some in which nobody lies."""
+        state = HONEST.play(quiet, defense)[-1][0].state if quiet else defense.initial_state(TEAM)
+        rng, met = np.random.default_rng(0), []
+        for _ in range(frames):
+            decision, tested = run_frame(defense, state, TEAM, [], rng, judge=self.judge)
+            state = json.loads(json.dumps(decision.state))
+            met.append((decision, {o.teammates: o.boxes for o in tested}))
+        return met
+
+
+def nothing(subset):
+    return CAR[:0]
+
+
+def with_liar(shown, otherwise):
+    """What a fusion shows with the liar, and without it."""
+    return lambda subset: shown if LIAR in subset else otherwise
+
+
+def seen_by(*names):
+    """A fusion with any of them shows the car."""
+    return lambda subset: CAR if set(names) & set(subset) else CAR[:0]
+
+
+def erased(subset):
+    return CAR[:0] if LIAR in subset else seen_by("car-2", "car-3", "rsu")(subset)
+
+
+HONEST = World({}, nothing)
+GHOST = World({"car-2": NO, "car-3": NO, LIAR: YES}, with_liar(CAR, CAR[:0]))
+ERASED = World({"car-2": YES, "car-3": YES, "rsu": YES, LIAR: NO}, erased)
+NEAR, ASIDE = CAR + [0, 0.1, 0, 0, 0, 0], CAR + [0, 1.6, 0, 0, 0, 0]
+MOVED = World({"car-2": YES, "car-3": YES, "rsu": YES}, with_liar(ASIDE, NEAR))
+
+
+def there(decision, tested, boxes):
+    """Judged boxes around the place, with their rows."""
+    rows = [(judged, tested[judged.subset][judged.index]) for judged in boxes]
+    return [(judged, row) for judged, row in rows if np.hypot(*(row[:2] - PLACE)) < 4.0]
+
+
+@pytest.mark.parametrize(("world", "kind"), [(GHOST, "ghost"), (ERASED, "gone"), (MOVED, "moved")])
+def test_who_lies_about_an_object_is_named_and_nobody_else(world, kind):
+    met = world.play(10)
+    assert {name for decision, _ in met for name in decision.named} == {LIAR}
+    last, _ = met[-1]
+    assert set(last.accepted) == set(TEAM) - {LIAR}
+    assert max(p for name, p in last.suspicion.items() if name != LIAR) < 0.5
+    items = [item for item in last.state["memory"]["evidence"][LIAR] if item["test"] == "objects"]
+    assert all(item["log_likelihood_ratio"] > 0 for item in items)
+    assert all(item["kinds"] or item["conflicts"] for item in items)
+    audited = [item for item in items if item["kinds"]]
+    assert audited
+    for item in audited:
+        assert set(item["kinds"]) == {kind}
+        assert item["places"][0] == pytest.approx(PLACE, abs=2.0)
+
+
+def test_without_testimony_a_lie_names_nobody():
+    """A single object is below what whole fusions show."""
+    world = World({}, GHOST.shows)
+    world.testimony = None
+    met = world.play(10)
+    assert {name for decision, _ in met for name in decision.named} == set()
+    assert all(decision.objects is None and decision.contradicted == () for decision, _ in met)
+
+
+def test_a_ghost_is_in_no_answer():
+    for decision, tested in GHOST.play(6, quiet=6):
+        assert there(decision, tested, decision.objects) == []
+        assert len(decision.objects) == len(SEEN)
+
+
+def test_with_the_liar_in_the_answer_a_ghost_is_contradicted():
+    decision, tested = GHOST.play(1, GroupTesting(MODEL, GroupTestingSettings(inspections=0)), quiet=6)[0]
+    assert LIAR in decision.accepted
+    ((ghost, _),) = there(decision, tested, decision.contradicted)
+    assert ghost.support.status is Standing.CONTRADICTED
+    assert (ghost.support.witnesses, set(ghost.support.deniers)) == ((LIAR,), {"car-2", "car-3"})
+    assert there(decision, tested, decision.objects) == []
+
+
+def test_a_ghost_in_the_answer_is_audited():
+    """The answer is decoded without whoever vouches for it, at once."""
+    decision, tested = GHOST.play(1, quiet=6)[0]
+    whole, without, *_ = tested
+    assert set(whole) == set(TEAM)
+    assert without == tuple(name for name in whole if name != LIAR)
+    assert decision.state["memory"]["lies"]["levels"].keys() == {LIAR}
+
+
+TRUE = {ERASED: CAR[0], MOVED: NEAR[0]}
+
+
+@pytest.mark.parametrize("world", TRUE)
+def test_what_a_liar_removes_or_moves_is_answered_where_it_is(world):
+    for decision, tested in world.play(5, quiet=6):
+        ((_, row),) = there(decision, tested, decision.objects)
+        np.testing.assert_array_equal(row, TRUE[world])
+        assert len(decision.objects) == len(SEEN) + 1
+        assert decision.contradicted == ()
+
+
+@pytest.mark.parametrize(("world", "inspections"), [(ERASED, 1), (MOVED, 4)])
+def test_with_the_liar_in_the_answer_a_box_is_repaired(world, inspections):
+    """Taken from a fusion without it, although there was no time to find out who it is."""
+    decision, tested = world.play(1, GroupTesting(MODEL, GroupTestingSettings(inspections=inspections)), quiet=6)[0]
+    assert LIAR in decision.accepted
+    ((judged, row),) = there(decision, tested, decision.objects)
+    assert judged.support.status is Standing.REPAIRED
+    assert LIAR not in judged.subset
+    np.testing.assert_array_equal(row, TRUE[world])
+
+
+@pytest.mark.parametrize(
+    ("said", "status"),
+    [
+        ({EGO: YES, "car-2": NO}, Standing.CONFIRMED),
+        ({"car-2": YES, "rsu": YES}, Standing.CONFIRMED),
+        ({"car-2": YES}, Standing.SINGLE_WITNESS),
+        ({}, Standing.SINGLE_WITNESS),
+        ({"car-2": YES, "rsu": NO}, Standing.DISPUTED),
+        ({"car-2": YES, "car-3": YES, "rsu": NO}, Standing.DISPUTED),
+        ({"car-2": NO, "rsu": NO}, Standing.CONTRADICTED),
+    ],
+)
+def test_a_box_stands_on_what_is_said_of_it(said, status):
+    decision, tested = World(said, lambda _: CAR).play(1)[0]
+    boxes = decision.contradicted if status is Standing.CONTRADICTED else decision.objects
+    ((judged, _),) = there(decision, tested, boxes)
+    assert judged.support.status is status
+    assert set(judged.support.witnesses) == {name for name, value in said.items() if value > 0}
+    assert set(judged.support.deniers) == {name for name, value in said.items() if value < 0}
+    everywhere = [other.support for other in decision.objects if other is not judged]
+    assert {each.status for each in everywhere} == {Standing.CONFIRMED}
+    assert all(set(each.witnesses) == {EGO, *TEAM} for each in everywhere)
+
+
+def test_a_false_box_that_nobody_brings_is_blamed_on_nobody():
+    """The detector itself shows it, with and without each of them; after a while nobody is asked any more."""
+    met = World({EGO: NO, "car-2": NO, "rsu": NO}, lambda subset: CAR).play(12)
+    assert all(decision.named == () for decision, _ in met)
+    assert max(met[-1][0].suspicion.values()) < 0.5
+    assert set(met[-1][0].accepted) == set(TEAM)
+    assert min(len(tested) for _, tested in met[1:]) < len(met[0][1])
+
+
+def test_one_who_denies_what_another_sees_is_believed_no_more_than_it():
+    """One word against one: nobody is named, and the box stays."""
+    world = World({"car-2": YES, "rsu": NO}, seen_by("car-2"))
+    for decision, tested in world.play(10):
+        assert decision.named == ()
+        assert decision.contradicted == ()
+        if "car-2" in decision.accepted:
+            assert there(decision, tested, decision.objects)
+
+
+def test_nobody_is_suspected_where_nothing_is_wrong():
+    met = World(dict.fromkeys((EGO, *TEAM), YES), lambda _: CAR).play(15)
+    last, tested = met[-1]
+    assert max(last.suspicion.values()) < 0.1
+    assert set(last.accepted) == set(TEAM)
+    assert set(last.state["trusted"]) == set(TEAM)
+    assert len(tested) == 1
+
+
+def test_objects_are_judged_only_if_asked_for():
+    plain = GroupTesting(make_model(), GroupTestingSettings(judge_objects=False))
+    assert (plain.asks_witnesses, DEFENSE.asks_witnesses) == (False, True)
+
+
+@pytest.mark.parametrize("inspections", [0, 1, 3])
+def test_inspections_are_bounded(inspections):
+    settings = GroupTestingSettings(inspections=inspections)
+    (_, first), *later = GHOST.play(8, GroupTesting(MODEL, settings))
+    assert len(first) <= settings.first_budget + inspections
+    assert all(len(tested) <= settings.budget + inspections for _, tested in later)
+    assert (LIAR in later[-1][0].named) == (inspections > 1)

@@ -1,0 +1,123 @@
+"""What is remembered of lies, and when they are too many."""
+
+import json
+
+import numpy as np
+import pytest
+
+from robosac.defenses.group_testing.lies import LONGEST_QUIET, MOST_QUIET, QUIET_FRAMES, QUIET_M, RULES, Lies
+
+HERE = np.array([100.0, -40.0])
+
+
+def level(lies, kind, name="a"):
+    return lies.levels.get(name, {}).get(kind, (0.0, 0.0))[0]
+
+
+@pytest.mark.parametrize("kind", RULES)
+def test_a_level_rises_with_lies_and_sinks_without(kind):
+    lies, rule = Lies(), RULES[kind]
+    lies.add("a", {kind: 1})
+    assert level(lies, kind) == pytest.approx(rule.gain - rule.drift)
+    lies.add("a", {kind: 1})
+    assert level(lies, kind) == pytest.approx(2 * (rule.gain - rule.drift))
+    lies.add("a", {})
+    assert level(lies, kind) == pytest.approx(2 * rule.gain - 3 * rule.drift)
+    for _ in range(50):
+        lies.add("a", {})
+    assert lies.levels == {}
+
+
+@pytest.mark.parametrize("kind", RULES)
+def test_of_the_lies_of_a_frame_so_many_count(kind):
+    one, many = Lies(), Lies()
+    one.add("a", {kind: RULES[kind].most})
+    many.add("a", {kind: 50})
+    assert (
+        level(one, kind) == level(many, kind) == pytest.approx(RULES[kind].gain * RULES[kind].most - RULES[kind].drift)
+    )
+
+
+@pytest.mark.parametrize("kind", RULES)
+def test_each_step_weighs_once_on_the_way_up(kind):
+    """Not per frame: a mistake repeats itself. From 0 on it counts anew."""
+    lies, rule = Lies(), RULES[kind]
+    frames = 0
+    weights = [0.0]
+    while level(lies, kind) < rule.weights[-1][0]:
+        weights.append(lies.add("a", {kind: 1}))
+        frames += 1
+        reached = sum(w for step, w in rule.weights if step <= level(lies, kind) + 1e-9)
+        assert sum(weights) == pytest.approx(reached)
+    assert sum(weights) == pytest.approx(sum(w for _, w in rule.weights))
+    assert lies.add("a", {}) == 0.0
+    assert lies.add("a", {kind: 1}) == 0.0  # up there again
+    for _ in range(100):
+        lies.add("a", {})
+    again = sum(lies.add("a", {kind: 1}) for _ in range(frames))
+    assert again == pytest.approx(sum(weights))
+
+
+@pytest.mark.parametrize("kind", RULES)
+def test_who_lies_too_often_in_one_way_is_named(kind):
+    lies, rule = Lies(), RULES[kind]
+    enough = int(np.ceil(rule.names / (rule.gain - rule.drift) - 1e-9))
+    for number in range(1, enough + 1):
+        lies.add("a", {kind: 1})
+        assert lies.names("a") == (number == enough)
+        assert (lies.worst("a") >= 1.0) == lies.names("a")
+    assert not lies.names("b")
+
+
+def test_lies_of_several_kinds_do_not_add_up():
+    lies = Lies()
+    lies.add("a", dict.fromkeys(RULES, 1))
+    assert len(lies.levels["a"]) == len(RULES)
+    assert not lies.names("a")
+    assert lies.worst("a") == max(level(lies, kind) / rule.names for kind, rule in RULES.items())
+    assert lies.worst("b") == 0.0
+
+
+def test_a_place_is_left_alone_for_some_frames():
+    lies = Lies()
+    assert not lies.is_quiet(HERE, 3)
+    lies.leave_alone(HERE, 3)
+    assert [lies.is_quiet(HERE, frame) for frame in (3, 3 + QUIET_FRAMES, 4 + QUIET_FRAMES)] == [True, True, False]
+    assert lies.is_quiet(HERE + [QUIET_M - 0.1, 0.0], 4)
+    assert not lies.is_quiet(HERE + [QUIET_M + 0.1, 0.0], 4)
+
+
+def test_each_time_for_twice_as_long():
+    lies, frame, spans = Lies(), 0, []
+    for _ in range(5):
+        lies.leave_alone(HERE + [0.5, 0.5], frame)
+        until = frame
+        while lies.is_quiet(HERE, until + 1):
+            until += 1
+        spans.append(until - frame)
+        frame = until + 1
+        assert len(lies.quiet) == 1
+    assert spans == [min(LONGEST_QUIET, QUIET_FRAMES * 2**n) for n in range(5)]
+
+
+def test_places_of_long_ago_are_forgotten_and_the_latest_kept():
+    lies = Lies()
+    for number in range(2 * MOST_QUIET):
+        lies.leave_alone(HERE + [10.0 * number, 0.0], 5)
+    assert len(lies.quiet) == MOST_QUIET
+    assert lies.is_quiet(HERE + [10.0 * (2 * MOST_QUIET - 1), 0.0], 5)
+    assert not lies.is_quiet(HERE, 5)
+    lies.leave_alone(HERE, 1000)
+    assert len(lies.quiet) == 1
+
+
+def test_what_is_remembered_survives_json():
+    lies = Lies()
+    lies.add("a", {"ghost": 1, "conflict": 3})
+    lies.add("b", {"moved": 1})
+    lies.leave_alone(HERE, 7)
+    again = Lies.from_state(json.loads(json.dumps(lies.to_state())))
+    assert again == lies
+    assert again.add("a", {"ghost": 1}) == lies.add("a", {"ghost": 1})
+    again.forget("a")
+    assert set(again.levels) == {"b"}

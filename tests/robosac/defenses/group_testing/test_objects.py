@@ -1,0 +1,158 @@
+"""What a fusion does to single objects, and on whom it is blamed."""
+
+import numpy as np
+import pytest
+
+from robosac.defenses.group_testing.objects import Hearing, Shown, effects, gone
+from tests.robosac.testifying import saying
+
+PLACE = np.array([10.4, 4.3])
+ELSEWHERE = np.array([-12.4, -7.3])
+YES, NO = 5.5, -7.0
+TEAM = ("a", "b", "c", "d")
+
+
+def car(place=PLACE, score=0.9, off=(0.0, 0.0), yaw=0.0):
+    """A box whose centre is off its place along and across itself, metres."""
+    cos, sin = np.cos(yaw), np.sin(yaw)
+    x, y = place + [off[0] * cos - off[1] * sin, off[0] * sin + off[1] * cos]
+    return np.array([[x, y, 4.5, 1.9, yaw, score]])
+
+
+REST = car(ELSEWHERE)
+NOTHING = np.zeros((0, 6))
+
+
+def hearing(unheard=(), place=PLACE, **said):
+    """What the ego and teammates say of a place; somewhere else the ego and "a" see a car."""
+    words = {"": said.pop("ego", 0.0), **{name: said.get(name, 0.0) for name in TEAM}}
+    known = {name: [(*place, value)] for name, value in words.items()}
+    for name in ("", "a"):
+        known[name].append((*ELSEWHERE, YES))
+    return Hearing(saying(known), unheard)
+
+
+def found(heard, joined, without, suspect="d"):
+    """What is blamed on a suspect for a box joined with it, and one without it."""
+    others = tuple(name for name in TEAM if name != suspect)
+    lies = effects(
+        Shown(TEAM, np.vstack([REST, joined]), heard), Shown(others, np.vstack([REST, without]), heard), suspect
+    )
+    assert all(np.hypot(*(lie.place - PLACE)) < 2.5 for lie in lies)
+    return [lie.kind for lie in lies]
+
+
+DENIED = {"b": NO, "c": NO, "d": YES}
+SEEN = {"b": YES, "c": YES}
+
+
+def test_a_ghost_is_blamed_on_whoever_brings_it():
+    heard = hearing(**DENIED)
+    assert found(heard, car(), NOTHING) == ["ghost"]
+    assert found(heard, car(), car(score=0.2)) == ["ghost"]
+    assert found(heard, car(), car(), suspect="a") == []  # it is there without "a"
+    assert found(heard, car(score=0.5), car(score=0.35)) == []  # hardly changed
+    assert found(heard, car(score=0.25), NOTHING) == []  # hardly shown
+    assert found(heard, NOTHING, car()) == []  # made up by somebody else
+
+
+@pytest.mark.parametrize(
+    ("said", "kinds"),
+    [
+        ({}, []),
+        ({"b": NO}, []),
+        ({"b": NO, "d": NO}, []),  # its own word is not against it
+        ({"ego": NO}, []),  # one word against another
+        ({"ego": NO, "b": -3.0}, ["ghost"]),
+        ({"ego": YES, "b": NO, "c": NO}, []),
+    ],
+)
+def test_a_box_that_nobody_can_deny_is_blamed_on_nobody(said, kinds):
+    assert found(hearing(**said), car(), NOTHING) == kinds
+
+
+def test_a_vehicle_gone_is_blamed_on_whoever_takes_it_away():
+    heard = hearing(**SEEN, d=NO)
+    assert found(heard, NOTHING, car()) == ["gone"]
+    assert found(heard, car(off=(5.0, 0.0)), car()) == ["gone"]  # moved out of its place
+    assert found(heard, car(), car()) == []
+    assert found(heard, car(score=0.2), car()) == []  # faint, but there
+    assert found(heard, NOTHING, car(score=0.45)) == []  # never crisp
+    assert found(heard, NOTHING, NOTHING) == []  # gone without it too
+    assert found(heard, NOTHING, NOTHING, suspect="a") == []
+
+
+@pytest.mark.parametrize(
+    ("said", "kinds"),
+    [({}, []), ({"b": YES}, []), ({"b": YES, "d": YES}, []), ({"b": YES, "c": YES, "a": NO}, []), (SEEN, ["gone"])],
+)
+def test_a_vehicle_that_two_others_see_is_missed(said, kinds):
+    assert found(hearing(**said), NOTHING, car()) == kinds
+
+
+@pytest.mark.parametrize("off", [(0.0, 1.5), (0.0, -1.5), (1.8, 0.0)])
+@pytest.mark.parametrize("yaw", [0.0, 2.0])
+def test_a_vehicle_moved_is_blamed_on_whoever_moves_it(off, yaw):
+    heard, moved, near = hearing(**SEEN, a=YES), car(off=off, yaw=yaw), car(off=(0.1, 0.1), yaw=yaw)
+    assert found(heard, moved, near) == ["moved"]
+    assert found(heard, moved, moved) == []
+    assert found(heard, near, moved) == []
+    assert found(hearing(**{"b": YES}), moved, near) == []  # one witness may be wrong itself
+    assert found(hearing(**{"b": YES, "d": YES}), moved, near) == []  # as may the suspect
+
+
+def test_a_hole_is_where_vehicles_stand_and_nothing_is_shown():
+    heard = hearing(**SEEN)
+    (hole,) = Shown(TEAM, REST, heard).lies
+    assert hole.kind == "gone"
+    assert hole.place == pytest.approx(PLACE, abs=0.1)  # where they see it, not the middle of a place
+    assert Shown(TEAM, np.vstack([REST, car()]), heard).lies == []
+    assert Shown(TEAM, np.vstack([REST, car(score=0.2, off=(1.0, 0.5))]), heard).lies == []
+    assert [lie.kind for lie in Shown(TEAM, car(), heard).lies] == ["gone"]  # the other one
+
+
+@pytest.mark.parametrize(
+    ("said", "holes"),
+    [
+        ({"b": YES}, 0),
+        ({"ego": YES, "b": YES}, 1),
+        ({"b": YES, "c": YES, "d": NO}, 1),  # who denies it most does not count
+        ({"b": YES, "c": YES, "d": NO, "a": NO}, 0),
+        ({"b": 3.5, "c": YES}, 0),
+    ],
+)
+def test_a_vehicle_stands_where_the_ego_or_two_know_it(said, holes):
+    assert len(Shown(TEAM, REST, hearing(**said)).holes) == holes
+
+
+def test_all_that_may_be_wrong_is_told_of_a_fusion():
+    ghost = Shown(TEAM, np.vstack([REST, car()]), hearing(**DENIED)).lies
+    assert [(lie.kind, lie.place.tolist()) for lie in ghost] == [("ghost", PLACE.tolist())]
+    moved = Shown(TEAM, np.vstack([REST, car(off=(0, 1.5))]), hearing(**SEEN)).lies
+    assert [lie.kind for lie in moved] == ["moved"]
+
+
+def test_the_word_of_those_unheard_counts_for_nothing():
+    assert len(Shown(TEAM, REST, hearing(["c"], **SEEN)).lies) == 0
+    assert len(Shown(TEAM, np.vstack([REST, car()]), hearing(["c"], **DENIED)).lies) == 0
+    assert len(hearing(["c"], **SEEN).everybody.agents) == 5
+
+
+def test_boxes_are_vouched_for_by_others_than_those_who_join():
+    shown = Shown(TEAM, np.vstack([REST, car()]), hearing(c=YES, d=YES))
+    assert shown.vouched(("d",)).tolist() == [True, True]
+    assert shown.vouched(("c", "d")).tolist() == [True, False]
+
+
+def test_what_a_fusion_has_lost_is_found_by_its_part():
+    heard = hearing(**SEEN)
+    part = Shown(("b", "c"), np.vstack([car(), REST]), heard)
+    assert gone(Shown(TEAM, REST, heard), part, None).tolist() == [0]
+    assert gone(Shown(TEAM, np.vstack([REST, car()]), heard), part, None).tolist() == []
+    assert gone(Shown(TEAM, REST, hearing()), Shown(("b", "c"), np.vstack([car(), REST]), hearing()), None).size == 0
+
+
+def test_odds_are_those_of_the_best_box_at_a_place():
+    shown = Shown(TEAM, np.vstack([car(score=0.8), car(score=0.5, off=(1.0, 0)), REST]), hearing())
+    odds = shown.odds_at(np.array([PLACE, PLACE + [3.0, 0], PLACE + [0, 9.0]]))
+    assert odds == pytest.approx([np.log(4), 0.0, np.log(0.05 / 0.95)])

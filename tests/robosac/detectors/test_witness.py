@@ -1,0 +1,139 @@
+"""What a witness reads of messages, and how it lies."""
+
+from dataclasses import replace
+
+import numpy as np
+import pytest
+import torch
+
+from robosac.boxes import pose_matrix
+from robosac.detectors import DetectorInfo, Message, TensorSpec
+from robosac.detectors.weights_file import WeightsError
+from robosac.detectors.witness import GEOMETRY, HIGHEST_M, Layout, Witness, WitnessNetwork
+from robosac.testimony import LAYERS
+
+MAP = {"other": TensorSpec("float16", (2, 8, 8)), "map": TensorSpec("float32", (4, 16, 16))}
+INFO = DetectorInfo("fake", {"ego": {}, "teammate": MAP}, (-32, -32, 32, 32), 4.0, "d" * 64, 0.5)
+NAMES = ("", "a", "b")
+POSES = [pose_matrix(0, 0, 1.6, 0), pose_matrix(12, -5, 2.0, 1.0), pose_matrix(-7, 9, 5.0, -2.5)]
+
+
+def witness(info=INFO, scale=2.0):
+    torch.manual_seed(3)
+    layout = Layout.of(info, scale)
+    return Witness(WitnessNetwork(layout.channels, layout.upsampling), layout)
+
+
+def messages(rng, mirrored=False):
+    maps = [rng.normal(size=(4, 16, 16)).astype(np.float32) for _ in NAMES]
+    sent = [np.ascontiguousarray(m[..., ::-1]) if mirrored else m for m in maps]
+    return {name: Message(pose, {"map": m}) for name, pose, m in zip(NAMES, POSES, sent, strict=True)}
+
+
+def test_the_largest_map_of_floats_is_read_in_places_of_a_metre():
+    layout = Layout.of(INFO, 2.0)
+    assert (layout.tensor, layout.channels, layout.height, layout.width) == ("map", 4, 16, 16)
+    assert layout.upsampling == 4
+    assert layout.half_extent_m == 32.0
+    finer = {"teammate": {"map": TensorSpec("float32", (4, 128, 128)), "ids": TensorSpec("int64", (4, 512, 512))}}
+    assert Layout.of(replace(INFO, tensors=finer), 1.0).upsampling == 1
+
+
+@pytest.mark.parametrize(
+    ("change", "reason"),
+    [
+        ({"tensors": {"teammate": {"x": TensorSpec("int8", (4, 16, 16))}}}, "no tensor"),
+        ({"tensors": {"teammate": {"x": TensorSpec("float32", (16, 16))}}}, "no tensor"),
+        ({"area_m": (-32, -32, 32, 31)}, "square around the sensor"),
+        ({"area_m": (0, 0, 64, 64)}, "square around the sensor"),
+    ],
+)
+def test_what_cannot_be_read_is_refused(change, reason):
+    with pytest.raises(WeightsError, match=reason):
+        Layout.of(replace(INFO, **change), 1.0)
+
+
+def test_maps_mirrored_or_not_give_the_same_testimony():
+    plain = witness().testify("", messages(np.random.default_rng(5)))
+    info = replace(INFO, mirrored=True)
+    mirrored = witness(info).testify("", messages(np.random.default_rng(5), mirrored=True))
+    unflipped = witness(info).testify("", messages(np.random.default_rng(5)))
+    np.testing.assert_array_equal(mirrored.maps, plain.maps)
+    np.testing.assert_array_equal(mirrored.over_ego, plain.over_ego)
+    assert np.abs(unflipped.maps - plain.maps).max() > 0.01
+
+
+def test_testimony_of_a_message_depends_on_no_other(rng):
+    """Not even by rounding, whatever the others hold, and whoever is the ego."""
+    sent = messages(rng)
+    together = witness().testify("", sent)
+    assert together.agents == NAMES
+    assert together.maps.shape == (3, LAYERS, 64, 64)
+    forged = Message(sent["b"].pose, {"map": 50 - sent["b"].tensors["map"]})
+    beside = witness().testify("a", {**sent, "b": forged})
+    alone = witness().testify("a", {"a": sent["a"]})
+    np.testing.assert_array_equal(beside.maps[:2], together.maps[:2])
+    np.testing.assert_allclose(alone.maps[0], together.maps[1], atol=2e-3)
+    assert np.abs(beside.maps[2] - together.maps[2]).max() > 0.1
+
+
+def test_maps_are_read_alike_however_they_lie_in_memory():
+    layout = Layout.of(INFO, 1.0)
+    values = np.random.default_rng(0).normal(size=(4, 16, 16)).astype(np.float32)
+    last = np.ascontiguousarray(values.transpose(1, 2, 0)).transpose(2, 0, 1)
+    one, other = (layout.maps([Message(POSES[0], {"map": m})] * 2) for m in (values, last))
+    assert one.stride() == other.stride()
+    assert torch.equal(one, other)
+
+
+def test_the_network_is_told_where_cells_are():
+    geometry = Layout.of(INFO, 1.0).geometry([2.5, 400.0])
+    assert geometry.shape == (2, GEOMETRY, 16, 16)
+    east, north = geometry[0, :2, 3, 12] * 32
+    assert (float(east), float(north)) == (18.0, -18.0)
+    np.testing.assert_allclose(geometry[0, 2] ** 2, geometry[0, 0] ** 2 + geometry[0, 1] ** 2, rtol=1e-5)
+    assert float(geometry[0, -1, 0, 0]) == 0.5
+    assert float(geometry[1, -1, 0, 0]) == HIGHEST_M / 5
+
+
+def test_what_is_read_is_divided_by_the_usual_size(rng):
+    sent = messages(rng)
+    double = {n: Message(m.pose, {"map": 2 * m.tensors["map"]}) for n, m in sent.items()}
+    np.testing.assert_array_equal(
+        witness(scale=2.0).testify("", sent).maps, witness(scale=4.0).testify("", double).maps
+    )
+
+
+def test_testimony_is_laid_over_the_egos_map(rng):
+    """As `Testimony.likelihood` finds it at the same places, to the width of a place."""
+    said = witness().testify("", messages(rng))
+    places = said.ego_places()
+    looked_up = said.likelihood(places.reshape(-1, 2)).reshape(3, 64, 64)
+    inside = (np.abs(said.places(places.reshape(-1, 2))).max(axis=-1) < 31).reshape(3, 64, 64)
+    for agent in range(3):
+        np.testing.assert_allclose(said.over_ego[agent][inside[agent]], looked_up[agent][inside[agent]], atol=2e-3)
+    assert inside.sum(axis=(1, 2)).min() > 1000
+    assert (said.over_ego[1][~inside[1]] == 0).any()
+
+
+def test_a_witness_survives_a_file(rng, tmp_path):
+    before, path = witness(scale=0.7), tmp_path / "x.witness.safetensors"
+    before.network.half().float()  # as files hold it
+    before.write(path, INFO, {"seed": 3})
+    after = Witness.open(path, INFO)
+    assert after.layout == before.layout
+    sent = messages(rng)
+    np.testing.assert_array_equal(after.testify("", sent).maps, before.testify("", sent).maps)
+
+
+def test_a_witness_of_other_weights_or_messages_is_refused(tmp_path):
+    path = tmp_path / "x.witness.safetensors"
+    witness().write(path, INFO, {})
+    with pytest.raises(WeightsError, match="belongs to weights with the digest dddddddddddd"):
+        Witness.open(path, replace(INFO, weights_digest="e" * 64))
+    wider = {"teammate": {"map": TensorSpec("float32", (5, 16, 16))}}
+    with pytest.raises(WeightsError, match="does not fit the messages of fake"):
+        Witness.open(path, replace(INFO, tensors=wider))
+    path.write_bytes(path.read_bytes()[:-8])
+    with pytest.raises(WeightsError, match="not a readable"):
+        Witness.open(path, INFO)
