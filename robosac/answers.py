@@ -77,9 +77,9 @@ class Standing(StrEnum):
     """How a box stands among those who could see the place."""
 
     CONFIRMED = "confirmed"
-    """The ego saw it, or at least two teammates did."""
+    """The ego sees it, or at least two teammates do and nobody denies it."""
     SINGLE_WITNESS = "single_witness"
-    """One teammate saw it, and nobody else could have: no accusation."""
+    """Nobody denies it, and fewer than two teammates are sure of it, as where nobody else can see: no accusation."""
     DISPUTED = "disputed"
     """Somebody who could have seen it did not, but not enough of them to leave it out."""
     REPAIRED = "repaired"

@@ -21,6 +21,8 @@ DENIES = -4.0
 """An agent denies a place from this L on downwards."""
 WEIGHTY = 6.0
 """Testimony of several agents decides from this sum of L on, in either direction."""
+CONFLICT_OWN, CONFLICT_SUM = 4.5, 10.0
+"""L of one, and the sum of all others' the other way, from which on they are in conflict."""
 AROUND_M = 0.6
 """L of a box is the greatest within so far along and across of its centre: a place a little off is no denial."""
 _STEPS = np.array([[0.0, 0.0], [1.0, 0.0], [-1.0, 0.0], [0.0, 1.0], [0.0, -1.0]])
@@ -62,6 +64,15 @@ class Claims:
     def denying(self) -> BoolArray:
         """Who (witnesses, n) denies which box."""
         return self.likelihood <= DENIES
+
+    def conflicts(self, witness: str, unheard: Collection[str]) -> int:
+        """Boxes over which a witness says the contrary of all others that are heard: its L is at least 4.5 one way, and
+        the sum of theirs 10 the other.
+        """
+        own = self.likelihood[self.witnesses.index(witness)]
+        others = self.without({witness, *unheard}).likelihood.sum(axis=0)
+        against = (np.sign(own) != np.sign(others)) & (np.abs(own) >= CONFLICT_OWN) & (np.abs(others) >= CONFLICT_SUM)
+        return int(against.sum())
 
     def contradicted(self, suspect: str | None = None, weighty: float = WEIGHTY) -> BoolArray:
         """Which boxes (n,) are contradicted, whoever supports them.

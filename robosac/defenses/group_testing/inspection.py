@@ -12,7 +12,7 @@ from robosac.defenses.group_testing.claims import SUPPORTS, Claims
 from robosac.defenses.group_testing.knowledge import Knowledge
 from robosac.defenses.group_testing.lies import Lies
 from robosac.defenses.group_testing.model import CELLS, CLEAN, LIE
-from robosac.defenses.group_testing.objects import REACH_M, Hearing, Lie, Shown, effects, gone
+from robosac.defenses.group_testing.objects import REACH_M, Hearing, Lie, Shown, blame, effects, gone
 from robosac.defenses.group_testing.standing import Judged, judge
 from robosac.defenses.protocol import Hypothesis, Outcome
 from robosac.testimony import Testimony
@@ -24,9 +24,7 @@ UNHEARD = 0.9
 CLEARING = 1.5
 """What a frame in which nothing is wrong takes off the logarithm of the odds that one of those fused lies."""
 CONFLICT_SCORE = 0.5
-CONFLICT_SUM = 10.0
-"""A teammate is in conflict over a box of this score if its L is at least 4.5 one way, the others' sum 10 the other."""
-CONFLICT_OWN = 4.5
+"""Conflicts are counted over boxes of this score."""
 LATER = 100.0
 
 
@@ -53,8 +51,7 @@ class Inspection:
         self._keep_contradicted = keep_contradicted
         self._lies = lies
         self._team = team
-        suspicion = known.suspicion()
-        self._unheard = {name for name in team if name in named or suspicion[name] > UNHEARD}
+        self._unheard = {name for name, p in known.suspicion().items() if name in named or p > UNHEARD}
         self._named = frozenset(named)
         self._shown: dict[Hypothesis, Shown] = {}
         self._decoded: set[Hypothesis] = set()
@@ -80,7 +77,7 @@ class Inspection:
                 return subset
         if answer not in self._shown:
             return None
-        lies = self._unexplained(answer)
+        lies = self._unexplained(answer) or self._hardly_explained(answer)
         holes = [lie for lie in lies if lie.kind == "gone"]
         if holes and len(holes) == len(lies):
             witnesses = self._supporters(answer, holes[0])
@@ -100,8 +97,14 @@ class Inspection:
         if self._hearing is None:
             return
         blamed: dict[str, list[Lie]] = {name: [] for name in self._team}
-        for (joined, without), suspect in self._comparisons().items():
-            blamed[suspect] += effects(self._shown[joined], self._shown[without], suspect)
+        for joined, shown in self._shown.items():
+            found = {
+                suspect: effects(shown, self._shown[without], suspect)
+                for (fused, without), suspect in self._comparisons().items()
+                if fused == joined
+            }
+            for suspect, lies in blame(found, shown).items():
+                blamed[suspect] += lies
         conflicts = self._conflicts(answer)
         self._leave_alone(answer)
         self._clear()
@@ -124,31 +127,31 @@ class Inspection:
         for name in answer:
             if tuple(other for other in answer if other != name) in self._decoded:
                 self._lies.left_out[name] = frame
-        everybody = all(self._lies.recently_left_out(name, frame) for name in answer)
+        lying = any(self._lies.worst(name) for name in self._team)
+        everybody = not lying and all(self._lies.recently_left_out(name, frame) for name in answer)
         for lie in self._unexplained(answer) if answer in self._shown else ():
-            if not everybody and lie.kind == "gone":
-                witnesses = self._supporters(answer, lie)
-                no_loss = not witnesses or (witnesses in self._decoded and not self._is_real(answer, witnesses, lie))
-            else:
-                no_loss = False
-            if everybody or no_loss:
+            witnesses = self._supporters(answer, lie) if lie.kind == "gone" else ()
+            tested = lie.kind == "gone" and (not witnesses or witnesses in self._decoded)
+            if everybody or (tested and not self._is_real(answer, witnesses, lie)):
                 self._lies.leave_alone(self._placed(lie.place), frame)
 
     def _again(self, answer: Hypothesis) -> list[Hypothesis]:
-        """What is to be decoded to ask those again that are neither in the answer nor named: as many together of those
-        only in doubt, beside the answer, as are more likely all honest than not; each of the two most suspected ones
-        alone, and beside the answer.
+        """What is to be decoded to ask those again that are neither in the answer nor named: of those only in doubt,
+        beside the answer, in one frame as many together as are more likely all honest than not, in the next the least
+        suspected; each of the two most suspected ones, or that lied lately, alone and beside the answer.
         """
         posterior, suspicion = self._known.posterior, self._known.suspicion()
         left = [name for name in self._team if name not in answer and name not in self._named]
         left.sort(key=lambda name: suspicion[name])
-        doubtful = [name for name in left if suspicion[name] <= SUSPECT]
+        suspects = [name for name in left if suspicion[name] > SUSPECT or self._lies.worst(name)]
+        doubtful = [name for name in left if name not in suspects]
         groups = [self._with(answer, doubtful[:count]) for count in range(len(doubtful), 0, -1)]
         asked = groups[-1:]
-        if len(groups) > 1:
+        turn = self._hearing is None or self._known.memory.frame % 2 == 0  # a liar among them would spoil every test
+        if len(groups) > 1 and turn:
             honest = posterior.unattacked(posterior.masks(self._known.rows(groups))) >= SUSPECT
             asked = [groups[int(honest.argmax())]] if honest.any() else asked
-        for suspect in left[len(doubtful) :][-2:][::-1]:
+        for suspect in suspects[-2:][::-1]:
             asked += [(suspect,), self._with(answer, [suspect])]
         return asked
 
@@ -190,14 +193,25 @@ class Inspection:
         """What is wrong in the answer and not remembered as nobody's, and in no decoded fusion without one of them is
         put right.
         """
-        frame = self._known.memory.frame
-        lies = [lie for lie in self._shown[answer].lies if not self._lies.is_quiet(self._placed(lie.place), frame)]
+        lies = self._lies_in(answer)
         for suspect in answer:
             without = tuple(name for name in answer if name != suspect)
             if lies and without in self._shown:
                 done = effects(self._shown[answer], self._shown[without], suspect)
                 lies = [a for a in lies if all(np.hypot(*(a.place - b.place)) > 3.0 for b in done)]
         return lies
+
+    def _lies_in(self, answer: Hypothesis) -> list[Lie]:
+        """What is wrong in the answer, and not remembered as nobody's doing."""
+        frame = self._known.memory.frame
+        return [lie for lie in self._shown[answer].lies if not self._lies.is_quiet(self._placed(lie.place), frame)]
+
+    def _hardly_explained(self, answer: Hypothesis) -> list[Lie]:
+        """What is wrong in the answer, and explained, while only one of those fused was left out: what two do together
+        is explained by either.
+        """
+        left_out = sum(tuple(other for other in answer if other != name) in self._shown for name in answer)
+        return self._lies_in(answer) if left_out == 1 and len(answer) > 1 else []
 
     def _candidates(self, answer: Hypothesis, lies: Sequence[Lie]) -> list[str]:
         """Who may be behind them, the likeliest first: those suspected already, and those whose own testimony goes with
@@ -211,29 +225,18 @@ class Inspection:
         frame = self._known.memory.frame
 
         def unlikely(name: str) -> float:
-            again = LATER * self._lies.recently_left_out(name, frame)
+            again = LATER * (self._lies.recently_left_out(name, frame) and not self._lies.worst(name))
             return float(again - 10 * self._lies.worst(name) - 10 * suspicion[name] - own.get(name, 0.0))
 
         return sorted(answer, key=unlikely)
 
     def _conflicts(self, answer: Hypothesis) -> dict[str, int]:
         """Boxes of the answer over which each teammate alone says the contrary of all others."""
-        found = dict.fromkeys(self._team, 0)
         if answer not in self._shown:
-            return found
+            return dict.fromkeys(self._team, 0)
         boxes = self._shown[answer].boxes
         claims = Claims.of(boxes[boxes[:, 5] >= CONFLICT_SCORE], self._said())
-        heard = np.array([name not in self._unheard for name in claims.witnesses])
-        for index, name in enumerate(claims.witnesses):
-            if name in found:
-                others = heard.copy()
-                others[index] = False
-                rest, own = claims.likelihood[others].sum(axis=0), claims.likelihood[index]
-                against = ((own <= -CONFLICT_OWN) & (rest >= CONFLICT_SUM)) | (
-                    (own >= CONFLICT_OWN) & (rest <= -CONFLICT_SUM)
-                )
-                found[name] = int(against.sum())
-        return found
+        return {name: claims.conflicts(name, self._unheard) for name in self._team}
 
     def _said(self) -> Testimony:
         """What everybody says."""

@@ -8,7 +8,7 @@ witnesses and an effect.
 
 from __future__ import annotations
 
-from collections.abc import Collection
+from collections.abc import Collection, Mapping, Sequence
 from dataclasses import dataclass
 from functools import cached_property
 
@@ -33,6 +33,8 @@ THERE_SCORE = 0.15
 """Where a box has this score or more, something is shown."""
 CERTAIN = 4.0
 """From this L on, two teammates or the ego know that a vehicle stands in a place."""
+SAME_LIE_M = 3.0
+"""Lies so near each other are about one object."""
 REACH_M = 2.2
 """A box is at a place if it is centred so near."""
 RIM_M = 1.2
@@ -141,6 +143,11 @@ class Shown:
         own: FloatArray = self._everybody.likelihood[self._everybody.witnesses.index(suspect)]
         return own
 
+    def goes_with(self, suspect: str, lie: Lie) -> bool:
+        """Whether a suspect's own message says what a lie says."""
+        said = self._hearing.everybody.of([suspect]).likelihood(lie.place[None])[0, 0]
+        return bool(said <= DENIES if lie.kind == "gone" else said >= SUPPORTS)
+
     @cached_property
     def ghosts(self) -> BoolArray:
         """Boxes (n,) that are shown and contradicted."""
@@ -215,6 +222,25 @@ def effects(joined: Shown, without: Shown, suspect: str | None) -> list[Lie]:
         if same is not None and 0.0 < other[same] <= away[index] - AWAY_EFFECT:
             found.append(Lie("moved", joined.boxes[index, :2]))
     return found
+
+
+def blame(found: Mapping[str, Sequence[Lie]], joined: Shown) -> dict[str, list[Lie]]:
+    """Who is to blame for what is wrong in a fusion, of what is not so without each suspect.
+
+    What is explained by several may be the doing of one of them, who makes it show only beside another. Then those are
+    to blame whose own message goes with the lie, and if nobody's does, nobody is.
+    """
+    blamed: dict[str, list[Lie]] = {name: [] for name in found}
+    for name, lies in found.items():
+        for lie in lies:
+            others = [
+                other
+                for other, theirs in found.items()
+                if other != name and any(np.hypot(*(each.place - lie.place)) <= SAME_LIE_M for each in theirs)
+            ]
+            if not others or joined.goes_with(name, lie):
+                blamed[name].append(lie)
+    return blamed
 
 
 def gone(joined: Shown, without: Shown, suspect: str | None) -> IntArray:

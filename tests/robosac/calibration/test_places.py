@@ -54,6 +54,13 @@ def test_over_a_low_wall_a_part_is_seen():
     assert 0 < part < whole
 
 
+def test_rays_that_end_short_of_a_car_are_no_hits():
+    """A car across the way, and a wall just before it."""
+    across = AHEAD + [0, 0, 0, 0, np.pi / 2]
+    assert hits(scan((10.5, 5.0, 3.0)), across)[0] == 0
+    assert hits(scan((11.5, 5.0, 3.0)), across)[0] > OBSERVED_HITS
+
+
 @pytest.mark.parametrize(("height", "counted"), [(1.75, 0), (1.0, 21)])
 def test_rays_over_a_car_are_no_hits(height, counted):
     """Returns of a wall far behind: those from high up have passed over the car's roof."""

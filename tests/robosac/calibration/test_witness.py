@@ -24,14 +24,14 @@ def layout(mirrored=False):
 
 
 def lesson(rng, mirrored=False):
-    """Four vehicles and a dozen free places. The half ahead is observed: there the map shows what is where."""
+    """A few vehicles, and three times as many free places. In the half ahead, the map shows all vehicles."""
     at = rng.uniform(-10.5, 10.5, (60, 2))
     apart = []
     for place in at:
         if all(np.abs(place - other).max() > 4.2 for other in apart):
             apart.append(place)
     at = np.array(apart)
-    vehicle = (np.arange(len(at)) < len(at) // 2).astype(float)
+    vehicle = (np.arange(len(at)) < len(at) // 4).astype(float)
     hits = np.where(at[:, 0] > 0, 40.0, 0.0)
     centres = np.arange(CELLS) * 2.0 - HALF_EXTENT_M + 1
     x, y = np.meshgrid(centres, centres)
@@ -62,7 +62,7 @@ def test_a_plain_world_is_learned(trained):
     figures = check(witness, world(2, 40))
     assert figures.places > 200
     assert figures.vehicles_supported > 0.9
-    assert figures.free_denied > 0.8
+    assert figures.free_denied > 0.6
     assert figures.vehicles_denied < 0.02
     assert figures.free_supported < 0.05
     assert max(figures.off_along_m, figures.off_across_m) < 0.5
@@ -79,12 +79,14 @@ def test_an_untrained_witness_knows_nothing():
 
 
 def test_where_nothing_is_observed_nothing_is_said(trained):
-    """What stands there is as likely as not, in the lessons too."""
+    """Although most such places are free: vehicles and free places weigh the same in total."""
     witness, _ = trained
-    unobserved = [np.abs(said_of(witness, each)[each.places.hits < OBSERVED_HITS]) for each in world(3, 20)]
-    observed = [np.abs(said_of(witness, each)[each.places.hits >= OBSERVED_HITS]) for each in world(3, 20)]
-    assert np.median(np.concatenate(unobserved)) < 1.0
-    assert np.median(np.concatenate(observed)) > 3.0
+    said = [(said_of(witness, each), each.places.hits >= OBSERVED_HITS) for each in world(3, 40)]
+    unobserved = np.concatenate([likelihood[~seen] for likelihood, seen in said])
+    observed = np.concatenate([likelihood[seen] for likelihood, seen in said])
+    assert abs(np.median(unobserved)) < 0.5
+    assert np.median(np.abs(unobserved)) < 1.0
+    assert np.median(np.abs(observed)) > 3.0
 
 
 def said_of(witness, each):
