@@ -150,8 +150,11 @@ class Evidence:
         before = self._known.memory.shown.get(key)
         if before is None or max(crowd(before), crowd(now)) < MIN_WITNESSES:
             return []
-        boxes = crowd(now)
-        changed = self._known.memory.steadiness.unexpected(boxes, self.changes(before, now))
+        boxes, shown, pose = crowd(now), self._checked[outcome.teammates], outcome.pose
+        if shown is None:
+            changed = self._known.memory.steadiness.unexpected(boxes, self.changes(before, now))
+        else:
+            changed = self.changes(before, now, lambda rows: shown.stands(_in_frame(rows, pose)))
         likelihood = self._known.model.change(len(outcome.teammates), boxes, changed)
         values = {"boxes": boxes, "changes": changed}
         return [_Finding("change", (), outcome.teammates, np.log(likelihood), 1.0, values)]
@@ -199,6 +202,11 @@ class Evidence:
                     item["joining"] = list(finding.d)
                 item["log_likelihood_ratio"] = round(ratio, 3)
                 memory.add_evidence(name, item)
+
+
+def _in_frame(rows: FloatArray, pose: FloatArray) -> FloatArray:
+    """Places (n, 2) in the ego's frame of boxes (n, 4) as `geometry.followed` gives them."""
+    return (rows[:, :2] - pose[:2, 3]) @ pose[:2, :2]
 
 
 def _log_odds(p: FloatArray) -> FloatArray:

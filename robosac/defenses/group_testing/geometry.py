@@ -2,12 +2,15 @@
 
 from __future__ import annotations
 
+from collections.abc import Callable
 from dataclasses import dataclass
 from typing import Any
 
 import numpy as np
 
 from robosac.boxes import FloatArray, pairwise_iou, to_world
+
+BoolArray = np.ndarray[tuple[Any, ...], np.dtype[np.bool_]]
 
 WITNESS_SCORE = 0.5
 """Boxes of the smaller fusion from this score on must survive in the larger one."""
@@ -37,9 +40,7 @@ class PairMeasure:
     """v, boxes that overlap nothing of before."""
 
 
-def measure(
-    smaller: FloatArray, larger: FloatArray, vouched: np.ndarray[Any, np.dtype[np.bool_]] | None = None
-) -> PairMeasure | None:
+def measure(smaller: FloatArray, larger: FloatArray, vouched: BoolArray | None = None) -> PairMeasure | None:
     """Compare the boxes (n, 6) of a fusion with those (m, 6) of the same fusion and more messages.
 
     ``g = 1 - mean over boxes b of the smaller, score >= .5, of max IoU(b, boxes of the larger, score >= .15)``: honest
@@ -87,21 +88,26 @@ def crowd(now: FloatArray) -> int:
     return int((now[:, 3] >= NEW_SCORE).sum())
 
 
-def changes(before: FloatArray, now: FloatArray) -> int:
+def changes(before: FloatArray, now: FloatArray, real: Callable[[FloatArray], BoolArray] | None = None) -> int:
     """Boxes that came or went between two frames of one fusion, (n, 4) and (m, 4), as `followed` gives them.
 
     A box has come if it has a score >= .3 and before none was kept where it can have been; it has gone if it had a
     score >= .5 and none is kept where it can be. It can get as far as `ALONG_M`, `ACROSS_M` and `TURN_RAD`
     say; front and rear are not told apart. What is there stays, or drives on: made-up boxes, and boxes that a
-    perturbed map shakes, come and go.
+    perturbed map shakes, come and go. ``real`` says of boxes (n, 4) in which places a vehicle stands by the word of
+    others: if a box comes and goes there, the detector is unsure, and nobody has made it up.
     """
-    return _nowhere(now[now[:, 3] >= NEW_SCORE], before) + _nowhere(before[before[:, 3] >= WITNESS_SCORE], now)
+    came = _nowhere(now[now[:, 3] >= NEW_SCORE], before)
+    gone = _nowhere(before[before[:, 3] >= WITNESS_SCORE], now)
+    changed = np.concatenate([came, gone])
+    return len(changed) if real is None else int((~real(changed)).sum())
 
 
-def _nowhere(boxes: FloatArray, others: FloatArray) -> int:
-    """Boxes that are none of the others."""
+def _nowhere(boxes: FloatArray, others: FloatArray) -> FloatArray:
+    """Those boxes that are none of the others."""
     x, y = np.moveaxis(boxes[:, None, :2] - others[None, :, :2], -1, 0)
     cos, sin = np.cos(boxes[:, 2, None]), np.sin(boxes[:, 2, None])
     turned = np.abs((boxes[:, 2, None] - others[None, :, 2] + np.pi / 2) % np.pi - np.pi / 2)
     same = (np.abs(cos * x + sin * y) < ALONG_M) & (np.abs(cos * y - sin * x) < ACROSS_M) & (turned < TURN_RAD)
-    return len(boxes) - int(same.any(axis=1).sum())
+    nowhere: FloatArray = boxes[~same.any(axis=1)]
+    return nowhere

@@ -164,6 +164,12 @@ class Shown:
         places = self._hearing.standing
         return places[~self._covered(places)]
 
+    def stands(self, places: FloatArray) -> BoolArray:
+        """Whether somebody supports a vehicle at places (n, 2) who is not among those fused."""
+        others = self._testimony.of([name for name in self._testimony.agents if name not in self.teammates])
+        supported: BoolArray = np.atleast_1d((others.likelihood(places) >= SUPPORTS).any(axis=0))
+        return supported
+
     def vouched(self, joining: Hypothesis) -> BoolArray:
         """Which boxes (n,) somebody supports who is not among the joining: nothing that these may have made up."""
         supported: BoolArray = np.atleast_1d(self.claims.without(joining).supporting.any(axis=0))

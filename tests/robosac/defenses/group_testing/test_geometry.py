@@ -91,3 +91,17 @@ def test_rounding_does_not_turn_a_box_around():
 def test_nothing_changes_where_there_is_nothing():
     assert changes(kept(SEEN[:0]), kept(SEEN[:0])) == 0
     assert changes(kept(SEEN[:0]), kept()) == len(SEEN)
+
+
+def test_what_comes_or_goes_where_others_see_a_vehicle_is_not_made_up():
+    here = kept()
+    assert changes(here, here[1:]) == changes(here[1:], here) == 1
+    for real, counted in ((True, 0), (False, 1)):
+        seen = []
+
+        def stands(boxes, real=real, seen=seen):
+            seen.append(boxes)
+            return np.full(len(boxes), real)
+
+        assert changes(here, here[1:], stands) == changes(here[1:], here, stands) == counted
+        assert all(np.array_equal(boxes, here[:1]) for boxes in seen)
