@@ -12,7 +12,7 @@ from robosac.defenses.group_testing.claims import SUPPORTS, Claims
 from robosac.defenses.group_testing.knowledge import Knowledge
 from robosac.defenses.group_testing.lies import Lies
 from robosac.defenses.group_testing.model import CELLS, CLEAN, LIE
-from robosac.defenses.group_testing.objects import REACH_M, Hearing, Lie, Shown, blame, effects, gone
+from robosac.defenses.group_testing.objects import REACH_M, SAME_LIE_M, Hearing, Lie, Shown, blame, effects, gone
 from robosac.defenses.group_testing.standing import Judged, judge
 from robosac.defenses.protocol import Hypothesis, Outcome
 from robosac.testimony import Testimony
@@ -25,7 +25,6 @@ CLEARING = 1.5
 """What a frame in which nothing is wrong takes off the logarithm of the odds that one of those fused lies."""
 CONFLICT_SCORE = 0.5
 """Conflicts are counted over boxes of this score."""
-LATER = 100.0
 
 
 class Inspection:
@@ -97,10 +96,11 @@ class Inspection:
         if self._hearing is None:
             return
         blamed: dict[str, list[Lie]] = {name: [] for name in self._team}
+        comparisons = self._comparisons()
         for joined, shown in self._shown.items():
             found = {
                 suspect: effects(shown, self._shown[without], suspect)
-                for (fused, without), suspect in self._comparisons().items()
+                for (fused, without), suspect in comparisons.items()
                 if fused == joined
             }
             for suspect, lies in blame(found, shown).items():
@@ -198,7 +198,7 @@ class Inspection:
             without = tuple(name for name in answer if name != suspect)
             if lies and without in self._shown:
                 done = effects(self._shown[answer], self._shown[without], suspect)
-                lies = [a for a in lies if all(np.hypot(*(a.place - b.place)) > 3.0 for b in done)]
+                lies = [a for a in lies if all(np.hypot(*(a.place - b.place)) > SAME_LIE_M for b in done)]
         return lies
 
     def _lies_in(self, answer: Hypothesis) -> list[Lie]:
@@ -224,9 +224,9 @@ class Inspection:
         own = dict(zip(testimony.agents, (said * sign).sum(axis=1).tolist(), strict=True))
         frame = self._known.memory.frame
 
-        def unlikely(name: str) -> float:
-            again = LATER * (self._lies.recently_left_out(name, frame) and not self._lies.worst(name))
-            return float(again - 10 * self._lies.worst(name) - 10 * suspicion[name] - own.get(name, 0.0))
+        def unlikely(name: str) -> tuple[bool, float]:
+            again = self._lies.recently_left_out(name, frame) and not self._lies.worst(name)
+            return again, -(10 * self._lies.worst(name) + 10 * suspicion[name] + own[name])
 
         return sorted(answer, key=unlikely)
 
