@@ -27,6 +27,10 @@ PLACE_M = 1.0
 """Edge of the squares that testimony is about, as near as doubling cells of the message's map comes to it, metres."""
 WIDTH = 32
 DILATIONS = (1, 2, 4)
+LARGEST = 50.0
+"""Whatever a message holds, nothing is read from it that is farther from 0: half floats would become infinite, and what
+is laid over the ego's map no number.
+"""
 HIGHEST_M = 10.0
 """A pose whose z is not the height above ground, but above the sea, counts as this high."""
 GEOMETRY = 7
@@ -151,7 +155,8 @@ class Witness:
         """
         with torch.inference_mode():
             heights = [float(message.pose[2, 3]) for message in messages.values()]
-            maps = self.read(self.layout.maps(list(messages.values())), heights).half().numpy()
+            maps = self.read(self.layout.maps(list(messages.values())), heights)
+            maps = torch.nan_to_num(maps).clamp(-LARGEST, LARGEST).half().numpy()
         from_ego = planar(messages[ego].pose, [message.pose for message in messages.values()])
         return as_testimony(tuple(messages), maps, from_ego, self.layout.half_extent_m)
 

@@ -54,7 +54,6 @@ class Lies:
     """By teammate and kind: the level, and the highest since it was 0."""
     quiet: list[tuple[float, float, int, int]] = field(default_factory=list)
     """Places left alone: x, y (world, metres), the frame of the session until which, and for how many frames."""
-
     left_out: dict[str, int] = field(default_factory=dict)
     """By teammate: the frame of the session in which an answer was last decoded without it, to see what it does."""
 

@@ -77,6 +77,20 @@ def test_testimony_of_a_message_depends_on_no_other(rng):
     assert np.abs(beside.maps[2] - together.maps[2]).max() > 0.1
 
 
+@pytest.mark.parametrize("size", [1e6, -1e6, 3e38])
+def test_a_message_of_huge_values_is_read_as_numbers_and_costs_nobody_else(rng, size):
+    sent = messages(rng)
+    honest = witness().testify("", sent)
+    huge = Message(sent["b"].pose, {"map": np.full((4, 16, 16), size, dtype=np.float32)})
+    heard = witness().testify("", {**sent, "b": huge})
+    assert np.isfinite(heard.maps).all()
+    assert np.isfinite(heard.over_ego).all()
+    sighting = heard.sighting(np.array([[3.0, 4.0], [-9.0, 1.0]]))
+    assert np.isfinite(sighting.along).all()
+    assert np.array_equal(heard.maps[:2], honest.maps[:2])
+    assert np.array_equal(heard.over_ego[:2], honest.over_ego[:2])
+
+
 def test_maps_are_read_alike_however_they_lie_in_memory():
     layout = Layout.of(INFO, 1.0)
     values = np.random.default_rng(0).normal(size=(4, 16, 16)).astype(np.float32)
