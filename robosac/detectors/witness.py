@@ -155,8 +155,8 @@ class Witness:
         """
         with torch.inference_mode():
             heights = [float(message.pose[2, 3]) for message in messages.values()]
-            maps = self.read(self.layout.maps(list(messages.values())), heights)
-            maps = torch.nan_to_num(maps).clamp(-LARGEST, LARGEST).half().numpy()
+            read = self.read(self.layout.maps(list(messages.values())), heights)
+            maps = torch.nan_to_num(read).clamp(-LARGEST, LARGEST).half().numpy()
         from_ego = planar(messages[ego].pose, [message.pose for message in messages.values()])
         return as_testimony(tuple(messages), maps, from_ego, self.layout.half_extent_m)
 
