@@ -8,6 +8,7 @@ from __future__ import annotations
 
 from collections.abc import Collection, Sequence
 from dataclasses import dataclass
+from functools import cached_property
 
 import numpy as np
 
@@ -70,7 +71,7 @@ class Testimony:
         local = self.places(points)
         column = (local[..., 0] + self.half_extent_m) * width / (2 * self.half_extent_m) - 0.5
         row = (local[..., 1] + self.half_extent_m) * height / (2 * self.half_extent_m) - 0.5
-        padded = np.pad(np.clip(self.maps[:, LIKELIHOOD], -MOST, MOST), [(0, 0), (1, 2), (1, 2)])
+        padded = self._padded
         r = np.clip(np.floor(row).astype(np.int64) + 1, 0, height)
         c = np.clip(np.floor(column).astype(np.int64) + 1, 0, width)
         y, x = np.clip(row + 1 - r, 0.0, 1.0), np.clip(column + 1 - c, 0.0, 1.0)
@@ -79,6 +80,16 @@ class Testimony:
         bottom = padded[who, r + 1, c] * (1 - x) + padded[who, r + 1, c + 1] * x
         value: FloatArray = top * (1 - y) + bottom * y
         return value
+
+    @cached_property
+    def _padded(self) -> FloatArray:
+        """L within its bounds, zeros around each map: (agents, H + 3, W + 3)."""
+        padded: FloatArray = np.pad(np.clip(self.maps[:, LIKELIHOOD], -MOST, MOST), [(0, 0), (1, 2), (1, 2)])
+        return padded
+
+    @cached_property
+    def _to_ego(self) -> FloatArray:
+        return np.linalg.inv(self.from_ego)
 
     def sighting(self, points: FloatArray) -> Sighting:
         """Where each agent sees the vehicles at places (n, 2), ego frame. It means something where L is high."""
@@ -90,7 +101,7 @@ class Testimony:
         found = self.maps[np.arange(len(self.agents))[:, None], :, row, column]  # (agents, n, LAYERS)
         x = (column + 0.5) * cell_x - self.half_extent_m + found[..., X]
         y = (row + 0.5) * cell_y - self.half_extent_m + found[..., Y]
-        back = np.linalg.inv(self.from_ego)
+        back = self._to_ego
         centre = np.einsum("aij,anj->ani", back[:, :2, :2], np.stack([x, y], axis=-1)) + back[:, None, :2, 2]
         return Sighting(centre, np.exp(found[..., ALONG]), np.exp(found[..., ACROSS]))
 

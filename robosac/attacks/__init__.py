@@ -9,9 +9,11 @@ from robosac.attacks.adaptive import Erase, Invent, InventSteady, Shift
 from robosac.attacks.base import Attack, IterativeAttack
 from robosac.attacks.campaign import BEHAVIOURS, HONEST, SEPARATOR, Campaign, lacking
 from robosac.attacks.carlini_wagner import CarliniWagner
+from robosac.attacks.denial import Deny
 from robosac.attacks.geometric import NoGeometry
-from robosac.attacks.ghosts import Ghost, GhostAhead, GhostDriving, Ghosts, Swarm
+from robosac.attacks.ghosts import Ghost, GhostAhead, GhostDriving, GhostHidden, Ghosts, Swarm
 from robosac.attacks.gradient import BIM, PGD
+from robosac.attacks.hearing import Hearing, NoWitness
 from robosac.attacks.noise import GaussianNoise
 from robosac.attacks.objects import OnObjects
 from robosac.attacks.replays import Copy, Elsewhere, Frozen, Replay, Stale
@@ -82,6 +84,7 @@ __all__ = [
     "Campaign",
     "CarliniWagner",
     "Copy",
+    "Deny",
     "Displace",
     "Elsewhere",
     "Erase",
@@ -92,13 +95,16 @@ __all__ = [
     "Ghost",
     "GhostAhead",
     "GhostDriving",
+    "GhostHidden",
     "Ghosts",
     "Invent",
     "InventSteady",
     "InventStill",
+    "Hearing",
     "IterativeAttack",
     "Lie",
     "NoGeometry",
+    "NoWitness",
     "OnObjects",
     "OnVehicles",
     "Past",

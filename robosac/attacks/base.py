@@ -53,6 +53,8 @@ class Attack(ABC):
     """What the attack calls of an attack surface, besides its ``messages``."""
     remembers: ClassVar[bool] = False
     """Whether it goes by earlier frames, too: then it is run over the frames of a sequence in order."""
+    hears: ClassVar[bool] = False
+    """Whether it reads what each message says by itself: then it needs a detector with a witness."""
     bounded: ClassVar[bool] = True
     """Whether messages keep within ``epsilon`` of the benign ones."""
 

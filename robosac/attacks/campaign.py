@@ -14,10 +14,11 @@ from typing import Any
 import numpy as np
 import torch
 
-from robosac.attacks import penalties
+from robosac.attacks import penalties, words
 from robosac.attacks.alibi import Alibi, covering, framing, keeping
 from robosac.attacks.base import Attack, IterativeAttack, Tensors, Term
 from robosac.attacks.geometric import SHOWN
+from robosac.attacks.hearing import Hearing
 from robosac.attacks.situation import Past, Situation
 from robosac.boxes import FloatArray, pose_matrix
 from robosac.detectors.base import AttackSurface, Detector, Encoder, GeometricSurface, Message, Preparer, blank
@@ -85,12 +86,18 @@ class Campaign:
     """Weight of the sum of `robosac.attacks.penalties.PENALTIES`; for iterative attacks. Such an attack remembers, and
     takes at least `SOFT_STEPS` steps of at most `SOFT_STEP`, since larger ones shake the boxes by themselves.
     """
+    words: penalties.Penalty | None = None
+    """What the attackers' own messages are made to say, for attacks that are soft: one more penalty of that weight
+    (`robosac.attacks.words`). It needs a detector with a witness.
+    """
     bound: float = 1.0
     """So many times the attack's own bound."""
 
     def __post_init__(self) -> None:
         if self.softness and not isinstance(self.attack, IterativeAttack):
             raise ValueError(f"only an attack that optimises can be soft, not {self.name}")
+        if self.words is not None and not self.softness:
+            raise ValueError("only an attack that is soft pays for words")
         if self.bound != 1.0 and (self.attack is None or not self.attack.bounded):
             raise ValueError(f"only an attack with a bound can have another one, not {self.name}")
         if self.alibi is not None and not isinstance(self.attack, IterativeAttack):
@@ -115,6 +122,11 @@ class Campaign:
     def remembers(self) -> bool:
         """Whether what it does in a frame depends on earlier ones; see `Attack.remembers`."""
         return bool(self.softness) or (self.attack is not None and self.attack.remembers)
+
+    @property
+    def hears(self) -> bool:
+        """Whether it reads what each message says by itself; see `Attack.hears`."""
+        return self.words is not None or (self.attack is not None and self.attack.hears)
 
     @property
     def needs(self) -> tuple[str, ...]:
@@ -151,6 +163,8 @@ class Campaign:
             If an attacker has no message in the frame.
         NoGeometry
             If the attack or its alibi needs boxes that the detector does not show.
+        NoWitness
+            If it needs a witness that the detector does not have.
         """
         acting = list(self.schedule(frame, sorted(attackers)))
         if not acting or (self.attack is None and self.pose is None):
@@ -168,6 +182,8 @@ class Campaign:
             poses={name: message.pose for name, message in met.items()},
             tensor=lambda message: detector.attack_surface(ego, {"": message}).messages[""],
         )
+        if self.hears:
+            known = replace(known, hearing=Hearing.of(detector.info, ego, surface.messages, known.poses))
         tensors = self._attacked(surface, acting, rng, known)
         attacking = {name: detector.perturbed(sent[name], tensor) for name, tensor in tensors.items()}
         return {**sent, **attacking} if self.pose is not None else attacking
@@ -192,7 +208,8 @@ class Campaign:
 
     def _paid(self, surface: AttackSurface, situation: Situation) -> Term:
         def paid(sent: Tensors) -> torch.Tensor:
-            each = [penalty(situation, surface, sent) for penalty in penalties.PENALTIES]
+            due = [*penalties.PENALTIES, *([] if self.words is None else [self.words])]
+            each = [penalty(situation, surface, sent) for penalty in due]
             return self.softness * torch.stack(each).sum()
 
         return paid
@@ -219,6 +236,11 @@ def lacking(attack: Attack | Campaign | None, detector: Preparer) -> str | None:
         return f"the detector {name} cannot be used in scenes with the attack {campaign.name!r}: it {missing}"
     if campaign.attack is None or not isinstance(detector, Detector):
         return None
+    if campaign.hears and detector.info.witness is None:
+        return (
+            f"{campaign.name} cannot attack the detector {name}: it reads testimony, and no witness lies beside the "
+            "detector's weights (robosac witness makes one)"
+        )
     surface = detector.attack_surface(blank(detector.info, "ego"), {"a": blank(detector.info, "teammate")})
     missing = lacks(surface, GeometricSurface, dict.fromkeys(campaign.needs))
     return f"{campaign.name} cannot attack the detector {name}: its attack surface {missing}" if missing else None
@@ -233,6 +255,8 @@ BEHAVIOURS: Mapping[str, Mapping[str, Any]] = {
     "false-pose": {"pose": false_pose},
     "soft": {"softness": 1.0},
     "soft3": {"softness": 3.0},
+    "denying": {"softness": 1.0, "words": words.denying},
+    "vouching": {"softness": 1.0, "words": words.vouching},
     "double": {"bound": 2.0},
 }
 """All behaviours by name: what each sets of a `Campaign`."""

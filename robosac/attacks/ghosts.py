@@ -10,7 +10,9 @@ import numpy as np
 from robosac.attacks.objects import OnObjects, Scope
 from robosac.attacks.places import Followed, advanced, any_places, lane_places, path_places
 from robosac.attacks.situation import Lie, Situation
+from robosac.attacks.words import hearing_in
 from robosac.boxes import FloatArray
+from robosac.defenses.group_testing.claims import Claims
 
 AREA_M = 30.0
 """A made-up object that is farther than this from the ego along an axis is given up, and another one is made up."""
@@ -50,13 +52,35 @@ class Ghost(OnObjects):
             if number not in around:
                 places = taken.free(self.places(situation, rng), list(around.values()))
                 if len(places):
-                    around[number] = places[rng.integers(len(places))][:5]
+                    around[number] = places[self.choose(scope, places, rng)][:5]
                     standing[number] = situation.in_world(around[number][None])[0]
         return [Lie("ghost", box, number) for number, box in sorted(around.items())]
 
     def places(self, situation: Situation, rng: np.random.Generator) -> FloatArray:  # noqa: ARG002
         """Where one might stand, free or not: (n, 5+), ego frame."""
         return lane_places(situation.truth)
+
+    def choose(self, scope: Scope, places: FloatArray, rng: np.random.Generator) -> int:  # noqa: ARG002
+        """Where one stands of free places (n, 5+): the number of the place; by default any."""
+        return int(rng.integers(len(places)))
+
+
+@dataclass(frozen=True)
+class GhostHidden(Ghost):
+    """One car that does not exist, parked in the free place of `Ghost` that honest messages deny least.
+
+    It is the one where the sum of L over the ego and all honest teammates is highest, each within +-6, as the defence
+    would look it up. So it often stands where few can see.
+    """
+
+    name: ClassVar[str] = "ghost-hidden"
+    hears: ClassVar[bool] = True
+
+    def choose(self, scope: Scope, places: FloatArray, rng: np.random.Generator) -> int:  # noqa: ARG002
+        """Where the sum is highest."""
+        said = hearing_in(scope.situation).benign
+        honest = said.of([name for name in said.agents if name not in scope.attackers])
+        return int(Claims.of(places, honest).likelihood.sum(axis=0).argmax())
 
 
 @dataclass(frozen=True)

@@ -9,6 +9,7 @@ from typing import Any, Literal
 import numpy as np
 import torch
 
+from robosac.attacks.hearing import Hearing
 from robosac.boxes import FloatArray, from_world, to_world
 from robosac.detectors.base import Message
 
@@ -58,6 +59,10 @@ class Situation:
     """Gives messages of another scene; None where there is none."""
     tensor: Callable[[Message], torch.Tensor] | None = None
     """Turns a message into what an attack surface shows of it; None where no detector is at hand."""
+    hearing: Hearing | None = None
+    """What each message says by itself; None unless the attack asks for it (`robosac.attacks.Attack.hears`), or where
+    the detector has no witness.
+    """
     lies: list[Lie] = field(default_factory=list)
     """What the attack says that it lies about in this frame."""
     _known: dict[Hashable, Any] = field(default_factory=dict)

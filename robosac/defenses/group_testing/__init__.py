@@ -2,8 +2,9 @@
 
 from __future__ import annotations
 
+from robosac.defenses.group_testing.calibration import Calibration
 from robosac.defenses.group_testing.defense import GroupTesting, GroupTestingSettings
-from robosac.defenses.group_testing.model import OPEN, Calibration, CalibrationError, EvidenceModel
+from robosac.defenses.group_testing.model import OPEN, CalibrationError, EvidenceModel
 from robosac.defenses.group_testing.posterior import Hazards
 
 __all__ = [

@@ -11,14 +11,16 @@ from dataclasses import dataclass
 
 import numpy as np
 
-from robosac.boxes import FloatArray, IntArray
+from robosac.boxes import FloatArray
 from robosac.defenses.group_testing.distribution import BoolArray
 from robosac.testimony import Testimony
 
 SUPPORTS = 3.0
 """An agent supports a place from this L on."""
-DENIES = -4.0
+DENIES = -3.0
 """An agent denies a place from this L on downwards."""
+EGO_KNOWS = -5.5
+"""Where the ego's own L is so low, whoever supports a vehicle is wrong: nobody else has a part in what the ego saw."""
 WEIGHTY = 6.0
 """Testimony of several agents decides from this sum of L on, in either direction."""
 CONFLICT_OWN, CONFLICT_SUM = 4.5, 10.0
@@ -55,6 +57,10 @@ class Claims:
         kept = [i for i, name in enumerate(self.witnesses) if name not in agents]
         return Claims(self.boxes, tuple(self.witnesses[i] for i in kept), self.likelihood[kept])
 
+    def of_boxes(self, which: BoolArray) -> Claims:
+        """Some of the boxes (n,)."""
+        return Claims(self.boxes[which], self.witnesses, self.likelihood[:, which])
+
     @property
     def supporting(self) -> BoolArray:
         """Who (witnesses, n) supports which box."""
@@ -65,42 +71,32 @@ class Claims:
         """Who (witnesses, n) denies which box."""
         return self.likelihood <= DENIES
 
-    def conflicts(self, witness: str, unheard: Collection[str]) -> int:
-        """Boxes over which a witness says the contrary of all others that are heard: its L is at least 4.5 one way, and
-        the sum of theirs 10 the other.
+    def in_conflict(self, witness: str, unheard: Collection[str]) -> BoolArray:
+        """Boxes (n,) over which a witness says the contrary of all others that are heard: its L is at least 4.5 one
+        way, and the sum of theirs 10 the other.
         """
         own = self.likelihood[self.witnesses.index(witness)]
         others = self.without({witness, *unheard}).likelihood.sum(axis=0)
         against = (np.sign(own) != np.sign(others)) & (np.abs(own) >= CONFLICT_OWN) & (np.abs(others) >= CONFLICT_SUM)
-        return int(against.sum())
+        return np.asarray(against, dtype=bool)
 
-    def contradicted(self, suspect: str | None = None, weighty: float = WEIGHTY) -> BoolArray:
+    def contradicted(self, suspects: Collection[str] | None = None, weighty: float = WEIGHTY) -> BoolArray:
         """Which boxes (n,) are contradicted, whoever supports them.
 
-        The sum of L without the suspect (by default without the teammate who supports a box most) is at most
-        ``-weighty``, and
-        the ego denies it, or two teammates do. What the ego itself supports is not contradicted.
+        Those with an L of -5.5 or less by the ego are. So are those that the ego denies, or two teammates, if the sum
+        of L without the suspects is at most ``-weighty``; by default without the teammate who supports a box most. What
+        the ego itself supports is not contradicted.
         """
-        heard = self if suspect is None else self.without([suspect])
+        heard = self if suspects is None else self.without(suspects)
         rest = heard.likelihood.sum(axis=0)
-        if suspect is None:
+        if suspects is None:
             rest = rest - np.maximum(self.likelihood[1:].max(axis=0, initial=0.0), 0.0)
-        denied: BoolArray = (rest <= -weighty) & two_witnesses(heard.denying) & ~self.supporting[0]
-        return denied
+        denied = (rest <= -weighty) & two_witnesses(heard.denying) & ~self.supporting[0]
+        known: BoolArray = denied | (self.likelihood[0] <= EGO_KNOWS)
+        return known
 
 
 def two_witnesses(speaking: BoolArray) -> BoolArray:
     """Which places (n,) the ego, or two teammates, speak of: ``speaking`` (witnesses, n), the ego first."""
     enough: BoolArray = speaking[0] | (speaking[1:].sum(axis=0) >= 2)
     return enough
-
-
-def peaks(total: FloatArray, among: BoolArray) -> IntArray:
-    """Rows and columns (n, 2) of the places ``among`` those of a map (H, W) that are the greatest of the 5 x 5 around
-    them.
-    """
-    rows, columns = np.nonzero(among)
-    padded = np.pad(total, 2, constant_values=-np.inf)
-    around = np.lib.stride_tricks.sliding_window_view(padded, (5, 5))[rows, columns].max(axis=(1, 2), initial=-np.inf)
-    greatest = total[rows, columns] >= around
-    return np.stack([rows[greatest], columns[greatest]], axis=1)

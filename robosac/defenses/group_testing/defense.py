@@ -10,13 +10,15 @@ import numpy as np
 from pydantic import Field
 
 from robosac.consensus import DEFAULT_THRESHOLD
+from robosac.defenses.group_testing.calibration import Calibration
 from robosac.defenses.group_testing.candidates import unresolved
 from robosac.defenses.group_testing.evidence import Evidence
+from robosac.defenses.group_testing.findings import Findings
 from robosac.defenses.group_testing.frame import JudgedFrame
 from robosac.defenses.group_testing.inspection import Inspection
 from robosac.defenses.group_testing.knowledge import Knowledge, remember
 from robosac.defenses.group_testing.memory import Memory
-from robosac.defenses.group_testing.model import LIE, Calibration, CalibrationError, EvidenceModel
+from robosac.defenses.group_testing.model import LIE, CalibrationError, EvidenceModel
 from robosac.defenses.group_testing.posterior import Hazards, Posterior
 from robosac.defenses.protocol import Conversation, Reference, State, named_in, trusted_in
 from robosac.defenses.sampling import MAX_BUDGET
@@ -41,6 +43,7 @@ class GroupTestingSettings(DefenseSettings):
     hijack: float = Field(0.003, ge=0, le=0.5, description="Per frame, that a benign teammate becomes an attacker.")
     recovery: float = Field(0.001, ge=0, le=0.5, description="Per frame, that an attacker becomes benign.")
     kind_change: float = Field(0.02, ge=0, le=0.5, description="Per frame, that the kind of attack changes.")
+    budgets: ClassVar[tuple[str, ...]] = ("first_budget", "budget")
     first_budget: int = Field(7, ge=1, le=MAX_BUDGET, description="Most hypotheses in the first frame.")
     budget: int = Field(4, ge=1, le=MAX_BUDGET, description="Most hypotheses in each later frame.")
     naming_bound: float = Field(0.99, ge=0.5, lt=1, description="Probability above which an attacker is named.")
@@ -108,13 +111,15 @@ class GroupTesting:
     3. A decoded subset is evidence by what it keeps, moves and adds compared with the ego alone and with each part and
        superset decoded in this frame (`geometry.measure`), and by what comes and goes in it since the frame before, if
        it was decoded there too (`geometry.changes`). A repeated test weighs less. So does what speaks against somebody
-       where the ego itself is less steady than where the likelihoods were calibrated (`Steadiness.trust`).
+       in the first frame, and where the ego itself is less steady than where the likelihoods were calibrated
+       (`Steadiness.trust`). How much less honest messages agree in this world is learned (`Strangeness`).
     4. Where there is testimony, up to ``inspections`` further subsets are decoded: to ask those again that are left
        out, and to see without whom an object is right that is wrong in the answer (`Inspection.next_test`). Lies raise
        a teammate's level (`lies.RULES`) and its probability.
     5. The answer is the decoded subset of greatest utility that is in consensus with the ego, or all trusted. Each box
        of it is judged by testimony: left out, repaired, or kept with its status (`standing.judge`).
-    6. A teammate is named (``distrusted``) once it lied about objects too often and its probability is at least a half;
+    6. A teammate is named (``distrusted``) once it lied about objects too often (`Lies.guilt`; where the ego is
+       unsteady, twice as much) and its probability is at least a half;
        or once its probability passes ``naming_bound``, at least two different subsets speak against it, and its own
        fusions are much less steady than the ego's perception (`Steadiness.names`). It is cleared when the probability
        falls below a half.
@@ -185,12 +190,13 @@ class GroupTesting:
         first = memory.frame == 0
         if not first:
             posterior.step(Hazards(settings.hijack, settings.recovery, settings.kind_change))
+            memory.strangeness.step()
         posterior.regroup(unresolved(posterior.marginals()))
         known = Knowledge(self.model, posterior, memory)
         evidence = self.evidence(known, compare_frames=settings.compare_frames is not False)
         judged = JudgedFrame(known, evidence, tuple(team), frozenset(trusted_in(state)))
         named = frozenset(named_in(state) or ())
-        inspection = Inspection(known, memory.lies, tuple(team), named, settings.keep_contradicted)
+        inspection = Inspection(Findings(known, memory.lies, tuple(team), named), settings.keep_contradicted)
         passes, inspections = settings.first_budget if first else settings.budget, settings.inspections
         while True:
             subset = judged.next_test(rng, passes) if passes > 0 else None

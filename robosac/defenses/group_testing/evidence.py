@@ -16,7 +16,7 @@ from robosac.defenses.group_testing.distribution import BoolArray
 from robosac.defenses.group_testing.geometry import MIN_WITNESSES, PairMeasure, crowd
 from robosac.defenses.group_testing.knowledge import Knowledge
 from robosac.defenses.group_testing.memory import CHANGE_REPEAT, EGO_REPEAT, PAIR_REPEAT, WORTH_KEEPING, keys
-from robosac.defenses.group_testing.model import CLEAN, pair_bin
+from robosac.defenses.group_testing.model import CELLS, CLEAN, LIE
 from robosac.defenses.group_testing.objects import Shown
 from robosac.defenses.protocol import Hypothesis, Outcome
 
@@ -29,7 +29,7 @@ _TINY = 1e-300
 
 @dataclass(frozen=True)
 class _Finding:
-    """One piece of evidence: a test of ``a`` (and ``d`` beside it), and how likely its outcome was.
+    """One piece of evidence: a test of ``a`` (and ``d`` beside it), and how likely its outcome was in each world.
 
     ``test`` is ``ego`` (d beside the ego alone), ``pair`` (beside a), or ``change`` (d beside itself in the frame
     before).
@@ -38,7 +38,7 @@ class _Finding:
     test: str
     a: Hypothesis
     d: Hypothesis
-    log_likelihood: FloatArray
+    likelihood: FloatArray
     weight: float
     values: Mapping[str, Any]
 
@@ -157,28 +157,41 @@ class Evidence:
             changed = self.changes(before, now, lambda rows: shown.stands(_in_frame(rows, pose)))
         likelihood = self._known.model.change(len(outcome.teammates), boxes, changed)
         values = {"boxes": boxes, "changes": changed}
-        return [_Finding("change", (), outcome.teammates, np.log(likelihood), 1.0, values)]
+        return [_Finding("change", (), outcome.teammates, likelihood, 1.0, values)]
 
     def _finding(
         self, a: Hypothesis, d: Hypothesis, pair: PairMeasure, weight: float, values: Mapping[str, Any]
     ) -> _Finding:
-        table = self._known.model.tables(np.array([len(a)]), np.array([len(d)]))[0]
+        likelihood = self._known.model.pair(len(a), len(d), pair)
         values = {**values, "loss": round(pair.loss, 4), "novelty": pair.novelty}
         weight *= DEPENDENCE
-        return _Finding("pair" if a else "ego", a, d, np.log(table[:, pair_bin(pair)]), weight, values)
+        return _Finding("pair" if a else "ego", a, d, likelihood, weight, values)
 
     def _apply(self, finding: _Finding) -> None:
         posterior = self._known.posterior
         rows = self._known.rows([finding.a, finding.d])
         before = posterior.marginals()
-        posterior.update(rows[0], rows[1], self._weight(finding, rows) * finding.log_likelihood)
+        cells = posterior.cells(*posterior.masks(rows)[:, :, None].swapaxes(0, 1))[0]
+        strangeness = self._known.memory.strangeness
+        likelihood = self._neutral(strangeness.weights @ finding.likelihood, cells)
+        weight = self._weight(finding, rows, cells, likelihood)
+        strangeness.learn(finding.likelihood, cells, weight)
+        posterior.update(rows[0], rows[1], weight * np.log(likelihood))
         self._keep(finding, _log_odds(posterior.marginals()) - _log_odds(before))
 
-    def _weight(self, finding: _Finding, rows: BoolArray) -> float:
+    def _neutral(self, likelihood: FloatArray, cells: FloatArray) -> FloatArray:
+        """The likelihoods, with those of liars as they are on average for the honest: what tells honest messages from
+        each other tells nothing about liars.
+        """
+        kinds = self._known.model.kinds
+        if LIE in kinds and (clean := float(cells[:CLEAN].sum())) > _TINY:
+            first = CLEAN + CELLS * kinds.index(LIE)
+            likelihood[first : first + CELLS] = float(cells[:CLEAN] @ likelihood[:CLEAN]) / clean
+        return likelihood
+
+    def _weight(self, finding: _Finding, rows: BoolArray, cells: FloatArray, likelihood: FloatArray) -> float:
         """What a finding counts: a repetition little, and one of a large subset less."""
-        posterior, memory = self._known.posterior, self._known.memory
-        cells = posterior.cells(*posterior.masks(rows)[:, :, None].swapaxes(0, 1))[0]
-        likelihood = np.exp(finding.log_likelihood)
+        memory = self._known.memory
         clean, attacked = (
             float(cells[part] @ likelihood[part]) / max(float(cells[part].sum()), _TINY)
             for part in (slice(CLEAN), slice(CLEAN, None))

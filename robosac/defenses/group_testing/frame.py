@@ -11,11 +11,14 @@ from robosac.answers import Reason, Source, Verdict
 from robosac.defenses.group_testing import choice
 from robosac.defenses.group_testing.candidates import WITNESSES, candidates, cleared
 from robosac.defenses.group_testing.evidence import Evidence
+from robosac.defenses.group_testing.findings import CALM
 from robosac.defenses.group_testing.inspection import Inspection
 from robosac.defenses.group_testing.knowledge import Knowledge, remember
 from robosac.defenses.group_testing.posterior import EXACT
 from robosac.defenses.protocol import Decision, Hypothesis, Outcome, Rejection, explain_rejections
 
+UNSTEADY_LEVELS = 2.0
+"""Where the ego itself is unsteady it takes so many times as many lies to be named."""
 TRUSTED_BELOW = 0.1
 """Largest suspicion of a teammate on the trust list."""
 CLEARED_BELOW = 0.5
@@ -111,7 +114,7 @@ class JudgedFrame:
         tests and its own fusions are too unsteady.
         """
         memory = self._known.memory
-        if memory.lies.names(name):
+        if memory.lies.guilt(name) >= (1.0 if memory.steadiness.calm >= CALM else UNSTEADY_LEVELS):
             return True
         return certain and memory.subsets_against(name) >= SUBSETS_TO_NAME and memory.steadiness.names(name)
 

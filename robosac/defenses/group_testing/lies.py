@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Mapping
+from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, field
 from typing import Any
 
@@ -23,18 +23,22 @@ class Rule:
     most: int
     drift: float
     names: float
-    """Level from which on it is named."""
+    """Level from which on it is named, if it is named for this at all."""
     weights: tuple[tuple[float, float], ...]
     """At each of these levels, when first reached, the logarithm of the likelihood ratio that it adds to suspicion."""
+    malice: bool = True
+    """Whether somebody is named for it; else it has innocent causes, too."""
 
 
 RULES: Mapping[str, Rule] = {
     "ghost": Rule(1.5, 1, 0.5, 3.0, ((1.0, 5.0), (2.0, 2.0), (3.0, 3.0))),
     "gone": Rule(1.5, 1, 0.5, 3.0, ((1.0, 2.5), (2.0, 3.0), (3.0, 4.0))),
     "moved": Rule(1.0, 1, 0.3, 2.0, ((0.7, 2.0), (1.4, 3.0), (2.1, 4.0))),
+    "late": Rule(1.0, 1, 0.3, 2.0, ((0.7, 2.0), (1.4, 3.0), (2.1, 4.0)), malice=False),
+    "veiled": Rule(1.25, 1, 0.5, 3.0, ((0.75, 2.5), (1.5, 2.5), (2.25, 4.0))),
     "conflict": Rule(1.0, 3, 0.5, 6.0, ((3.0, 2.0), (4.5, 4.0), (6.0, 4.0))),
 }
-QUIET_FRAMES = 6
+QUIET_FRAMES = 9
 LONGEST_QUIET = 24
 """A place where something seemed wrong, but nobody had the effect, is left alone for so many frames, at first and at
 most.
@@ -44,6 +48,10 @@ RECENT_FRAMES = 3
 QUIET_M = 3.0
 """Places nearer than this are one, metres."""
 MOST_QUIET = 32
+CONFLICT_FRAMES = 50
+"""Of a place over which somebody differs from all others it is counted once in so many frames: an honest mistake about
+one thing stays where it is.
+"""
 
 
 @dataclass
@@ -54,6 +62,9 @@ class Lies:
     """By teammate and kind: the level, and the highest since it was 0."""
     quiet: list[tuple[float, float, int, int]] = field(default_factory=list)
     """Places left alone: x, y (world, metres), the frame of the session until which, and for how many frames."""
+    conflicts: dict[str, list[tuple[float, float, int]]] = field(default_factory=dict)
+    """By teammate: places over which it differed from all others: x, y (world, metres), and the frame of the session.
+    """
     left_out: dict[str, int] = field(default_factory=dict)
     """By teammate: the frame of the session in which an answer was last decoded without it, to see what it does."""
 
@@ -76,13 +87,29 @@ class Lies:
             del self.levels[teammate]
         return weight
 
-    def names(self, teammate: str) -> bool:
-        """Whether it lied too often."""
-        return any(level >= RULES[kind].names for kind, (level, _) in self.levels.get(teammate, {}).items())
+    def new_conflicts(self, teammate: str, places: Sequence[FloatArray], frame: int) -> int:
+        """How many of the places (2,), world, over which it differs from all others are not known yet; as many as count
+        are known from now on.
+        """
+        known = [entry for entry in self.conflicts.get(teammate, ()) if frame - entry[2] < CONFLICT_FRAMES]
+        new = 0
+        for place in places:
+            if new < RULES["conflict"].most and not any(_near(x, y, place) for x, y, _ in known):
+                known.append((round(float(place[0]), 2), round(float(place[1]), 2), frame))
+                new += 1
+        self.conflicts.pop(teammate, None)
+        if known:
+            self.conflicts[teammate] = known[-MOST_QUIET:]
+        return new
 
     def worst(self, teammate: str) -> float:
-        """The level of the kind nearest to being named for, as a share."""
+        """The level of the kind nearest to being named for, as a share, whether or not somebody is named for it."""
         return max((level / RULES[k].names for k, (level, _) in self.levels.get(teammate, {}).items()), default=0.0)
+
+    def guilt(self, teammate: str) -> float:
+        """The same of the kinds that somebody is named for: at 1 it is."""
+        known = self.levels.get(teammate, {}).items()
+        return max((level / RULES[k].names for k, (level, _) in known if RULES[k].malice), default=0.0)
 
     def is_quiet(self, place: FloatArray, frame: int) -> bool:
         """Whether a place (2,), world, is left alone."""
@@ -98,6 +125,7 @@ class Lies:
     def forget(self, teammate: str) -> None:
         """It left."""
         self.levels.pop(teammate, None)
+        self.conflicts.pop(teammate, None)
         self.left_out.pop(teammate, None)
 
     def to_state(self) -> dict[str, Any]:
@@ -105,6 +133,7 @@ class Lies:
         return {
             "levels": {name: {kind: list(pair) for kind, pair in of.items()} for name, of in self.levels.items()},
             "quiet": [list(entry) for entry in self.quiet],
+            "conflicts": {name: [list(entry) for entry in of] for name, of in self.conflicts.items()},
             "left_out": self.left_out,
         }
 
@@ -114,6 +143,10 @@ class Lies:
         return cls(
             {name: {kind: (float(a), float(b)) for kind, (a, b) in of.items()} for name, of in state["levels"].items()},
             [(float(x), float(y), int(until), int(frames)) for x, y, until, frames in state["quiet"]],
+            {
+                str(name): [(float(x), float(y), int(frame)) for x, y, frame in of]
+                for name, of in state.get("conflicts", {}).items()  # not in the states of older versions
+            },
             {str(name): int(frame) for name, frame in state["left_out"].items()},
         )
 

@@ -13,6 +13,7 @@ import numpy as np
 from robosac.boxes import FloatArray
 from robosac.defenses.group_testing.lies import Lies
 from robosac.defenses.group_testing.steadiness import Steadiness
+from robosac.defenses.group_testing.strangeness import Strangeness
 
 REPEAT_MEMORY = 60
 """Frames after which a test counts as new."""
@@ -66,6 +67,7 @@ class Memory:
     lies: Lies = field(default_factory=Lies)
     """About objects."""
     steadiness: Steadiness = field(default_factory=Steadiness)
+    strangeness: Strangeness = field(default_factory=Strangeness)
 
     def weights(self, tests: KeyArray, rho: float) -> FloatArray:
         """Expected weights of tests (n,): ``1 - rho ** k`` if a test was made k frames ago already, else 1."""
@@ -134,6 +136,7 @@ class Memory:
             "shown_in": self.shown_in,
             "lies": self.lies.to_state(),
             "steadiness": self.steadiness.to_state(),
+            "strangeness": self.strangeness.to_state(),
         }
 
     @classmethod
@@ -149,4 +152,5 @@ class Memory:
             shown_in=int(state.get("shown_in", 0)),
             lies=Lies.from_state(state["lies"]) if "lies" in state else Lies(),
             steadiness=Steadiness.from_state(state["steadiness"]) if "steadiness" in state else Steadiness(),
+            strangeness=Strangeness.from_state(state["strangeness"]) if "strangeness" in state else Strangeness(),
         )

@@ -2,20 +2,16 @@
 
 from __future__ import annotations
 
-import json
-from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
 from functools import cached_property
-from pathlib import Path
-from typing import Any
 
 import numpy as np
 
 from robosac.boxes import FloatArray, IntArray
 from robosac.budget import DomainError
 from robosac.defenses.group_testing.geometry import PairMeasure
+from robosac.defenses.group_testing.strangeness import STRETCHES, stretched
 
-FORMAT = 3
 OPEN = "open"
 """The kind of attack that nothing was calibrated for: any outcome of an attacked fusion is as likely as any other."""
 LIE = "lie"
@@ -139,12 +135,45 @@ class EvidenceModel:
         """Tables (n, CLEAN + 3 K, BINS) for pairs of these sizes (n,) and (n,); d at least 1."""
         return self._by_size[size_row(a, d)]
 
-    def change(self, size: int, boxes: int, changes: int) -> FloatArray:
-        """Likelihoods (CLEAN + 3 K,), by the rows of `pairs`, of so many changes in a fusion of this many teammates in
-        which there are so many boxes. The teammates are d; nobody is in a.
+    @cached_property
+    def _stretched_pairs(self) -> FloatArray:
+        """`pairs` in each world of `STRETCHES`: what honest messages show is stretched, (worlds, ...)."""
+        honest = [*range(CLEAN), *(row for row in range(CLEAN, len(self.pairs)) if self._kind(row) == LIE)]
+        grid = self.pairs[honest].reshape(len(honest), -1, LOSS_BINS, NOVELTY_BINS)
+        worlds = np.repeat(self.pairs[None], len(STRETCHES), axis=0)
+        for world, stretch in zip(worlds, STRETCHES, strict=True):
+            moved = np.einsum(
+                "rsab,ac,bd->rscd", grid, stretched(LOSS_EDGES, stretch), stretched(NOVELTY_EDGES, stretch)
+            )
+            world[honest] = moved.reshape(len(honest), -1, BINS)
+        return worlds
+
+    @cached_property
+    def _stretched_changes(self) -> FloatArray:
+        """`changes` in each world, likewise."""
+        honest = [0, *(row for row, kind in enumerate(self.kinds, start=1) if kind == LIE)]
+        worlds = np.repeat(self.changes[None], len(STRETCHES), axis=0)
+        for world, stretch in zip(worlds, STRETCHES, strict=True):
+            world[honest] = self.changes[honest] @ stretched(CHANGE_EDGES, stretch)
+        return worlds
+
+    def _kind(self, row: int) -> str:
+        """The kind of attack that an attacked row of `pairs` is about."""
+        return self.kinds[(row - CLEAN) // CELLS]
+
+    def pair(self, a: int, d: int, measured: PairMeasure) -> FloatArray:
+        """Likelihoods (worlds, CLEAN + 3 K) of what a pair of these sizes shows, d at least 1, in each of
+        `STRETCHES`.
         """
-        table = self.changes[:, min(size, CHANGE_SIZES) - 1, crowd_bin(boxes), change_bin(changes)]
-        return np.concatenate([np.repeat(table[:1], CLEAN), np.repeat(table[1:], CELLS)])
+        (row,) = size_row(np.array([a]), np.array([d])).tolist()
+        return self._stretched_pairs[:, :, row, pair_bin(measured)]
+
+    def change(self, size: int, boxes: int, changes: int) -> FloatArray:
+        """Likelihoods (worlds, CLEAN + 3 K), by the rows of `pairs`, of so many changes in a fusion of this many
+        teammates in which there are so many boxes. The teammates are d; nobody is in a.
+        """
+        table = self._stretched_changes[:, :, min(size, CHANGE_SIZES) - 1, crowd_bin(boxes), change_bin(changes)]
+        return np.concatenate([np.repeat(table[:, :1], CLEAN, axis=1), np.repeat(table[:, 1:], CELLS, axis=1)], axis=1)
 
     def change_information(self, sizes: IntArray, boxes: IntArray, cells: FloatArray) -> FloatArray:
         """Bits (n,) that fusions of so many teammates (n,) promise about who attacks, by what changed since the frame
@@ -182,89 +211,3 @@ def _entropy(p: FloatArray) -> FloatArray:
     """Sum of -p log2 p over the last axis."""
     bits: FloatArray = -np.einsum("...i,...i", p, np.log2(np.maximum(p, _TINY)))
     return bits
-
-
-@dataclass(frozen=True)
-class Calibration:
-    """The likelihoods of one detector, at several levels of pose error."""
-
-    detector: str
-    weights_digest: str
-    """SHA-256 of the weights file that it belongs to, hexadecimal."""
-    recipe: Mapping[str, Any]
-    """How it was made; JSON values."""
-    levels: tuple[EvidenceModel, ...]
-    """Ascending pose error."""
-    witnessed: bool = False
-    """Whether the detector has a witness, so that single objects can be judged; not kept in the file."""
-
-    def at(self, pose_error_m: float) -> EvidenceModel:
-        """The level with the least pose error not below this one, metres.
-
-        Raises
-        ------
-        CalibrationError
-            If it was calibrated at none so large.
-        """
-        for level in self.levels:
-            if level.pose_error_m >= pose_error_m:
-                return level
-        most = max((level.pose_error_m for level in self.levels), default=0.0)
-        raise CalibrationError(f"calibrated up to a pose error of {most:g} m, {pose_error_m:g} m is asked for")
-
-    def write(self, path: Path) -> None:
-        """Write as JSON."""
-        content = {
-            "format": FORMAT,
-            "detector": self.detector,
-            "weights_digest": self.weights_digest,
-            "recipe": dict(self.recipe),
-            "levels": [
-                {
-                    "pose_error_m": level.pose_error_m,
-                    "kinds": list(level.kinds),
-                    "pairs": _rounded(level.pairs),
-                    "changes": _rounded(level.changes),
-                }
-                for level in self.levels
-            ],
-        }
-        path.write_text(json.dumps(content) + "\n")
-
-    @classmethod
-    def read(cls, path: Path) -> Calibration:
-        """Read what `write` wrote.
-
-        Raises
-        ------
-        CalibrationError
-            If the file cannot be read or is no calibration.
-        """
-        try:
-            content = json.loads(path.read_text())
-            if content["format"] != FORMAT:
-                raise CalibrationError(f"format {content['format']!r} is unknown")
-            levels = [
-                EvidenceModel(
-                    float(level["pose_error_m"]),
-                    tuple(map(str, level["kinds"])),
-                    _normalised(level["pairs"]),
-                    _normalised(level["changes"]),
-                )
-                for level in content["levels"]
-            ]
-            levels.sort(key=lambda level: level.pose_error_m)
-            return cls(str(content["detector"]), str(content["weights_digest"]), content["recipe"], tuple(levels))
-        except (OSError, KeyError, TypeError, ValueError) as error:
-            raise CalibrationError(f"{path} is no calibration: {error}") from error
-
-
-def _rounded(table: FloatArray) -> Sequence[Any]:
-    values: Sequence[Any] = np.round(table, 6).tolist()
-    return values
-
-
-def _normalised(values: Sequence[Any]) -> FloatArray:
-    table = np.asarray(values, dtype=np.float64)
-    total: FloatArray = table / table.sum(axis=-1, keepdims=True)
-    return total

@@ -15,7 +15,7 @@ from functools import cached_property
 import numpy as np
 
 from robosac.boxes import FloatArray, IntArray, pairwise_iou
-from robosac.defenses.group_testing.claims import DENIES, SUPPORTS, WEIGHTY, Claims, peaks, two_witnesses
+from robosac.defenses.group_testing.claims import DENIES, SUPPORTS, WEIGHTY, Claims, two_witnesses
 from robosac.defenses.group_testing.distribution import BoolArray
 from robosac.defenses.protocol import Hypothesis
 from robosac.testimony import Testimony
@@ -23,6 +23,8 @@ from robosac.testimony import Testimony
 SHOWN_SCORE = 0.3
 """Boxes from this score on claim something."""
 CRISP_SCORE = 0.5
+OWN_DENIES = -4.0
+"""Whose own message denies a place so far is not to blame for a box there."""
 GONE_EFFECT = 1.5
 """A box is gone by somebody's fault if it had such a score, and has so much less now: faint ones come and go."""
 BLAMED_SUM = 8.0
@@ -31,6 +33,8 @@ PLACED_SCORE = 0.4
 """Boxes from this score on have to be in their place."""
 THERE_SCORE = 0.15
 """Where a box has this score or more, something is shown."""
+STANDING_SUM = 10.0
+"""A vehicle stands where the sum of L is so much."""
 CERTAIN = 4.0
 """From this L on, two teammates or the ego know that a vehicle stands in a place."""
 SAME_LIE_M = 3.0
@@ -58,6 +62,20 @@ class Lie:
     """``ghost``, ``gone`` or ``moved``."""
     place: FloatArray
     """(2,): ego frame, metres."""
+    veiled: bool = False
+    """Whether the message of whoever is behind it says the contrary of what it does: that a ghost is none, or that a
+    vehicle that it removes is there.
+    """
+
+    along: bool = False
+    """Whether a vehicle is moved along itself only, as by a message that is late."""
+
+    @property
+    def counts_as(self) -> str:
+        """What it is counted as, see `lies.RULES`."""
+        if self.along:
+            return "late"
+        return "veiled" if self.veiled else self.kind
 
 
 class Hearing:
@@ -76,12 +94,14 @@ class Hearing:
 
     @cached_property
     def standing(self) -> FloatArray:
-        """Places (k, 2) where a vehicle stands: the ego, or two teammates, say so, and all together without the one who
-        denies it most.
+        """Centres (k, 2) of vehicles that the ego, or two teammates, know of, and all together without the one who
+        denies them most. The surest come first; of one vehicle there may be many.
         """
         over = np.clip(self.heard.over_ego, -WEIGHTY, WEIGHTY)
         total = over.sum(axis=0) - np.minimum(over[1:].min(axis=0, initial=0.0), 0.0)
-        rows, columns = peaks(total, two_witnesses(over >= CERTAIN) & (total >= WEIGHTY)).T
+        rows, columns = np.nonzero(two_witnesses(over >= CERTAIN) & (total >= STANDING_SUM))
+        order = np.argsort(-total[rows, columns], kind="stable")
+        rows, columns = rows[order], columns[order]
         places = self.heard.ego_places()[rows, columns]
         supporting = (over[:, rows, columns] >= CERTAIN)[..., None]
         seen = np.where(supporting, self.heard.sighting(places).centre, 0.0).sum(axis=0)
@@ -108,44 +128,42 @@ class Shown:
         self.boxes = boxes
         self._hearing = hearing
         self._testimony = hearing.heard
-        self.claims = Claims.of(boxes, hearing.heard)
+        self.everybody = Claims.of(boxes, hearing.everybody)
+        """What everybody says of the boxes, heard or not."""
+        self.claims = self.everybody.without(set(hearing.everybody.agents) - set(hearing.heard.agents))
 
     @cached_property
     def _away(self) -> FloatArray:
-        """How far (witnesses, n) each box is from where a witness sees the vehicle, in units of what it may err; not a
-        number where it does not support the box.
+        """How far (2, witnesses, n) each box is along and across itself from where a witness sees the vehicle, in units
+        of what it may err; not a number where it does not support the box.
         """
         seen = self._testimony.sighting(self.boxes[:, :2])
         off = seen.centre - self.boxes[None, :, :2]
         cos, sin = np.cos(self.boxes[:, 4]), np.sin(self.boxes[:, 4])
         along, across = off[..., 0] * cos + off[..., 1] * sin, off[..., 1] * cos - off[..., 0] * sin
-        away = np.maximum(np.abs(along) / (seen.along + SLACK_ALONG_M), np.abs(across) / (seen.across + SLACK_ACROSS_M))
-        return np.where(self.claims.supporting, away, np.nan)
+        away = np.stack([along / (seen.along + SLACK_ALONG_M), across / (seen.across + SLACK_ACROSS_M)])
+        return np.where(self.claims.supporting, np.abs(away), np.nan)
 
-    def away(self, suspect: str | None = None) -> FloatArray:
-        """How far (n,) each box is from where witnesses see it, the lower median of at least two; 0 with fewer. The
-        suspect is no witness.
+    def away(self, suspects: Collection[str] = (), *, across: bool = False) -> FloatArray:
+        """How far (n,) each box is from where witnesses see it, in either direction or ``across`` itself, the lower
+        median of at least two; 0 with fewer. The suspects are no witnesses.
         """
-        others = np.array([name != suspect for name in self.claims.witnesses])
-        away = np.sort(np.where(np.isnan(self._away[others]), np.inf, self._away[others]), axis=0)
+        others = np.array([name not in suspects for name in self.claims.witnesses])
+        away = self._away[1:, others].max(axis=0) if across else self._away[:, others].max(axis=0)
+        away = np.sort(np.where(np.isnan(away), np.inf, away), axis=0)
         seeing = np.isfinite(away).sum(axis=0)
         middle: FloatArray = away[np.maximum(seeing - 1, 0) // 2, np.arange(len(self.boxes))]
         return np.where(seeing >= 2, middle, 0.0)
 
-    @cached_property
-    def _everybody(self) -> Claims:
-        return Claims.of(self.boxes, self._hearing.everybody)
-
-    def own(self, suspect: str | None) -> FloatArray:
-        """What a suspect's own message says of each box (n,); 0 without a suspect."""
-        if suspect is None:
-            return np.zeros(len(self.boxes))
-        own: FloatArray = self._everybody.likelihood[self._everybody.witnesses.index(suspect)]
+    def own(self, suspects: Sequence[str]) -> FloatArray:
+        """What the suspects' own messages say of each box: (suspects, n)."""
+        own: FloatArray = self.everybody.likelihood[[self.everybody.witnesses.index(name) for name in suspects]]
         return own
 
     def goes_with(self, suspect: str, lie: Lie) -> bool:
         """Whether a suspect's own message says what a lie says."""
-        said = self._hearing.everybody.of([suspect]).likelihood(lie.place[None])[0, 0]
+        everybody = self._hearing.everybody
+        said = everybody.likelihood(lie.place[None])[everybody.agents.index(suspect), 0]
         return bool(said <= DENIES if lie.kind == "gone" else said >= SUPPORTS)
 
     @cached_property
@@ -161,13 +179,17 @@ class Shown:
     @cached_property
     def holes(self) -> FloatArray:
         """Places (k, 2) where a vehicle stands by testimony, and nothing is shown."""
-        places = self._hearing.standing
-        return places[~self._covered(places)]
+        left = self._hearing.standing
+        left, found = left[~self._covered(left)], []
+        while len(left):
+            found.append(left[0])
+            left = left[np.hypot(*(left - left[0]).T) > REACH_M]
+        return np.array(found).reshape(-1, 2)
 
     def stands(self, places: FloatArray) -> BoolArray:
         """Whether somebody supports a vehicle at places (n, 2) who is not among those fused."""
-        others = self._testimony.of([name for name in self._testimony.agents if name not in self.teammates])
-        supported: BoolArray = np.atleast_1d((others.likelihood(places) >= SUPPORTS).any(axis=0))
+        others = [i for i, name in enumerate(self._testimony.agents) if name not in self.teammates]
+        supported: BoolArray = np.atleast_1d((self._testimony.likelihood(places)[others] >= SUPPORTS).any(axis=0))
         return supported
 
     def vouched(self, joining: Hypothesis) -> BoolArray:
@@ -202,31 +224,27 @@ class Shown:
         return covered
 
 
-def effects(joined: Shown, without: Shown, suspect: str | None) -> list[Lie]:
-    """What is wrong in a fusion, and is not in the same fusion without the suspect.
+def effects(joined: Shown, without: Shown, suspects: Sequence[str]) -> list[Lie]:
+    """What is wrong in a fusion, and is not in the same fusion without the suspects.
 
-    - ``ghost``: a contradicted box whose odds without it are less by a factor of e;
-    - ``gone``: a box without it where the others support a vehicle, and nothing is shown with it;
-    - ``moved``: a box that is out of place, and without it less so.
-
-    Where the suspect's own message speaks for what the others say, it is no lie of its own: fusion makes such errors by
-    itself, above all in places that a detector was not made for.
+    - ``ghost``: a contradicted box whose odds without them are less by a factor of e;
+    - ``gone``: a box without them where the others support a vehicle, and nothing is shown with them;
+    - ``moved``: a box that is out of place, and without them less so. If it is so along itself only, it may be late.
     """
-    found = []
-    ghosts = joined.claims.contradicted(suspect, BLAMED_SUM) & (joined.boxes[:, 5] >= CRISP_SCORE)
-    ghosts &= joined.own(suspect) > DENIES
-    grown = joined.boxes[ghosts]
+    ghosts = joined.claims.contradicted(suspects, BLAMED_SUM) & (joined.boxes[:, 5] >= CRISP_SCORE)
+    grown, own = joined.boxes[ghosts], joined.own(suspects)[:, ghosts].max(axis=0)
     drop = joined.odds_at(grown[:, :2]) - without.odds_at(grown[:, :2])
-    found += [Lie("ghost", box[:2]) for box in grown[drop >= EFFECT]]
-    lost = without.boxes[gone(joined, without, suspect)]
+    found = [Lie("ghost", grown[i, :2], bool(own[i] <= OWN_DENIES)) for i in np.flatnonzero(drop >= EFFECT)]
+    which = gone(joined, without, suspects)
+    lost, own = without.boxes[which], without.own(suspects)[:, which].min(axis=0)
     drop = without.odds_at(lost[:, :2]) - joined.odds_at(lost[:, :2])
-    blamed = without.own(suspect)[gone(joined, without, suspect)] < SUPPORTS
-    found += [Lie("gone", box[:2]) for box in lost[(lost[:, 5] >= CRISP_SCORE) & (drop >= GONE_EFFECT) & blamed]]
-    away, other = joined.away(suspect), without.away(suspect)
+    taken = np.flatnonzero((lost[:, 5] >= CRISP_SCORE) & (drop >= GONE_EFFECT))
+    found += [Lie("gone", lost[i, :2], bool(own[i] >= SUPPORTS)) for i in taken]
+    away, aside, other = joined.away(suspects), joined.away(suspects, across=True), without.away(suspects)
     for index in np.flatnonzero((away >= AWAY) & (joined.boxes[:, 5] >= PLACED_SCORE) & ~ghosts):
         same = _at(without, joined.boxes[index])
         if same is not None and 0.0 < other[same] <= away[index] - AWAY_EFFECT:
-            found.append(Lie("moved", joined.boxes[index, :2]))
+            found.append(Lie("moved", joined.boxes[index, :2], along=bool(aside[index] < AWAY)))
     return found
 
 
@@ -249,10 +267,10 @@ def blame(found: Mapping[str, Sequence[Lie]], joined: Shown) -> dict[str, list[L
     return blamed
 
 
-def gone(joined: Shown, without: Shown, suspect: str | None) -> IntArray:
+def gone(joined: Shown, without: Shown, suspects: Collection[str] = ()) -> IntArray:
     """Boxes, by their places in ``without``, that are gone in ``joined`` although others support them."""
     claims = without.claims
-    others = np.array([name != suspect for name in claims.witnesses])
+    others = np.array([name not in suspects for name in claims.witnesses])
     supported = two_witnesses(claims.supporting & others[:, None])
     supported &= claims.likelihood[others].sum(axis=0) >= WEIGHTY
     there = joined.boxes[joined.boxes[:, 5] >= THERE_SCORE]

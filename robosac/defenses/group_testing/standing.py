@@ -54,7 +54,7 @@ def judge(answer: Shown, decoded: Sequence[Shown]) -> Judged:
         else:
             keep(answer, index)
     for part in parts:
-        for at in gone(answer, part, None).tolist():
+        for at in gone(answer, part).tolist():
             place = part.boxes[at, :2]
             if all(np.hypot(*(place - other)) > SAME_M for other in repaired):
                 keep(part, at, Standing.REPAIRED)

@@ -18,6 +18,8 @@ LEAST_RATE = 0.1
 """Changes a box, from frame to frame, below which the ego's own rate is not believed."""
 STEADY_RATE = 0.2
 """Up to this rate of the ego's own, fusions are as steady as where they were calibrated."""
+FIRST_TRUST = 0.5
+"""What evidence against somebody is worth as long as the ego's own rate is not known."""
 EXCESS = 0.15
 """By how much an attacker's rate of changes is larger than the ego's, at least."""
 PRIOR_CHANGES, PRIOR_BOXES = 2.1, 30.0
@@ -40,6 +42,7 @@ class Steadiness:
     levels: dict[str, float] = field(default_factory=dict)
     """By teammate: S, see `learn`; those at 0 are left out."""
     _compared: bool = field(default=False, init=False)
+    _unknown: bool = field(default=False, init=False)
     _rate: float = field(default=LEAST_RATE, init=False)
 
     @property
@@ -48,11 +51,16 @@ class Steadiness:
         return self._rate
 
     @property
-    def trust(self) -> float:
-        """What evidence from whole fusions is worth in this frame that speaks against somebody, in (0, 1]: little where
-        even the ego alone is much less steady than where the likelihoods were calibrated.
-        """
+    def calm(self) -> float:
+        """In (0, 1]: little where even the ego alone is much less steady than where the likelihoods were calibrated."""
         return min(1.0, (STEADY_RATE / self._rate) ** 4)
+
+    @property
+    def trust(self) -> float:
+        """What evidence from whole fusions is worth in this frame that speaks against somebody, in (0, 1]: as much as
+        it is `calm`, and half before that is known.
+        """
+        return FIRST_TRUST if self._unknown else self.calm
 
     def begin(self, alone: tuple[int, int] | None) -> None:
         """Take in what the ego alone shows in a frame.
@@ -66,6 +74,7 @@ class Steadiness:
             Boxes n and changes c; None if the ego cannot be compared with the frame before.
         """
         self._compared = alone is not None
+        self._unknown = alone is None and not self.boxes
         boxes, changes = alone or (0, 0)
         self.changes += changes
         self.boxes += boxes

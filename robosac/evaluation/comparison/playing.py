@@ -19,6 +19,7 @@ from robosac.evaluation.frames import EvaluationFrame, another_scene
 from robosac.evaluation.objects import Judged, ObjectHistory, Shown, judge
 from robosac.evaluation.playing import FaultyDefense, play
 from robosac.evaluation.recordings import Recordings
+from robosac.evaluation.standing import TrueBoxes, true_boxes
 from robosac.scenes import Scene, SceneError, SceneSource, first_scenes
 from robosac.scenes.intersection import Synthetic
 
@@ -103,6 +104,8 @@ class Played:
     """None where the defence names nobody."""
     objects: ObjectHistory = field(default_factory=ObjectHistory)
     """What became of the lies about single objects, if there were any."""
+    standing: list[TrueBoxes] = field(default_factory=list)
+    """How the true boxes stand; empty from a defence that does not know."""
 
     def add(self, frame: EvaluationFrame, matched: Matched, accepted: Collection[str], passes: int) -> None:
         """Add a frame."""
@@ -211,10 +214,10 @@ def _play(
         played.add(frame, matcher(index, result.boxes), result.accepted, answer.passes)
         played.milliseconds.append(answer.milliseconds)
         named.append(result.named)
-        if frame.lies:
-            played.objects.judged.append(judge_lies(index, Shown.of(result.answer(index, {}, {}))))
-        else:
-            played.objects.judged.append(())
+        shown = Shown.of(result.answer(index, {}, {})) if frame.lies or result.objects is not None else None
+        played.objects.judged.append(judge_lies(index, shown) if frame.lies and shown is not None else ())
+        if shown is not None and shown.standing is not None:
+            played.standing.append(true_boxes(shown, frame.truth))
         played.objects.all_named.append(bool(chosen) and set(chosen) <= set(result.named or ()))
     if any(names is not None for names in named):
         played.naming = _naming(sequence, [frozenset(names or ()) for names in named], chosen)

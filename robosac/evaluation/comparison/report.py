@@ -7,7 +7,15 @@ from pathlib import Path
 
 from robosac.evaluation.comparison.pictures import draw_passes, draw_precision
 from robosac.evaluation.comparison.playing import Plan
-from robosac.evaluation.comparison.rows import WINDOWS, Estimate, Figures, NamingFigures, ObjectFigures, Row
+from robosac.evaluation.comparison.rows import (
+    WINDOWS,
+    Estimate,
+    Figures,
+    NamingFigures,
+    ObjectFigures,
+    Row,
+    StandingFigures,
+)
 from robosac.evaluation.comparison.tables import sections
 from robosac.evaluation.report import Table, write_csv, write_report
 
@@ -23,8 +31,9 @@ PRECISION, PASSES = "precision.png", "passes.png"
 ESTIMATES = ("ap50", "ap70", "ap50_difference", "ap70_difference", "ap70_ratio")
 OVERALL = ("passes_first", "passes_early", "passes_steady", "honest_refused", "milliseconds")
 NAMING = tuple(NamingFigures.__dataclass_fields__)
-SHARES = ("held", "flagged", "confirmed")
+SHARES = ("held", "flagged", "confirmed", "true_confirmed", "true_contradicted")
 OBJECTS = tuple(ObjectFigures.__dataclass_fields__)
+STANDING = tuple(StandingFigures.__dataclass_fields__)
 
 
 def write_comparison(rows: Sequence[Row], plan: Plan, out: Path, command: str) -> Path:
@@ -63,13 +72,13 @@ def _flat(row: Row) -> dict[str, object]:
         line |= {f"{name}{suffix}": value for name, value in _figures(row.windows.get(first)).items()}
     line |= {name: _rounded(getattr(row, name)) for name in OVERALL}
     line |= {name: _rounded(getattr(row.naming, name, None)) for name in NAMING}
-    return line | _objects(row.objects)
+    return line | _told(row.objects, OBJECTS) | _told(row.standing, STANDING)
 
 
-def _objects(objects: ObjectFigures | None) -> dict[str, object]:
+def _told(figures: ObjectFigures | StandingFigures | None, names: Sequence[str]) -> dict[str, object]:
     line: dict[str, object] = {}
-    for name in OBJECTS:
-        value = getattr(objects, name, None)
+    for name in names:
+        value = getattr(figures, name, None)
         line[name] = _rounded(value.value if isinstance(value, Estimate) else value)
         if name in SHARES:
             line[f"{name}_se"] = _rounded(value.error) if isinstance(value, Estimate) else None

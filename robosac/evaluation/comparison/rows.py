@@ -13,6 +13,7 @@ from robosac.evaluation.average_precision import AveragePrecision
 from robosac.evaluation.comparison.playing import Naming, Played
 from robosac.evaluation.comparison.settings import Setting
 from robosac.evaluation.objects import ObjectHistory, object_rates
+from robosac.evaluation.standing import NONE, TrueBoxes
 
 EARLY = 5
 """The frames after these count as steady."""
@@ -37,6 +38,10 @@ class Estimate:
         left_out = figure[1:]
         n = len(left_out)
         return cls(float(figure[0]), float(np.sqrt((n - 1) * left_out.var())) if n > 1 else None)
+
+    def times(self, factor: float) -> Estimate:
+        """The figure in another unit."""
+        return Estimate(factor * self.value, None if self.error is None else abs(factor) * self.error)
 
 
 @dataclass(frozen=True)
@@ -99,6 +104,16 @@ class ObjectFigures:
 
 
 @dataclass(frozen=True)
+class StandingFigures:
+    """How true boxes stand, as `robosac.evaluation.standing` counts them."""
+
+    true_judged: int
+    true_confirmed: Estimate
+    true_contradicted: Estimate
+    """Shares of them."""
+
+
+@dataclass(frozen=True)
 class Row:
     """What one defence did in one setting."""
 
@@ -122,6 +137,8 @@ class Row:
     sequences: int = 0
     objects: ObjectFigures | None = None
     """None where nobody lies about single objects."""
+    standing: StandingFigures | None = None
+    """None from a defence that does not know how boxes stand."""
 
     @property
     def whole(self) -> Figures:
@@ -179,6 +196,7 @@ def sum_up(
         true_boxes=float(np.mean([frame.truths for played in sequences for frame in played.matched])),
         sequences=len(sequences),
         objects=_objects([played.objects for played in sequences]),
+        standing=_standing([played.standing for played in sequences]),
     )
 
 
@@ -223,6 +241,14 @@ def _objects(histories: Sequence[ObjectHistory]) -> ObjectFigures | None:
         shown_named=rates["shown_named"],
         frames_to_name_shown=rates["frames_to_name"],
     )
+
+
+def _standing(sequences: Sequence[Sequence[TrueBoxes]]) -> StandingFigures | None:
+    counts = np.array([np.sum([NONE, *frames], axis=0) for frames in sequences], dtype=np.float64)
+    judged, confirmed, contradicted = np.vstack([counts.sum(0), counts.sum(0) - counts]).T
+    if not judged[0]:
+        return None
+    return StandingFigures(int(judged[0]), _share(confirmed, judged), _share(contradicted, judged))
 
 
 def _share(part: FloatArray, whole: FloatArray) -> Estimate:

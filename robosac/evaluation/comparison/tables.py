@@ -5,7 +5,16 @@ from __future__ import annotations
 from collections.abc import Callable, Sequence
 
 from robosac.evaluation.comparison.playing import EGO_ONLY, ORACLE
-from robosac.evaluation.comparison.rows import EARLY, WINDOWS, Estimate, Figures, NamingFigures, ObjectFigures, Row
+from robosac.evaluation.comparison.rows import (
+    EARLY,
+    WINDOWS,
+    Estimate,
+    Figures,
+    NamingFigures,
+    ObjectFigures,
+    Row,
+    StandingFigures,
+)
 from robosac.evaluation.comparison.settings import NOBODY
 from robosac.evaluation.report import Section, Table
 
@@ -105,7 +114,8 @@ def _naming(defense: str, rows: Sequence[Row]) -> Section:
     )
     text = (
         f"Frames are counted from 0. Honest teammates named, over all attacks: {named} of {honest}. "
-        f"Sequences with any of them named: {spoilt} of {played}."
+        f"Sequences with any of them named: {spoilt} of {played}. True boxes are those that match a true vehicle; "
+        "contradicted ones are left out of the answer."
     )
     return Section(f"{defense} in detail", text, [Table.of(lines)])
 
@@ -129,6 +139,15 @@ def _line(row: Row, oracle: Row, alone: Row) -> dict[str, str]:
         else "-",
         "honest named": f"{naming.honest_named} of {naming.honest}" if naming else "-",
         "in sequences": f"{naming.sequences_honest_named} of {naming.sequences}" if naming else "-",
+        **true_boxes(row.standing),
+    }
+
+
+def true_boxes(standing: StandingFigures | None) -> dict[str, str]:
+    """Cells that tell how true boxes stand."""
+    return {
+        "true boxes contradicted, of 1000": _estimate(standing.true_contradicted.times(1000)) if standing else "-",
+        "true boxes confirmed": _estimate(standing.true_confirmed) if standing else "-",
     }
 
 

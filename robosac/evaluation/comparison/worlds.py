@@ -8,6 +8,7 @@ from pathlib import Path
 from robosac.evaluation.comparison.playing import EGO_ONLY, ORACLE, Plan
 from robosac.evaluation.comparison.rows import Estimate, Row
 from robosac.evaluation.comparison.settings import DEFENSES, Setting
+from robosac.evaluation.comparison.tables import true_boxes
 from robosac.evaluation.report import Section, Table, write_csv, write_report
 
 HEAD = """# Defences in several worlds
@@ -80,6 +81,11 @@ def _flat(world: str, row: Row, oracle: Row, bare: Row | None, alone: Row) -> di
         difference: Estimate = getattr(row.whole, f"{ap}_difference")
         line[f"{ap}_lost"] = round(0.0 - difference.value, 5)
         line[f"{ap}_lost_se"] = None if difference.error is None else round(difference.error, 5)
+    standing = row.standing
+    for name in ("true_confirmed", "true_contradicted"):
+        share: Estimate | None = getattr(standing, name, None)
+        line[name] = None if share is None else round(share.value, 5)
+        line[f"{name}_se"] = None if share is None or share.error is None else round(share.error, 5)
     naming = row.naming
     return line | {
         "honest_refused": None if row.honest_refused is None else round(row.honest_refused, 5),
@@ -107,6 +113,7 @@ def _shown(world: str, row: Row, oracle: Row, bare: Row | None, alone: Row) -> d
         "honest teammates named": f"{naming.honest_named} of {naming.honest}" if naming else "-",
         "in sequences": f"{naming.sequences_honest_named} of {row.sequences}" if naming else "-",
         "passes: first / later": f"{row.passes_first:.2f} / {row.passes_steady:.2f}",
+        **true_boxes(row.standing),
     }
 
 

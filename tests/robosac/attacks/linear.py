@@ -3,8 +3,10 @@
 import numpy as np
 import torch
 
-from robosac.attacks import Situation
+from robosac.attacks import Hearing, Situation
+from robosac.boxes import pose_matrix
 from robosac.detectors import Message
+from robosac.testimony import ACROSS, ALONG, LAYERS, LIKELIHOOD
 
 VEHICLES = np.array([[x, y, 4.0, 2.0, yaw] for x in (3.0, 13.0, 23.0) for y in (-5.0, 5.0) for yaw in (0.0, 1.6)])
 """True boxes with gaps between them, none of them where `Linear` has a place."""
@@ -34,6 +36,40 @@ class Linear:
         return total, torch.stack([x, y + 0.5 * total.roll(1), *constants], dim=-1)
 
 
+class LinearWitness:
+    """Reads a map (H, W) of cells of 80 m / W: L grows by ``gain`` with each value, from what the sender says at 0.
+
+    A sender is known by the height of its sensor. Vehicles are seen in the middle of their cells.
+    """
+
+    half_extent_m = 40.0
+
+    def __init__(self, at_zero, gain=10.0):
+        self.layout, self._at_zero, self._gain = self, at_zero, gain
+
+    def scaled(self, maps):
+        return maps
+
+    def read(self, maps, heights):
+        testimony = torch.zeros(len(maps), LAYERS, *maps.shape[1:])
+        testimony[:, LIKELIHOOD] = torch.tensor([self._at_zero[round(h)] for h in heights])[:, None, None]
+        testimony[:, LIKELIHOOD] += self._gain * maps
+        testimony[:, [ALONG, ACROSS]] = np.log(0.2)
+        return testimony
+
+
+def pose(height, x=0.0):
+    return pose_matrix(x, 0.0, height, 0.0)
+
+
+def hearing(surface, at_zero=(-1.0, 0.0, 6.0, 6.0), **options):
+    """The ego and a hear of all places and are not sure; b knows those with x < 10, c those with x > 16."""
+    west_to_east = {"a": 0.0, "b": -30.0, "c": 56.0}
+    poses = {name: pose(n, west_to_east[name]) for n, name in enumerate(surface.messages, start=1)}
+    ego = torch.zeros_like(surface.ego)
+    return Hearing(LinearWitness(at_zero, **options), ego, pose(0), surface.messages, poses)
+
+
 def hidden(surface):
     """Boxes of what the ego alone does not see and its teammates do."""
     with torch.no_grad():
@@ -43,7 +79,8 @@ def hidden(surface):
 
 def situation(surface, **changes):
     """A first frame of a `Linear` ego, among `VEHICLES` and those that are hidden from it."""
-    return Situation(**{"truth": np.vstack([VEHICLES, hidden(surface)]), **changes})
+    known = {"truth": np.vstack([VEHICLES, hidden(surface)]), "hearing": hearing(surface)}
+    return Situation(**{**known, **changes})
 
 
 def message(tensor):

@@ -8,7 +8,7 @@ from robosac.attacks.places import CLEARANCE_M, REACH_M, Followed
 from robosac.boxes import pairwise_iou, pose_matrix
 from robosac.evaluation.encounters import Encounters
 from robosac.scenes import IntersectionScene
-from tests.robosac.attacks.linear import Linear
+from tests.robosac.attacks.linear import Linear, hearing
 
 ON_OBJECTS = [attack for attack in ATTACKS.values() if issubclass(attack, OnObjects)]
 SHAPE = (6, 6)
@@ -88,7 +88,7 @@ def test_a_car_that_the_ego_sees_is_left_alone(surface):
 def test_a_lie_keeps_its_distance_or_is_about_a_car(attack, surface):
     truth = street(surface, car(20.0, -9.0, 1.5), car(-12.0, 3.0, 0.4))
     poses = {"a": pose_matrix(-6, -6, 1.7, 0.0), "b": pose_matrix(9, -3, 1.7, 0.0), "c": pose_matrix(0, 5, 1.7, 0.0)}
-    met = Situation(truth=truth, poses=poses)
+    met = Situation(truth=truth, poses=poses, hearing=hearing(surface))
     attack(steps=1).run(surface, ["a"], np.random.default_rng(1), met)
     agents = np.array([[0.0, 0.0], *(pose[:2, 3] for pose in poses.values())])
     ghosts = [lie.box[:2] for lie in met.lies if lie.kind == "ghost"]

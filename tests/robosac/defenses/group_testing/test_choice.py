@@ -1,8 +1,11 @@
 import numpy as np
 import pytest
 
+from robosac.answers import Verdict
 from robosac.boxes import pose_matrix
+from robosac.defenses import Outcome
 from robosac.defenses.group_testing.choice import DEPENDENCE, expected_information
+from robosac.defenses.group_testing.evidence import Evidence
 from robosac.defenses.group_testing.geometry import followed
 from robosac.defenses.group_testing.knowledge import Knowledge
 from robosac.defenses.group_testing.memory import CHANGE_REPEAT, Memory, identity, keys
@@ -43,3 +46,18 @@ def test_comparisons_within_a_frame_promise_less_than_if_they_were_independent()
         assert independent.min() > 0.05
         assert promised == pytest.approx(DEPENDENCE * independent)
         assert DEPENDENCE == 0.85
+
+
+def test_beside_an_ego_that_is_no_witness_only_subsets_of_each_other_tell():
+    first = SINGLES[:1]
+    assert bits(Memory(), SINGLES[1:], first).min() > 0.05
+    assert bits(Memory(), SINGLES[1:], first, ego_sees=False) == pytest.approx(np.zeros(len(SINGLES) - 1))
+
+
+@pytest.mark.parametrize(("score", "witnesses"), [(0.9, True), (0.3, False)])
+def test_an_ego_without_confident_boxes_is_no_witness(score, witnesses):
+    seen = np.copy(SEEN)
+    seen[:, 5] = score
+    evidence = Evidence(Knowledge(MODEL, Posterior(len(MODEL.kinds), 0.5, 0.25, TEAM), Memory()))
+    evidence.learn(Outcome(TEAM[:1], 0.9, Verdict.CONSENSUS, SEEN, seen, np.eye(4), 0, alone=seen))
+    assert evidence.ego_witnesses == witnesses

@@ -4,7 +4,7 @@ import numpy as np
 import pytest
 
 from robosac.boxes import pose_matrix
-from robosac.defenses.group_testing.claims import AROUND_M, DENIES, SUPPORTS, Claims, peaks, two_witnesses
+from robosac.defenses.group_testing.claims import AROUND_M, DENIES, SUPPORTS, Claims, two_witnesses
 from robosac.testimony import MOST
 from tests.robosac.testifying import SPREAD_M, saying
 
@@ -24,6 +24,8 @@ def claim(ego, *teammates):
     [
         ((NO, YES), True),  # the ego's word is enough
         ((NO, 0.0, YES), True),
+        ((NO, YES, YES, YES), True),
+        ((-5.0, YES, YES), False),  # if it is clear
         ((0.0, NO, YES), False),  # one against one
         ((0.0, NO, NO, YES), True),
         ((0.0, NO, NO, YES, YES), True),  # who supports it most may have made it up
@@ -32,7 +34,7 @@ def claim(ego, *teammates):
         ((0.0, 0.0, 0.0), False),
         ((0.0, -5.0, 0.0, -0.5), False),  # too little in all
         ((0.0, -4.5, -4.5, YES), True),
-        ((-3.5, -3.5, -3.5, YES), False),  # nobody denies it by itself
+        ((-2.5, -2.5, -2.5, YES), False),  # nobody denies it by itself
     ],
 )
 def test_a_box_is_contradicted_by_the_ego_or_by_two(said, contradicted):
@@ -42,11 +44,11 @@ def test_a_box_is_contradicted_by_the_ego_or_by_two(said, contradicted):
 def test_a_suspects_own_word_is_left_out_whatever_it_is():
     liar_denies = claim(0.0, NO, NO, 0.0)
     assert liar_denies.contradicted().tolist() == [True]
-    assert liar_denies.contradicted("a").tolist() == [False]  # only "b" is left to deny it
-    assert liar_denies.contradicted("c").tolist() == [True]
+    assert liar_denies.contradicted(["a"]).tolist() == [False]  # only "b" is left to deny it
+    assert liar_denies.contradicted(["c"]).tolist() == [True]
     vouches = claim(0.0, NO, NO, YES, YES, YES)
     assert vouches.contradicted().tolist() == [False]
-    assert vouches.contradicted("c").tolist() == [False]  # "d" and "e" have still vouched for it
+    assert vouches.contradicted(["c"]).tolist() == [False]  # "d" and "e" have still vouched for it
     assert vouches.without(["c", "d"]).contradicted().tolist() == [True]
 
 
@@ -60,7 +62,7 @@ def test_without_some_their_word_counts_for_nothing():
 
 
 @pytest.mark.parametrize(
-    ("value", "supports", "denies"), [(SUPPORTS + 0.1, 1, 0), (2.9, 0, 0), (-3.9, 0, 0), (DENIES - 0.1, 0, 1)]
+    ("value", "supports", "denies"), [(SUPPORTS + 0.1, 1, 0), (2.9, 0, 0), (-2.9, 0, 0), (DENIES - 0.1, 0, 1)]
 )
 def test_who_speaks_for_and_against(value, supports, denies):
     claims = claim(0.0, value)
@@ -91,10 +93,3 @@ def test_no_boxes_make_no_claims():
 def test_the_ego_or_two_teammates_are_two_witnesses():
     speaking = np.array([[1, 0, 0, 0], [0, 1, 1, 0], [0, 0, 1, 0]], dtype=bool)
     assert two_witnesses(speaking).tolist() == [True, False, True, False]
-
-
-def test_peaks_are_the_greatest_around():
-    total = np.zeros((9, 9))
-    total[2, 2], total[2, 4], total[2, 5], total[8, 8] = 5.0, 4.0, 4.5, 1.0
-    assert peaks(total, total >= 1.0).tolist() == [[2, 2], [2, 5], [8, 8]]
-    assert peaks(total, np.zeros((9, 9), dtype=bool)).shape == (0, 2)

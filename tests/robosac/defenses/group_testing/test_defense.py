@@ -74,30 +74,6 @@ def test_memory_keeps_which_way_a_test_spoke(rng):
     assert {sign for _, sign in attacked.state["memory"]["tests"].values()} == {1}
 
 
-def test_an_ego_without_confident_boxes_is_no_witness(rng):
-    """What it says of a first subset, no other alone can be held against: those tested later hold it, or are in it."""
-    unsure = np.copy(SEEN)
-    unsure[:, 5] = 0.3
-    defense, apart = with_settings(inspections=0), []
-    for reference in (SEEN, unsure):
-        _, (first, *later) = run_frame(
-            defense,
-            defense.initial_state(TEAM),
-            TEAM,
-            ["car-2", "car-3"],
-            rng,
-            judge=lambda *a, seen=reference: outcome(*a, reference=seen),
-        )
-        apart.append([o.teammates for o in later if not nested(o, first)])
-    assert apart[0]
-    assert not apart[1]
-
-
-def nested(one, other):
-    one, other = set(one.teammates), set(other.teammates)
-    return one <= other or other <= one
-
-
 def test_the_same_subset_again_and_again_names_nobody():
     defense = with_settings(attack_prior=0.9, attacker_prior=0.9, first_budget=1, budget=1)
     decision, tested = run(defense, ["solo"], 12, np.random.default_rng(0), team=("solo",))

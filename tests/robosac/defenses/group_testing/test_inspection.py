@@ -223,3 +223,34 @@ def test_inspections_are_bounded(inspections):
     assert len(first) <= settings.first_budget + inspections
     assert all(len(tested) <= settings.budget + inspections for _, tested in later)
     assert (LIAR in later[-1][0].named) == (inspections > 1)
+
+
+VEILED = World({"car-2": NO, "car-3": NO, LIAR: NO}, with_liar(CAR, CAR[:0]))
+
+
+def test_who_denies_its_own_ghost_is_named_too():
+    met = VEILED.play(12)
+    assert {name for decision, _ in met for name in decision.named} == {LIAR}
+    items = [item for item in met[-1][0].state["memory"]["evidence"][LIAR] if item["test"] == "objects"]
+    assert {kind for item in items for kind in item["kinds"]} == {"veiled"}
+
+
+@pytest.mark.parametrize("denied", [{"": NO}, {"car-2": NO, "car-3": NO, "": -4.0}])
+def test_two_that_vouch_for_each_others_ghost_are_both_named(denied):
+    """Leaving out one of them changes nothing: the other one shows it as well."""
+    liars = {LIAR, "rsu"}
+    world = World({**denied, **dict.fromkeys(liars, YES)}, seen_by(*liars))
+    met = world.play(10)
+    assert {name for decision, _ in met for name in decision.named} == liars
+    for decision, tested in met:
+        assert there(decision, tested, decision.objects) == []
+    assert set(met[-1][0].accepted) == set(TEAM) - liars
+
+
+def test_who_moves_a_vehicle_along_itself_may_be_late_and_is_not_named():
+    behind = CAR - [2.0, 0, 0, 0, 0, 0]
+    met = World({"car-2": YES, "car-3": YES, "rsu": YES}, with_liar(behind, NEAR)).play(12)
+    assert {name for decision, _ in met for name in decision.named} == set()
+    last, _ = met[-1]
+    assert LIAR not in last.accepted
+    assert last.suspicion[LIAR] > 0.5

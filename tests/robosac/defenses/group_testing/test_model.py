@@ -78,7 +78,7 @@ def test_larger_sizes_count_as_the_largest_told_apart():
 @pytest.mark.parametrize("size", [1, 3, 5, 9])
 def test_changes_are_as_likely_as_calibrated(model, size):
     boxes, changes = CROWD_EDGES[1], CHANGE_EDGES[2] + 1
-    likelihood = model.change(size, boxes, changes)
+    likelihood = model.change(size, boxes, changes)[0]
     table = model.changes[:, min(size, CHANGE_SIZES) - 1, 2, 3]
     assert likelihood[:CLEAN] == pytest.approx([table[0]] * CLEAN)
     assert likelihood[CLEAN:].reshape(KINDS, CELLS) == pytest.approx(np.repeat(table[1:, None], CELLS, axis=1))
@@ -91,7 +91,7 @@ def test_what_changes_promise_is_the_mutual_information(model, rng):
     sizes, boxes = rng.integers(1, 9, 12), rng.integers(0, 50, 12)
     expected = []
     for size, number, cell in zip(sizes, boxes, cells, strict=True):
-        table = np.array([model.change(size, number, c) for c in (0, *CHANGE_EDGES)]).T
+        table = np.array([model.change(size, number, c)[0] for c in (0, *CHANGE_EDGES)]).T
         expected.append(mutual_information(table, cell))
     assert model.change_information(sizes, boxes, cells) == pytest.approx(expected)
     assert max(expected) > 0.1
@@ -105,8 +105,8 @@ def test_lies_look_like_nobody_attacks(model, rng):
     tables = lying.tables(a, d)
     np.testing.assert_array_equal(tables[:, :ROWS], model.tables(a, d))
     np.testing.assert_array_equal(tables[:, ROWS:], np.repeat(tables[:, :1], CELLS, axis=1))
-    likelihood = lying.change(2, CROWD_EDGES[1], CHANGE_EDGES[2])
-    np.testing.assert_array_equal(likelihood[:ROWS], model.change(2, CROWD_EDGES[1], CHANGE_EDGES[2]))
+    likelihood = lying.change(2, CROWD_EDGES[1], CHANGE_EDGES[2])[0]
+    np.testing.assert_array_equal(likelihood[:ROWS], model.change(2, CROWD_EDGES[1], CHANGE_EDGES[2])[0])
     np.testing.assert_array_equal(likelihood[ROWS:], likelihood[:CELLS])
 
 

@@ -36,7 +36,7 @@ def found(heard, joined, without, suspect="d"):
     """What is blamed on a suspect for a box joined with it, and one without it."""
     others = tuple(name for name in TEAM if name != suspect)
     lies = effects(
-        Shown(TEAM, np.vstack([REST, joined]), heard), Shown(others, np.vstack([REST, without]), heard), suspect
+        Shown(TEAM, np.vstack([REST, joined]), heard), Shown(others, np.vstack([REST, without]), heard), [suspect]
     )
     assert all(np.hypot(*(lie.place - PLACE)) < 2.5 for lie in lies)
     return [lie.kind for lie in lies]
@@ -62,7 +62,8 @@ def test_a_ghost_is_blamed_on_whoever_brings_it():
         ({}, []),
         ({"b": NO}, []),
         ({"b": NO, "d": NO}, []),  # its own word is not against it
-        ({"ego": NO}, []),  # one word against another
+        ({"ego": -5.0}, []),  # one word against another
+        ({"ego": NO}, ["ghost"]),
         ({"ego": NO, "b": -3.0}, ["ghost"]),
         ({"ego": YES, "b": NO, "c": NO}, []),
     ],
@@ -147,12 +148,22 @@ def test_boxes_are_vouched_for_by_others_than_those_who_join():
 def test_what_a_fusion_has_lost_is_found_by_its_part():
     heard = hearing(**SEEN)
     part = Shown(("b", "c"), np.vstack([car(), REST]), heard)
-    assert gone(Shown(TEAM, REST, heard), part, None).tolist() == [0]
-    assert gone(Shown(TEAM, np.vstack([REST, car()]), heard), part, None).tolist() == []
-    assert gone(Shown(TEAM, REST, hearing()), Shown(("b", "c"), np.vstack([car(), REST]), hearing()), None).size == 0
+    assert gone(Shown(TEAM, REST, heard), part).tolist() == [0]
+    assert gone(Shown(TEAM, np.vstack([REST, car()]), heard), part).tolist() == []
+    assert gone(Shown(TEAM, REST, hearing()), Shown(("b", "c"), np.vstack([car(), REST]), hearing())).size == 0
 
 
 def test_odds_are_those_of_the_best_box_at_a_place():
     shown = Shown(TEAM, np.vstack([car(score=0.8), car(score=0.5, off=(1.0, 0)), REST]), hearing())
     odds = shown.odds_at(np.array([PLACE, PLACE + [3.0, 0], PLACE + [0, 9.0]]))
     assert odds == pytest.approx([np.log(4), 0.0, np.log(0.05 / 0.95)])
+
+
+def test_a_vehicle_beside_one_that_is_shown_is_missed_too():
+    """The words about neighbours run into each other."""
+    beside = PLACE + [0.0, 3.4]
+    known = {name: [(*PLACE, YES)] for name in ("", *TEAM)}
+    for name in ("b", "c"):
+        known[name].append((*beside, YES))
+    ((x, y),) = Shown(TEAM, car(), Hearing(saying(known), ())).holes
+    assert np.hypot(x - beside[0], y - beside[1]) < 1.0

@@ -5,6 +5,7 @@ from robosac.evaluation.average_precision import match
 from robosac.evaluation.comparison.playing import Naming, Played
 from robosac.evaluation.comparison.rows import NamingFigures, precisions, sum_up
 from robosac.evaluation.comparison.settings import NOBODY
+from robosac.evaluation.standing import TrueBoxes
 
 TRUTH = np.array([[10.0 * i, 0.0, 4.0, 2.0, 0.0] for i in range(5)])
 
@@ -96,3 +97,21 @@ def test_naming_is_summed_over_sequences(played, oracle):
         one.naming = naming
     row = sum_up(NOBODY, "x", played, precisions(oracle))
     assert row.naming == NamingFigures(0.5, 4.0, 3, 4, 4.0, 7, 1, 9, 1, 3)
+
+
+def test_shares_of_true_boxes_are_those_of_all_sequences(played, oracle):
+    assert sum_up(NOBODY, "x", played, precisions(oracle)).standing is None
+    counts = [TrueBoxes(10, 9, 0), TrueBoxes(30, 20, 1), TrueBoxes(20, 20, 0), TrueBoxes(5, 4, 1)]
+    for one, count in zip(played, counts, strict=True):
+        one.standing = [count, count]
+    standing = sum_up(NOBODY, "x", played, precisions(oracle)).standing
+    assert standing.true_judged == 130
+    for name, share in (("confirmed", 53 / 65), ("contradicted", 2 / 65)):
+        figure = getattr(standing, f"true_{name}")
+        assert figure.value == pytest.approx(share)
+        without = [
+            sum(getattr(c, name) for c in counts if c != left_out) / sum(c.judged for c in counts if c != left_out)
+            for left_out in counts
+        ]
+        assert figure.error == pytest.approx(np.sqrt(3 / 4 * ((without - np.mean(without)) ** 2).sum()))
+        assert figure.times(1000).error == pytest.approx(1000 * figure.error)

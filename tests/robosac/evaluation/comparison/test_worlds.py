@@ -47,6 +47,8 @@ def test_each_world_has_its_report_and_all_have_one(out):
     for title in ("## nobody attacks", "## noise x 1"):
         assert title in page
     assert page.count("| highway | group_testing | ") == 2
+    assert "| true boxes contradicted, of 1000 | true boxes confirmed |" in page
+    assert "| true boxes contradicted, of 1000 | true boxes confirmed |" in (out / "highway/comparison.md").read_text()
 
 
 def test_a_line_says_what_the_world_s_report_says(out):
@@ -63,6 +65,9 @@ def test_a_line_says_what_the_world_s_report_says(out):
         assert float(line["honest_refused"]) == float(row["honest_refused"])
         assert line["honest_named"] == row["honest_named"]
         assert line["sequences"] == "2"
+        for name in ("true_confirmed", "true_contradicted", "true_confirmed_se"):
+            assert line[name] == row[name]
+            assert bool(line[name]) is line["defense"].startswith("group")
         assert bool(line["sequences_honest_named"]) is line["defense"].startswith("group")
 
 
@@ -91,7 +96,7 @@ def test_true_boxes_and_wrong_names_are_counted_by_sequence(detector, tmp_path):
     )  # where it attacks it is named rightly
     write_worlds({"mine": rows}, {"mine": plan}, tmp_path, "the command")
     assert f"| mine | a | {np.mean(truth):.1f} | " in (tmp_path / "worlds.md").read_text()
-    assert "| 3 of 15 | 3 of 3 | 0.00 / 0.00 |" in (tmp_path / "worlds.md").read_text()
+    assert "| 3 of 15 | 3 of 3 | 0.00 / 0.00 | - | - |" in (tmp_path / "worlds.md").read_text()
 
 
 def test_several_comparisons_are_each_as_by_itself(detector):

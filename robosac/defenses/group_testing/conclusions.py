@@ -1,0 +1,163 @@
+"""What a frame's findings about objects say about who lies."""
+
+from __future__ import annotations
+
+from collections import Counter
+from collections.abc import Sequence
+
+import numpy as np
+
+from robosac.defenses.group_testing.findings import UNHEARD, Findings
+from robosac.defenses.group_testing.model import CELLS, CLEAN, LIE
+from robosac.defenses.group_testing.objects import SAME_LIE_M, Lie, Shown, blame, effects
+from robosac.defenses.protocol import Hypothesis
+
+CLEARING = 1.5
+"""What a frame in which nothing is wrong takes off the logarithm of the odds that one of those fused lies."""
+CONFLICT_SCORE = 0.5
+"""Conflicts are counted over boxes of this score."""
+LEAST_CALM = 0.5
+"""Evidence on objects is worth so much, at least, however unsteady the ego is."""
+
+
+def conclude(found: Findings, answer: Hypothesis) -> None:
+    """Who lied in this frame; the posterior learns it, and memory keeps it."""
+    if found.hearing is None:
+        return
+    blamed: dict[str, list[Lie]] = {name: [] for name in found.team}
+    comparisons = _comparisons(found)
+    for joined, shown in found.shown.items():
+        done = {
+            suspect: effects(shown, found.shown[without], (suspect,))
+            for (fused, without), suspect in comparisons.items()
+            if fused == joined
+        }
+        for suspect, lies in blame(done, shown).items():
+            blamed[suspect] += [lie for lie in lies if found.calm or not lie.veiled]
+    for name, lie in _together(found, answer):
+        blamed[name].append(lie)
+    conflicts = _conflicts(found, answer)
+    _leave_alone(found, answer)
+    _clear(found)
+    for name in found.team:
+        counts = dict.fromkeys({lie.counts_as for lie in blamed[name]}, 1) | {"conflict": conflicts[name]}
+        weight = found.lies.add(name, counts)
+        if weight:
+            _accuse(found, name, weight, blamed[name], conflicts[name])
+
+
+def _together(found: Findings, answer: Hypothesis) -> list[tuple[str, Lie]]:
+    """What several do together: who they are that vouch for a lie in the answer, where it is gone without all of them.
+    Leaving out one of them alone does not put it right.
+    """
+    blamed = []
+    for lie in found.lies_in(answer) if answer in found.shown else ():
+        group = found.vouching(answer, lie)
+        without = tuple(name for name in answer if name not in group)
+        if group and without in found.shown:
+            done = effects(found.shown[answer], found.shown[without], group)
+            if any(np.hypot(*(each.place - lie.place)) <= SAME_LIE_M for each in done if each.kind == lie.kind):
+                blamed += [(name, lie) for name in group]
+    return blamed
+
+
+def _conflicts(found: Findings, answer: Hypothesis) -> dict[str, int]:
+    """Boxes of the answer over which each teammate alone says the contrary of all others. Where the ego itself is
+    unsteady, only those count over which it did not before: there honest mistakes are to be expected, and stay.
+    """
+    if answer not in found.shown:
+        return dict.fromkeys(found.team, 0)
+    claims = found.shown[answer].everybody
+    claims = claims.of_boxes(claims.boxes[:, 5] >= CONFLICT_SCORE)
+    memory, counts = found.known.memory, {}
+    for name in found.team:
+        places = [found.placed(box[:2]) for box in claims.boxes[claims.in_conflict(name, found.unheard)]]
+        new = found.lies.new_conflicts(name, places, memory.frame)
+        counts[name] = len(places) if found.calm else new
+    return counts
+
+
+def _leave_alone(found: Findings, answer: Hypothesis) -> None:
+    """What is wrong in the answer without anybody's doing: everybody was left out lately, or a hole is no loss."""
+    frame = found.known.memory.frame
+    for name in answer:
+        if tuple(other for other in answer if other != name) in found.decoded:
+            found.lies.left_out[name] = frame
+    lying = any(found.lies.worst(name) for name in found.team)
+    everybody = not lying and all(found.lies.recently_left_out(name, frame) for name in answer)
+    for lie in found.unexplained(answer) if answer in found.shown else ():
+        witnesses = found.supporters(answer, lie) if lie.kind == "gone" else ()
+        tested = lie.kind == "gone" and (not witnesses or witnesses in found.decoded)
+        if everybody or (tested and not found.is_real(answer, witnesses, lie)):
+            found.lies.leave_alone(found.placed(lie.place), frame)
+
+
+def _comparisons(found: Findings) -> dict[tuple[Hypothesis, Hypothesis], str]:
+    """Pairs of decoded fusions of which the first has one teammate more, and who that is.
+
+    Beside somebody who is all but certain to attack, what another one changes is no lie of its own: an
+    attacker's boxes come and go with whoever is fused with it.
+    """
+    suspicion = found.known.suspicion()
+    comparisons = {}
+    for joined in found.shown:
+        for suspect in joined:
+            without = tuple(name for name in joined if name != suspect)
+            if without in found.shown and all(suspicion[name] <= UNHEARD for name in without):
+                comparisons[joined, without] = suspect
+    return comparisons
+
+
+def _accuse(found: Findings, name: str, weight: float, lies: Sequence[Lie], conflicts: int) -> None:
+    """A piece of evidence on one teammate: all kinds of attack explain it alike."""
+    kinds = len(found.known.model.kinds)
+    log_likelihood = np.zeros(CLEAN + CELLS * kinds)
+    log_likelihood[CLEAN:] = weight * max(LEAST_CALM, found.known.memory.steadiness.calm)
+    before = found.known.suspicion()[name]
+    nobody, one = found.known.rows([(), (name,)])
+    found.known.posterior.update(nobody, one, log_likelihood)
+    after = found.known.suspicion()[name]
+    ratio = np.log(max(after, 1e-9) / max(1 - after, 1e-9)) - np.log(max(before, 1e-9) / max(1 - before, 1e-9))
+    places = [found.placed(lie.place).round(2).tolist() for lie in lies[:4]]
+    found.known.memory.add_evidence(
+        name,
+        {
+            "frame": found.known.memory.frame,
+            "test": "objects",
+            "teammates": [name],
+            "kinds": dict(sorted(Counter(lie.counts_as for lie in lies).items())),
+            "conflicts": conflicts,
+            "places": places,
+            "log_likelihood_ratio": round(float(ratio), 3),
+        },
+    )
+
+
+def _clear(found: Findings) -> None:
+    """Where nothing is wrong with any object, whoever is fused is less likely to lie: the most of them that were
+    fused so. Holes count only where vehicles were taken away.
+    """
+    clean = [subset for subset, shown in found.shown.items() if not _wrong(found, shown)]
+    best = max(clean, key=len, default=())
+    cleared = tuple(name for name in best if not found.lies.worst(name))
+    if not cleared:
+        return
+    model = found.known.model
+    log_likelihood = np.zeros(CLEAN + CELLS * len(model.kinds))
+    log_likelihood[CLEAN:] = -CLEARING * (1.0 - found.known.memory.steadiness.calm)
+    first = CLEAN + CELLS * model.kinds.index(LIE)
+    log_likelihood[first : first + CELLS] = -CLEARING
+    nobody, all_of_them = found.known.rows([(), cleared])
+    found.known.posterior.update(nobody, all_of_them, log_likelihood)
+
+
+def _wrong(found: Findings, shown: Shown) -> bool:
+    frame = found.known.memory.frame
+    lies = [lie for lie in shown.lies if not found.lies.is_quiet(found.placed(lie.place), frame)]
+    return any(lie.kind != "gone" or _is_lost(found, shown, lie) for lie in lies)
+
+
+def _is_lost(found: Findings, shown: Shown, hole: Lie) -> bool:
+    """Whether some decoded part of a fusion shows the vehicle of a hole."""
+    parts = [part for part in found.shown if set(part) < set(shown.teammates)]
+    return any(found.is_real(shown.teammates, part, hole) for part in parts)

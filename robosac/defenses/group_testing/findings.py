@@ -1,0 +1,124 @@
+"""What is found out about the objects of one frame, as its subsets are decoded."""
+
+from __future__ import annotations
+
+from collections.abc import Collection
+
+import numpy as np
+
+from robosac.boxes import FloatArray
+from robosac.defenses.group_testing.claims import SUPPORTS
+from robosac.defenses.group_testing.knowledge import Knowledge
+from robosac.defenses.group_testing.lies import Lies
+from robosac.defenses.group_testing.objects import REACH_M, SAME_LIE_M, Hearing, Lie, Shown, effects, gone
+from robosac.defenses.protocol import Hypothesis, Outcome
+from robosac.testimony import Testimony
+
+CALM = 0.5
+"""From here on the ego counts as steady."""
+UNHEARD = 0.9
+"""The testimony of those suspected more than this counts for nothing."""
+
+
+class Findings:
+    """The objects of one frame while it is judged.
+
+    Parameters
+    ----------
+    known : Knowledge
+    lies : Lies
+        Changed in place.
+    team : tuple of str
+        Teammates present.
+    named : collection of str
+        Held to be attackers before this frame.
+
+    Attributes
+    ----------
+    shown : dict of tuple of str to Shown
+        By subset decoded: what it shows.
+    decoded : set of tuple of str
+        All that were.
+    hearing : Hearing or None
+        What all messages say; None before the first outcome.
+    pose : (4, 4) ndarray
+        world_from_sensor of the ego.
+    """
+
+    def __init__(self, known: Knowledge, lies: Lies, team: Hypothesis, named: Collection[str]) -> None:
+        self.known = known
+        self.lies = lies
+        self.team = team
+        self.named = frozenset(named)
+        self.unheard = {name for name, p in known.suspicion().items() if name in self.named or p > UNHEARD}
+        self.shown: dict[Hypothesis, Shown] = {}
+        self.decoded: set[Hypothesis] = set()
+        self.hearing: Hearing | None = None
+        self.pose: FloatArray = np.eye(4)
+
+    def learn(self, outcome: Outcome) -> Shown | None:
+        """Take in a decoded subset; what it shows is given back, checked, if there is testimony to check it by."""
+        self.decoded.add(outcome.teammates)
+        if outcome.testimony is None or outcome.boxes is None:
+            return None
+        if self.hearing is None:
+            self.hearing = Hearing(outcome.testimony, self.unheard)
+        if outcome.pose is not None:
+            self.pose = outcome.pose
+        shown = self.shown[outcome.teammates] = Shown(outcome.teammates, outcome.boxes, self.hearing)
+        return shown
+
+    @property
+    def calm(self) -> bool:
+        """Whether the ego is about as steady as where the detector was calibrated."""
+        return self.known.memory.steadiness.calm >= CALM
+
+    def unexplained(self, answer: Hypothesis) -> list[Lie]:
+        """What is wrong in the answer and not remembered as nobody's, and in no decoded fusion without one of them, or
+        without all that vouch for it, is put right.
+        """
+        lies = self.lies_in(answer)
+        groups = [(suspect,) for suspect in answer] + list({self.vouching(answer, lie) for lie in lies})
+        for group in groups:
+            without = tuple(name for name in answer if name not in group)
+            if group and lies and without in self.shown:
+                done = effects(self.shown[answer], self.shown[without], group)
+                lies = [a for a in lies if all(np.hypot(*(a.place - b.place)) > SAME_LIE_M for b in done)]
+        return lies
+
+    def vouching(self, fused: Hypothesis, lie: Lie) -> Hypothesis:
+        """Those fused whose own messages go with a ghost or a hole, if they are several and not all."""
+        shown = self.shown[fused]
+        group = tuple(name for name in fused if lie.kind != "moved" and shown.goes_with(name, lie))
+        return group if 2 <= len(group) < len(fused) else ()
+
+    def lies_in(self, answer: Hypothesis) -> list[Lie]:
+        """What is wrong in the answer, and not remembered as nobody's doing."""
+        frame = self.known.memory.frame
+        return [lie for lie in self.shown[answer].lies if not self.lies.is_quiet(self.placed(lie.place), frame)]
+
+    def supporters(self, answer: Hypothesis, hole: Lie) -> Hypothesis:
+        """The two of those fused who support a vehicle in a hole most, in the order of the team."""
+        testimony = self.said()
+        said = dict(zip(testimony.agents, testimony.likelihood(hole.place[None])[:, 0].tolist(), strict=True))
+        most = sorted((name for name in answer if said[name] >= SUPPORTS), key=lambda name: -said[name])[:2]
+        return tuple(name for name in answer if name in most)
+
+    def is_real(self, answer: Hypothesis, witnesses: Hypothesis, hole: Lie) -> bool:
+        """Whether those who support a vehicle in a hole show it without the others: else nobody has taken it away."""
+        if witnesses not in self.shown:
+            return False
+        part = self.shown[witnesses]
+        found = part.boxes[gone(self.shown[answer], part)]
+        return bool(len(found)) and bool(np.hypot(*(found[:, :2] - hole.place).T).min() <= REACH_M)
+
+    def said(self) -> Testimony:
+        """What everybody says."""
+        if self.hearing is None:
+            raise RuntimeError("there is no testimony yet")
+        return self.hearing.everybody
+
+    def placed(self, place: FloatArray) -> FloatArray:
+        """A place (2,) of the ego's frame in the world."""
+        placed: FloatArray = self.pose[:2, :2] @ place + self.pose[:2, 3]
+        return placed
