@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import asyncio
 import contextlib
+import math
 import os
 import signal
 import socket
@@ -69,6 +70,15 @@ class GatewayProcess:
                     why = "was not ready in time" if status is None else f"ended with status {status}"
                     raise GatewayUnreachable(f"the gateway {why}; its log ends:\n{self._log.read_text()[-2000:]}")
                 await asyncio.sleep(0.05)
+
+    def peak_memory_mib(self) -> float:
+        """The most physical memory that it held, MiB; NaN where the system does not tell."""
+        try:
+            status = Path(f"/proc/{self._process.pid}/status").read_text()
+        except OSError:
+            return math.nan
+        (line,) = [line for line in status.splitlines() if line.startswith("VmHWM")]
+        return int(line.split()[1]) / 1024
 
     async def stop(self) -> bool:
         """Terminate the gateway, and kill it if it does not end; whether it ended by itself."""

@@ -48,7 +48,7 @@ class OverloadFigures:
     offered: int = 0
     seconds: float = 0.0
     answered_ms: list[float] = field(default_factory=list)
-    """From the request's last byte, where the budget begins, to the answer's."""
+    """From the request's last byte to the answer's. (The budget begins before, with the request's head.)"""
     refused_ms: list[float] = field(default_factory=list)
     """From the connection's beginning to the refusal."""
     deadline_met: int = 0

@@ -198,6 +198,19 @@ def _by_vehicle(value: Any) -> dict[str, RejectedTeammate]:
     return {entry.vehicle_id: entry for entry in rejected}
 
 
+class LogReceipt(Typed):
+    """The gateway's promise that its log of a session begins with these records, signed.
+
+    See `robosac.signatures.is_valid_head`.
+    """
+
+    session: str
+    seq: int = Field(description="Number of the log's latest record.")
+    head: str = Field(description="SHA-256 of that record.")
+    key_id: str = Field(description="Which of the gateway's keys signed, see /v1/keys.")
+    signature: str = Field(description="Ed25519, base64.")
+
+
 class FrameAnswer(Typed):
     """The answer to one frame.
 
@@ -231,6 +244,9 @@ class FrameAnswer(Typed):
     deadline_met: bool
     degraded_by: Literal["deadline", "fault"] | None = Field(description="What cut the defence short, if anything.")
     timings_ms: dict[str, float]
+    receipt: LogReceipt | None = Field(
+        None, exclude_if=lambda value: value is None, description="The log's end once this is on record, signed."
+    )
 
     @field_validator("support")
     @classmethod

@@ -177,3 +177,29 @@ def nms(boxes: FloatArray, scores: FloatArray, iou_threshold: float) -> IntArray
         if len(order):
             order = order[~np.any(pairwise_iou(boxes[order], boxes[survivors]) > iou_threshold, axis=1)]
     return np.array(kept, dtype=np.int64)
+
+
+BOX_UNITS = (100, 100, 100, 100, 1000, 10000)
+"""Units of what is kept of a box, as parts of 1: x, y, length and width in cm, yaw in mrad, score in 1e-4."""
+MOST_UNITS = 2**29
+
+
+def in_units(boxes: FloatArray) -> IntArray:
+    """Boxes (n, 6) as whole numbers of `BOX_UNITS`, at most 2**29 either way.
+
+    Raises
+    ------
+    ValueError
+        If one is no number.
+    """
+    scaled = np.round(boxes * BOX_UNITS)
+    if np.isnan(scaled).any():
+        raise ValueError("boxes must be numbers")
+    whole: IntArray = np.clip(scaled, -MOST_UNITS, MOST_UNITS).astype(np.int64)
+    return whole
+
+
+def from_units(whole: IntArray) -> FloatArray:
+    """The boxes (n, 6) of `in_units`."""
+    boxes: FloatArray = whole / np.array(BOX_UNITS, dtype=np.float64)
+    return boxes

@@ -20,16 +20,23 @@ class Deadline:
         When the answer is due, in the clock's time; infinite by default.
     reserve_s : float
         What has to be left for whatever comes after the fusion.
+    hypotheses : int, optional
+        How many may be tested, however much time there is.
     clock : callable
         Monotonic, seconds.
     """
 
     def __init__(
-        self, at: float = math.inf, reserve_s: float = 0.0, clock: Callable[[], float] = time.perf_counter
+        self,
+        at: float = math.inf,
+        reserve_s: float = 0.0,
+        clock: Callable[[], float] = time.perf_counter,
+        hypotheses: int | None = None,
     ) -> None:
         self.clock = clock
         self._end = at - reserve_s
         self._dearest_s = 0.0
+        self._left = math.inf if hypotheses is None else hypotheses
 
     @contextmanager
     def a_pass(self) -> Iterator[None]:
@@ -39,8 +46,10 @@ class Deadline:
         self._dearest_s = max(self._dearest_s, self.clock() - started)
 
     def another_fits(self) -> bool:
-        """Whether one more pass is expected to end in time."""
-        return self.clock() + SAFETY * self._dearest_s <= self._end
+        """Whether one more hypothesis may be tested: its pass is expected to end in time. It then counts as tested."""
+        fits = self._left > 0 and self.clock() + SAFETY * self._dearest_s <= self._end
+        self._left -= fits
+        return fits
 
     @property
     def is_met(self) -> bool:
@@ -52,9 +61,4 @@ class Recorded(Deadline):
     """One that passed after so many hypotheses, to make a decision again that time cut short."""
 
     def __init__(self, hypotheses: int) -> None:
-        super().__init__()
-        self._left = hypotheses
-
-    def another_fits(self) -> bool:
-        self._left -= 1
-        return self._left >= 0
+        super().__init__(hypotheses=hypotheses)

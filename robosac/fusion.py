@@ -7,10 +7,10 @@ detector decodes them, the consensus test judges, and the defence learns, until 
 from __future__ import annotations
 
 import logging
-from collections.abc import Iterator, Mapping, Sequence
+from collections.abc import Generator, Iterator, Mapping, Sequence
 from contextlib import contextmanager
 from dataclasses import dataclass, field, fields
-from typing import Any
+from typing import Any, TypeVar
 
 import numpy as np
 import rfc8785
@@ -41,9 +41,13 @@ from robosac.result import FusionResult
 from robosac.screening import Screened, Screening, joined, separated
 from robosac.testimony import Testimony
 
-__all__ = ["FusionResult", "UnverifiedAnswer", "fuse"]
+__all__ = ["FrameRun", "FusionResult", "Steps", "UnverifiedAnswer", "finished", "fuse"]
 
 logger = logging.getLogger(__name__)
+
+T = TypeVar("T")
+Steps = Generator[None, None, T]
+"""Work that pauses before each of its larger parts, so that the work of others can take turns with it."""
 
 
 class UnverifiedAnswer(Exception):
@@ -97,13 +101,23 @@ def fuse(  # all that a decision follows from, so that it can be made again
     -------
     FusionResult
     """
-    run = _FrameRun(detector, defense, ego, frame, previous, deadline or Deadline(), screening)
-    return run.answer(teammates, rng, state)
+    run = FrameRun(detector, defense, ego, frame, previous, deadline or Deadline(), screening)
+    return finished(run.answer(teammates, rng, state))
+
+
+def finished(steps: Steps[T]) -> T:
+    """What work comes to that is done without a pause."""
+    try:
+        while True:
+            next(steps)
+    except StopIteration as stop:
+        result: T = stop.value
+        return result
 
 
 @dataclass
-class _FrameRun:
-    """The state of one call of `fuse`."""
+class FrameRun:
+    """The state of one call of `fuse`, whose parameters these are."""
 
     detector: Preparer
     defense: Defense
@@ -123,7 +137,10 @@ class _FrameRun:
     out_of_time: bool = False
     fault: str | None = None
 
-    def answer(self, teammates: Mapping[str, Message], rng: np.random.Generator, state: State | None) -> FusionResult:
+    def answer(
+        self, teammates: Mapping[str, Message], rng: np.random.Generator, state: State | None
+    ) -> Steps[FusionResult]:
+        """Answer the frame, with a pause before each pass. Whether a pass still fits is looked at after the pause."""
         team = sorted(teammates)  # the draws must not depend on the order of arrival
         if state is None:
             state = self.defense.initial_state(team)
@@ -131,19 +148,24 @@ class _FrameRun:
         screened = Screened({}, (), memory)
         try:
             if self.screening is not None:
+                yield
                 screened = self._screen(self.screening, memory, teammates)
             passed = {name: teammates[name] for name in team if name not in screened.refused}
+            yield
             prepared = self._prepare(passed)
-            self._hear(passed)
-            decision = self._converse(prepared, list(passed), state, rng)
-            answered = self._assemble(prepared, decision)
+            if getattr(self.defense, "asks_witnesses", False):
+                yield
+                self._hear(passed)
+            decision = yield from self._converse(prepared, list(passed), state, rng)
+            answered = yield from self._assemble(prepared, decision)
         except Exception as error:
             logger.exception("fusion failed; answering with the ego's own perception")
             self.fault = describe(error)
             passed = {name: teammates[name] for name in team if name not in screened.refused}
             rejected = {name: Rejection(Reason.NOT_SAMPLED, {"fault": self.fault}) for name in passed}
             decision = Decision((), Source.EGO_ONLY, rejected, None, state)
-            answered = self._assemble(self._prepare({}), decision)
+            yield
+            answered = yield from self._assemble(self._prepare({}), decision)
         boxes = answered["boxes"]
         decided = {part.name: getattr(decision, part.name) for part in fields(Decision)}
         answered["rejected"] = {**decision.rejected, **screened.refused}
@@ -168,9 +190,7 @@ class _FrameRun:
             return self.detector.prepare(self.ego, teammates)
 
     def _hear(self, teammates: Mapping[str, Message]) -> None:
-        """Ask the witness what each message says by itself, if the defence wants to know."""
-        if not getattr(self.defense, "asks_witnesses", False):
-            return
+        """Ask the witness what each message says by itself."""
         with self._spending("testimony"):
             if isinstance(self.detector, Testifying):
                 said = self.detector.testify(self.ego, teammates)
@@ -178,12 +198,14 @@ class _FrameRun:
             elif (witness := witness_of(self.detector.info)) is not None:
                 self.testimony = witness.testify(EGO, {EGO: self.ego, **teammates})
 
-    def _converse(self, prepared: PreparedFrame, team: list[str], state: State, rng: np.random.Generator) -> Decision:
+    def _converse(
+        self, prepared: PreparedFrame, team: list[str], state: State, rng: np.random.Generator
+    ) -> Steps[Decision]:
         conversation = self.defense.converse(team, state, rng)
         try:
             batch = next(conversation)
             while True:
-                batch = conversation.send(self._test(prepared, batch))
+                batch = conversation.send((yield from self._test(prepared, batch)))
         except StopIteration as stop:
             decision: Decision = stop.value
         self._check(decision, team, state)
@@ -211,22 +233,24 @@ class _FrameRun:
         if self.defense.kind not in shipped():  # those that ship are known to keep JSON, and theirs may be long
             rfc8785.dumps(dict(decision.state))
 
-    def _assemble(self, prepared: PreparedFrame, decision: Decision) -> dict[str, Any]:
+    def _assemble(self, prepared: PreparedFrame, decision: Decision) -> Steps[dict[str, Any]]:
         """The fields of the result that hold boxes, and whose they are; judged ones are checked by now."""
         if decision.objects is None:
-            return {"boxes": self._decode(prepared, decision.accepted)}
+            return {"boxes": (yield from self._decode(prepared, decision.accepted))}
         objects, boxes = best_first(decision.objects, self.boxes)
         contradicted, left_out = best_first(decision.contradicted, self.boxes)
         return {"objects": objects, "boxes": boxes, "contradicted": contradicted, "contradicted_boxes": left_out}
 
-    def _test(self, prepared: PreparedFrame, batch: Sequence[Hypothesis]) -> list[Outcome]:
+    def _test(self, prepared: PreparedFrame, batch: Sequence[Hypothesis]) -> Steps[list[Outcome]]:
         tested: list[Outcome] = []
         for subset in batch:
-            reference = self._reference(prepared)
+            reference = yield from self._reference(prepared)
+            if subset not in self.boxes:
+                yield
             if not self.deadline.another_fits():
                 self.out_of_time = True
                 break
-            boxes = self._decode(prepared, subset)
+            boxes = self._decoded(prepared, subset)
             with self._spending("consensus"):
                 comparison = compare(reference, self._confident(boxes), self.defense.consensus_threshold)
             index, verdict = comparison.jaccard_index, comparison.verdict
@@ -235,13 +259,18 @@ class _FrameRun:
             self.outcomes.append(tested[-1])
         return tested
 
-    def _reference(self, prepared: PreparedFrame) -> FloatArray:
+    def _reference(self, prepared: PreparedFrame) -> Steps[FloatArray]:
         before = self.previous
         if self.defense.reference is Reference.PREVIOUS and before is not None and before.frame == self.frame - 1:
             return self._confident(before.expected_at(self.ego.pose))
-        return self._confident(self._decode(prepared, ()))
+        return self._confident((yield from self._decode(prepared, ())))
 
-    def _decode(self, prepared: PreparedFrame, subset: Hypothesis) -> FloatArray:
+    def _decode(self, prepared: PreparedFrame, subset: Hypothesis) -> Steps[FloatArray]:
+        if subset not in self.boxes:
+            yield
+        return self._decoded(prepared, subset)
+
+    def _decoded(self, prepared: PreparedFrame, subset: Hypothesis) -> FloatArray:
         """Boxes of a subset; each is decoded once a frame."""
         if subset not in self.boxes:
             with self._spending("hypotheses" if subset else "ego_only"), self.deadline.a_pass():

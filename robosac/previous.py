@@ -10,7 +10,7 @@ import numpy as np
 from scipy.optimize import linear_sum_assignment
 from scipy.spatial.distance import cdist
 
-from robosac.boxes import FloatArray, from_world, to_world
+from robosac.boxes import FloatArray, from_units, from_world, in_units, to_world
 
 FOLLOWED_M = 3.0
 """A vehicle is followed from one frame to the next if it moved less than this: 15 m/s at 5 Hz."""
@@ -41,10 +41,10 @@ class PreviousAnswer:
         pose : (4, 4) ndarray
             world_from_sensor of the ego.
         boxes : (n, 6) ndarray
-            In the ego's frame.
+            In the ego's frame. What is kept of them is rounded to `robosac.boxes.BOX_UNITS`, as an audit log has them.
         before : PreviousAnswer, optional
         """
-        placed = to_world(boxes, pose)
+        placed = to_world(from_units(in_units(boxes)), pose)
         motion = np.zeros((len(placed), 2))
         if before is not None and before.frame == frame - 1:
             distance = cdist(placed[:, :2], before.boxes[:, :2])

@@ -12,7 +12,7 @@ from robosac.deadline import Deadline
 from robosac.defenses import Defense, DefenseSettings, SampleConsensus, State, build
 from robosac.defenses.group_testing import GroupTestingSettings
 from robosac.detectors import Detector, DetectorInfo, Message, Preparer
-from robosac.fusion import FusionResult, fuse
+from robosac.fusion import FrameRun, FusionResult, Steps, finished
 from robosac.previous import PreviousAnswer
 from robosac.screening import Screening, joined, separated
 
@@ -141,18 +141,22 @@ class Session:
 
         The draws come from ``rng``.
         """
-        return fuse(
-            detector or self.detector,
-            self.defense,
-            ego,
-            teammates,
-            rng=rng,
-            state=self.state,
-            frame=frame,
-            previous=self.previous,
-            deadline=deadline,
-            screening=self.screening,
+        return finished(self.decide_in_steps(frame, ego, teammates, rng, deadline, detector))
+
+    def decide_in_steps(
+        self,
+        frame: int,
+        ego: Message,
+        teammates: Mapping[str, Message],
+        rng: np.random.Generator,
+        deadline: Deadline | None = None,
+        detector: Preparer | None = None,
+    ) -> Steps[FusionResult]:
+        """Decide as `decide` does, but pause before each pass, so that the work of others can take turns with it."""
+        run = FrameRun(
+            detector or self.detector, self.defense, ego, frame, self.previous, deadline or Deadline(), self.screening
         )
+        return run.answer(teammates, rng, self.state)
 
     def remember(self, result: FusionResult) -> None:
         """Let a decision count for the next frame."""

@@ -11,7 +11,7 @@ from __future__ import annotations
 import hashlib
 import math
 from collections.abc import Mapping
-from dataclasses import dataclass
+from dataclasses import dataclass, field
 from typing import Any
 
 import msgpack
@@ -69,7 +69,9 @@ class FrameEnvelope:
 
     frame: int
     ego: Any
-    teammates: Mapping[Any, Any]
+    teammates: Mapping[str, Any]
+    states: Mapping[str, bytes] = field(default_factory=dict)
+    """As `pack_frame` takes them."""
 
 
 def pack_message(frame: int, vehicle_id: str, message: Message, signature: bytes | None = None) -> bytes:
@@ -83,11 +85,17 @@ def pack_frame(
     teammates: Mapping[str, Message],
     ego_signature: bytes | None = None,
     signatures: Mapping[str, bytes] | None = None,
+    states: Mapping[str, bytes] | None = None,
 ) -> bytes:
-    """The body of a whole frame, with the signatures of those teammates that sign."""
+    """The body of a whole frame, with the signatures of those teammates that sign.
+
+    Of a frame that is kept, ``states`` may hold what the session remembered ``before`` and ``after`` it, as text
+    (`robosac.audit.packing.packed_state`).
+    """
     signed = signatures or {}
     fields = {name: _message_fields(message, signed.get(name)) for name, message in teammates.items()}
-    return pack({"frame": frame, "ego": _message_fields(ego, ego_signature), "teammates": fields})
+    known = {"states": dict(states)} if states else {}
+    return pack({"frame": frame, "ego": _message_fields(ego, ego_signature), "teammates": fields, **known})
 
 
 def content_digest(frame: int, vehicle_id: str, message: Message) -> str:
@@ -171,8 +179,10 @@ def read_message(body: bytes) -> MessageEnvelope:
 def read_frame(body: bytes) -> FrameEnvelope:
     """The parts of a whole frame; each is left to `check_message`."""
     fields = _Fields(unpack(body))
-    teammates = fields.take("teammates", dict)
-    return FrameEnvelope(_frame(fields), fields.take("ego"), teammates)
+    teammates = _named(fields.take("teammates", dict), "teammates")
+    states = fields.value.get("states")
+    kept = states if isinstance(states, dict) and all(isinstance(text, bytes) for text in states.values()) else {}
+    return FrameEnvelope(_frame(fields), fields.take("ego"), teammates, kept)
 
 
 def check_message(payload: Any, info: DetectorInfo, role: Role, path: str = "") -> Message:
@@ -282,6 +292,14 @@ class _Fields:
         if len(data) != length:
             raise WireError("wrong-length", self.at(name), f"must be {length} bytes, got {len(data)}")
         return data
+
+
+def _named(parts: Mapping[Any, Any], path: str) -> Mapping[str, Any]:
+    """Parts of which each has a name: a number is none, else ``"5"`` and ``5`` would be two parts of one vehicle."""
+    for name in parts:
+        if not isinstance(name, str):
+            raise WireError("wrong-type", path, f"a name must be a string, got {_type(name)} {_shown(name)}")
+    return parts
 
 
 def _of_type(value: Any, kind: type, path: str) -> Any:

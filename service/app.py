@@ -18,23 +18,29 @@ from fastapi import FastAPI  # noqa: E402
 
 from robosac.extras import MissingExtra  # noqa: E402
 from service import problems  # noqa: E402
+from service.arriving.arrival import Arrival  # noqa: E402
 from service.arriving.doors import Door, capacity_check, check_head, check_local  # noqa: E402
 from service.arriving.frames import Frames  # noqa: E402
 from service.arriving.limits import BodyLimit  # noqa: E402
 from service.deciding.admission import Admission  # noqa: E402
 from service.deciding.answering import Deciding  # noqa: E402
+from service.deciding.keeping import Keeping  # noqa: E402
 from service.engine import Engine  # noqa: E402
 from service.gateway import Gateway  # noqa: E402
+from service.keeping.gateway_keys import GatewayKeys  # noqa: E402
 from service.keeping.record import new_seed  # noqa: E402
 from service.keeping.store import Store  # noqa: E402
-from service.routes import operations, v1  # noqa: E402
+from service.operations import operations  # noqa: E402
+from service.routes import v1  # noqa: E402
 from service.sessions.identity import ApiKeys, Tokens  # noqa: E402
 from service.sessions.opening import Opening  # noqa: E402
+from service.sessions.room import Room  # noqa: E402
 from service.sessions.sessions import Sessions  # noqa: E402
 from service.sessions.teams import Teams  # noqa: E402
 from service.settings import Settings  # noqa: E402
 from service.watching.logs import logging_to_stderr  # noqa: E402
 from service.watching.metrics import Metrics  # noqa: E402
+from service.watching.stalls import LoopWatch  # noqa: E402
 from service.watching.tracing import Traced, Tracing, provider_from_environment  # noqa: E402
 
 if TYPE_CHECKING:
@@ -88,11 +94,12 @@ def create_app(
     app.state.gateway = gateway
     problems.install(app)
     app.add_middleware(BodyLimit, limit=settings.max_body_bytes, timeout_s=settings.body_timeout_s)
-    app.add_middleware(Door, check=capacity_check(gateway.admission, gateway.sessions.budget_s))
+    app.add_middleware(Door, check=capacity_check(gateway.admission, gateway.sessions.in_use))
     if not keys:
         app.add_middleware(Door, check=check_local)
     app.add_middleware(Traced, tracing=tracing)
     app.add_middleware(Door, check=check_head)
+    app.add_middleware(Arrival, watch=gateway.watch)
     app.include_router(v1)
     app.include_router(operations)
     return app
@@ -101,20 +108,26 @@ def create_app(
 def _built(
     settings: Settings, api_keys: ApiKeys, tokens: Tokens, seeds: Callable[[], str], tracing: Tracing
 ) -> Gateway:
-    engine, metrics, admission = Engine(settings.torch_threads, settings.extra_detectors), Metrics(), Admission()
-    store = Store(settings.database_url)
-    sessions = Sessions(settings, store, engine, metrics, tokens, seeds)
-    deciding = Deciding(sessions, store, engine, metrics, admission, tracing, settings.keep_frames)
+    engine, metrics = Engine(settings.torch_threads, settings.extra_detectors), Metrics()
+    admission = Admission(settings.max_hypotheses)
+    store = Store(settings.database_url, full_every=settings.audit_full_every, most_records=settings.audit_max_records)
+    keys = GatewayKeys(settings.gateway_key_file)
+    sessions = Sessions(settings, store, engine, metrics, tokens, keys, seeds)
+    deciding = Deciding(sessions, Keeping(sessions, store, settings.keep_frames), engine, metrics, admission, tracing)
+    of_key = settings.max_inflight_bytes_per_key if len(api_keys) > 1 else None  # one key has all to itself
     return Gateway(
         admission=admission,
+        keys=keys,
         engine=engine,
         metrics=metrics,
         store=store,
         opening=Opening(settings, store, engine, metrics, tokens, sessions),
         sessions=sessions,
         teams=Teams(settings, sessions, store, tokens),
-        frames=Frames(sessions, deciding, metrics, admission),
+        frames=Frames(sessions, deciding, metrics, admission, settings.max_frame_jump),
+        bodies=Room(settings.max_inflight_bytes, of_key, "ROBOSAC_MAX_INFLIGHT_BYTES"),
         api_keys=api_keys,
+        watch=LoopWatch(),
     )
 
 
@@ -125,18 +138,22 @@ async def _running(gateway: Gateway, settings: Settings, tokens: Tokens, tracing
     try:
         await asyncio.gather(store.start(), engine.start())
         await tokens.start(store)
+        await gateway.keys.start(store)
         gateway.metrics.sessions.set(await store.count())
         if settings.detector not in engine.detectors:
             known = list(engine.detectors)
             raise ValueError(f"ROBOSAC_DETECTOR: unknown detector {settings.detector!r}; known: {known}")
+        gateway.watch.start()
         sweeper = asyncio.create_task(gateway.sessions.expire_idle())
         logger.info("gateway ready", version=version("robosac"), detectors=list(engine.detectors))
         try:
             yield
         finally:
             sweeper.cancel()
+            gateway.watch.stop()
     finally:
         engine.stop()
+        await gateway.frames.deciding.keeping.close()
         await store.close()
         tracing.close()
         logger.info("gateway stopped")

@@ -3,10 +3,13 @@
 from __future__ import annotations
 
 import asyncio
+import math
+import threading
 import time
 from collections.abc import Callable, Mapping, Sequence
-from concurrent.futures import ThreadPoolExecutor
+from concurrent.futures import Future, ThreadPoolExecutor
 from copy import copy
+from dataclasses import dataclass
 from functools import partial
 from typing import TypeVar
 
@@ -15,15 +18,59 @@ import torch
 
 from robosac.deadline import Deadline
 from robosac.detectors import Detector, Message, available, blank, load
-from robosac.fusion import FusionResult
+from robosac.fusion import FusionResult, Steps
 from robosac.session import Session
 from service.errors import Kind, Refused
+from service.turns import Turns
 
 T = TypeVar("T")
 
 
+@dataclass(frozen=True)
+class Decided:
+    """A frame that is decided."""
+
+    result: FusionResult
+    worked_s: float
+    """For how long it had the engine's thread."""
+    waited_s: float
+    """For how long it waited for its turns."""
+
+
+class _Job:
+    """A frame that is being decided."""
+
+    def __init__(self, key: str, session_id: str, due: float, steps: Steps[FusionResult]) -> None:
+        self.key, self.session_id, self.due = key, session_id, due
+        self.done: Future[Decided] = Future()
+        self._steps = steps
+        self._submitted = time.perf_counter()
+        self._worked_s = 0.0
+
+    def step(self) -> bool:
+        """Do the next step; whether there are more."""
+        began = time.perf_counter()
+        try:
+            next(self._steps)
+        except StopIteration as stop:
+            now = time.perf_counter()
+            worked_s = self._worked_s + now - began
+            self._end(Decided(stop.value, worked_s, now - self._submitted - worked_s))
+            return False
+        except BaseException as error:
+            if self.done.set_running_or_notify_cancel():
+                self.done.set_exception(error)
+            return False
+        self._worked_s += time.perf_counter() - began
+        return True
+
+    def _end(self, decided: Decided) -> None:
+        if self.done.set_running_or_notify_cancel():
+            self.done.set_result(decided)
+
+
 class Engine:
-    """Runs fusions one after another on a thread of its own, so that the event loop never waits for torch.
+    """Decides frames on a thread of its own, pass by pass in turns, so that the event loop never waits for torch.
 
     Parameters
     ----------
@@ -36,6 +83,8 @@ class Engine:
     def __init__(self, threads: int, extra_detectors: Sequence[str] = ()) -> None:
         self._extra = extra_detectors
         self._executor = ThreadPoolExecutor(1, "fusion", initializer=torch.set_num_threads, initargs=(threads,))
+        self._lock = threading.Lock()
+        self._turns: Turns[_Job] = Turns()
         self._detectors: dict[str, Detector] = {}
         self.ready = False
 
@@ -75,18 +124,44 @@ class Engine:
         teammates: Mapping[str, Message],
         seed: int,
         deadline: Deadline,
-    ) -> tuple[FusionResult, float]:
+        *,
+        key: str = "",
+        session_id: str = "",
+        due: float = math.inf,
+    ) -> Decided:
         """Decide a frame on the engine's thread, from what the session remembers at this moment.
 
-        Returns the result, and for how many milliseconds the frame waited for the thread.
+        Between two passes frames of other sessions may have their turns, see `service.turns`; a frame that is due first
+        (``due``, of `time.perf_counter`) goes first where that is fair.
         """
-        submitted, asked = time.perf_counter(), copy(session)
+        steps = copy(session).decide_in_steps(frame, ego, teammates, np.random.default_rng(seed), deadline)
+        job = _Job(key, session_id, due, steps)
+        with self._lock:
+            self._turns.add(job)
+        self._executor.submit(self._take_turn)
+        return await asyncio.wrap_future(job.done)
 
-        def work() -> tuple[FusionResult, float]:
-            waited_ms = (time.perf_counter() - submitted) * 1e3
-            return asked.decide(frame, ego, teammates, np.random.default_rng(seed), deadline), waited_ms
+    def _take_turn(self) -> None:
+        """Do one step of the work whose turn it is. As many of these wait as there is work."""
+        if not self._step():
+            return
+        try:
+            self._executor.submit(self._take_turn)
+        except RuntimeError:  # the engine is being stopped; what was begun is finished
+            while self._turns:
+                self._step()
 
-        return await self._submit(work)
+    def _step(self) -> bool:
+        """Do one step; whether there is more of the same work."""
+        with self._lock:
+            job = self._turns.next()
+        began = time.perf_counter()
+        goes_on = not job.done.cancelled() and job.step()
+        with self._lock:
+            self._turns.charge(job, time.perf_counter() - began)
+            if not goes_on:
+                self._turns.remove(job)
+        return goes_on
 
     def stop(self) -> None:
         """Finish what was submitted."""

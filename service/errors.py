@@ -46,7 +46,9 @@ class Kind(StrEnum):
     OVERLOADED = "overloaded"
     DETECTOR_UNAVAILABLE = "detector-unavailable"
     DEFENSE_UNAVAILABLE = "defense-unavailable"
+    AUDIT_FULL = "audit-full"
     STORE_UNAVAILABLE = "store-unavailable"
+    STORE_TOO_SLOW = "store-too-slow"
 
 
 class Refused(Exception):
@@ -101,11 +103,33 @@ class FrameDecided(Refused):
         super().__init__(Kind.STALE_FRAME, f"frame {frame} or a later one is answered already", "frame")
 
 
+class AuditFull(Refused):
+    """The session's log holds as many records as it may."""
+
+    def __init__(self, records: int) -> None:
+        detail = (
+            f"the session's audit log holds {records} records, as many as it may: close the session and open another, "
+            "or have the operator raise ROBOSAC_AUDIT_MAX_RECORDS"
+        )
+        super().__init__(Kind.AUDIT_FULL, detail)
+
+
 class SessionChanged(Refused):
     """The session is not as it was when the change to it was worked out; perhaps another process changed it."""
 
     def __init__(self, detail: str = "the session was changed at the same time; try again") -> None:
         super().__init__(Kind.SESSION_CHANGED, detail)
+
+
+class StoreTooSlow(Refused):
+    """The database took longer over a decision than its frame has time."""
+
+    def __init__(self, what: str) -> None:
+        super().__init__(Kind.STORE_TOO_SLOW, f"the database {what}")
+
+
+class GivenUp(Exception):
+    """Nobody waits any more for what was to be kept, so it is not kept."""
 
 
 class StoreUnavailable(Refused):

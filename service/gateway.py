@@ -7,12 +7,15 @@ from dataclasses import dataclass
 from service.arriving.frames import Frames
 from service.deciding.admission import Admission
 from service.engine import Engine
+from service.keeping.gateway_keys import GatewayKeys
 from service.keeping.store import Store
 from service.sessions.identity import ApiKeys
 from service.sessions.opening import Opening
+from service.sessions.room import Room
 from service.sessions.sessions import Sessions
 from service.sessions.teams import Teams
 from service.watching.metrics import Metrics
+from service.watching.stalls import LoopWatch
 
 
 @dataclass(frozen=True)
@@ -20,6 +23,7 @@ class Gateway:
     """One gateway: detectors and their thread, sessions and teams, what answers frames, and who may open a session."""
 
     admission: Admission
+    keys: GatewayKeys
     engine: Engine
     metrics: Metrics
     store: Store
@@ -27,4 +31,6 @@ class Gateway:
     sessions: Sessions
     teams: Teams
     frames: Frames
+    bodies: Room
     api_keys: ApiKeys
+    watch: LoopWatch

@@ -63,7 +63,9 @@ ANSWERS: Mapping[Kind, tuple[int, Mapping[str, str]]] = {
     Kind.OVERLOADED: (503, {"Retry-After": "1"}),
     Kind.DETECTOR_UNAVAILABLE: (503, {}),
     Kind.DEFENSE_UNAVAILABLE: (503, {}),
+    Kind.AUDIT_FULL: (507, {}),
     Kind.STORE_UNAVAILABLE: (503, {"Retry-After": "1"}),
+    Kind.STORE_TOO_SLOW: (503, {"Retry-After": "1"}),
 }
 """Status and headers of each refusal."""
 

@@ -6,13 +6,16 @@ import re
 from typing import Annotated, Any
 
 from fastapi import APIRouter, Depends, Header, Path, Query, Request, Response
+from fastapi.responses import StreamingResponse
 from fastapi.security import HTTPAuthorizationCredentials, HTTPBearer
 from pydantic import BaseModel
 
 from robosac import wire
 from robosac.answers import FrameAnswer
-from service.arriving.bodies import MSGPACK, MSGPACK_TYPES, check_type, described, read_json
-from service.arriving.limits import read_bounded
+from service.arriving.arrival import arrival_of
+from service.arriving.bodies import JSON_BYTES, MSGPACK, MSGPACK_TYPES, check_type, described, read_json
+from service.arriving.limits import expected_bytes, read_bounded
+from service.deciding.asked import Answered
 from service.errors import Kind, Refused
 from service.gateway import Gateway
 from service.problems import documented
@@ -21,6 +24,8 @@ from service.schemas import (
     DetectorEntry,
     DetectorList,
     EnrolmentRequest,
+    GatewayKey,
+    GatewayKeyList,
     Receipt,
     RenewedToken,
     SessionCreated,
@@ -28,9 +33,9 @@ from service.schemas import (
     SessionState,
 )
 from service.sessions.live import Caller
+from service.sessions.room import Share
 
 v1 = APIRouter(prefix="/v1", responses=documented(422, 503))
-operations = APIRouter()
 _bearer = HTTPBearer(auto_error=False, scheme_name="Token", description="A vehicle's token.")
 _api_key = HTTPBearer(auto_error=False, scheme_name="ApiKey", description="An API key, where the gateway has any.")
 
@@ -52,8 +57,8 @@ Token = Annotated[str | None, Depends(_token)]
 
 async def _opener(
     gateway: GatewayDep, credentials: Annotated[HTTPAuthorizationCredentials | None, Depends(_api_key)]
-) -> None:
-    gateway.api_keys.check(credentials.credentials if credentials else None)
+) -> str:
+    return gateway.api_keys.check(credentials.credentials if credentials else None)
 
 
 async def _vehicle(sid: str, gateway: GatewayDep, token: Token) -> Caller:
@@ -68,14 +73,17 @@ Vehicle = Annotated[Caller, Depends(_vehicle)]
 Ego = Annotated[Caller, Depends(_ego)]
 
 
-async def _session_request(
-    request: Request, gateway: GatewayDep, _: Annotated[None, Depends(_opener)]
-) -> SessionRequest:
-    return await read_json(request, SessionRequest, gateway.sessions.defenses)
+KeyId = Annotated[str, Depends(_opener)]
 
 
-async def _enrolment_request(request: Request, _: Ego) -> EnrolmentRequest:
-    return await read_json(request, EnrolmentRequest)
+async def _session_request(request: Request, gateway: GatewayDep, key_id: KeyId) -> SessionRequest:
+    with gateway.bodies.share(key_id, "").holding(expected_bytes(request, JSON_BYTES)):
+        return await read_json(request, SessionRequest, gateway.sessions.defenses)
+
+
+async def _enrolment_request(request: Request, gateway: GatewayDep, caller: Ego) -> EnrolmentRequest:
+    with _room(gateway, caller).holding(expected_bytes(request, JSON_BYTES)):
+        return await read_json(request, EnrolmentRequest)
 
 
 _TENSOR_SCHEMA = {
@@ -86,6 +94,8 @@ _TENSOR_SCHEMA = {
 }
 _TENSOR_BODY: dict[str, Any] = {"requestBody": {"required": True, "content": {MSGPACK: {"schema": _TENSOR_SCHEMA}}}}
 _EGO_PROBLEMS = documented(401, 403, 404)
+_NO_STORE = {"Cache-Control": "no-store"}
+"""On answers with tokens (RFC 6749, section 5.1)."""
 _JSON_PROBLEMS = (400, 408, 413, 415)
 _FRAME_RESPONSES: dict[int | str, dict[str, Any]] = {
     **documented(400, 401, 403, 404, 408, 409, 413, 415),
@@ -100,6 +110,13 @@ async def list_detectors(gateway: GatewayDep) -> DetectorList:
     return DetectorList(detectors=[DetectorEntry.model_validate(info) for info in infos])
 
 
+@v1.get("/keys")
+async def list_keys(gateway: GatewayDep) -> GatewayKeyList:
+    """The gateway's public keys, with which receipts are checked."""
+    keys = [GatewayKey(key_id=name, public_key=key, signs=signs) for name, key, signs in gateway.keys.published()]
+    return GatewayKeyList(keys=keys)
+
+
 @v1.post(
     "/sessions",
     status_code=201,
@@ -107,10 +124,14 @@ async def list_detectors(gateway: GatewayDep) -> DetectorList:
     responses=documented(*_JSON_PROBLEMS, 401),
 )
 async def open_session(
-    request: Annotated[SessionRequest, Depends(_session_request)], gateway: GatewayDep
+    request: Annotated[SessionRequest, Depends(_session_request)],
+    gateway: GatewayDep,
+    key_id: KeyId,
+    response: Response,
 ) -> SessionCreated:
     """Open a session of one ego with its teammates. The tokens are shown only in this answer."""
-    return await gateway.opening.open(request)
+    response.headers.update(_NO_STORE)
+    return await gateway.opening.open(request, key_id)
 
 
 @v1.get("/sessions/{sid}", responses=_EGO_PROBLEMS)
@@ -126,8 +147,9 @@ async def delete_session(caller: Ego, gateway: GatewayDep, response: Response) -
 
 
 @v1.post("/sessions/{sid}/token", status_code=201, responses=documented(401, 404, 429))
-async def renew_token(caller: Vehicle, gateway: GatewayDep) -> RenewedToken:
+async def renew_token(caller: Vehicle, gateway: GatewayDep, response: Response) -> RenewedToken:
     """A fresh token for the vehicle that asks; the one it asks with is worth nothing any more."""
+    response.headers.update(_NO_STORE)
     return await gateway.teams.renew(caller)
 
 
@@ -138,9 +160,13 @@ async def renew_token(caller: Vehicle, gateway: GatewayDep) -> RenewedToken:
     responses={**_EGO_PROBLEMS, **documented(*_JSON_PROBLEMS, 409)},
 )
 async def enrol_teammates(
-    request: Annotated[EnrolmentRequest, Depends(_enrolment_request)], caller: Ego, gateway: GatewayDep
+    request: Annotated[EnrolmentRequest, Depends(_enrolment_request)],
+    caller: Ego,
+    gateway: GatewayDep,
+    response: Response,
 ) -> ChangedTeam:
     """Let teammates join from the next frame on. Their tokens are shown only in this answer."""
+    response.headers.update(_NO_STORE)
     return await gateway.teams.enrol(caller, request.teammates, request.public_keys)
 
 
@@ -156,11 +182,15 @@ async def dismiss_teammate(vehicle_id: str, caller: Ego, gateway: GatewayDep) ->
     responses={**_EGO_PROBLEMS, 200: {"content": {"application/jsonl": {}}}},
 )
 async def get_audit(
-    sid: str, gateway: GatewayDep, token: Token, after: Annotated[int, Query(ge=0, le=2**53)] = 0
+    sid: str,
+    gateway: GatewayDep,
+    token: Token,
+    after: Annotated[int, Query(ge=0, le=2**53)] = 0,
+    limit: Annotated[int, Query(ge=1, le=2**53)] = 2**53,
 ) -> Response:
-    """The audit log as JSON Lines: records with a number above `after`; of an ended session, too."""
-    lines = await gateway.sessions.audit_log(sid, token, after)
-    return Response("".join(line + "\n" for line in lines), media_type="application/jsonl")
+    """The audit log as JSON Lines: at most `limit` records with a number above `after`; of an ended session, too."""
+    pages = await gateway.sessions.audit_log(sid, token, after, limit)
+    return StreamingResponse(pages, media_type="application/jsonl")
 
 
 @v1.post(
@@ -176,9 +206,11 @@ async def post_message(
     request: Request, caller: Vehicle, gateway: GatewayDep, accept: Annotated[str | None, Header()] = None
 ) -> Response:
     """A vehicle's own message. The ego's starts the fusion and is answered with the frame result."""
-    body = await _read_body(request, caller, gateway, whole_frame=False)
-    answer = await gateway.frames.post_message(caller, body)
-    return _negotiated(answer, accept, 202 if isinstance(answer, Receipt) else 200)
+    limit = gateway.frames.body_limit(caller, whole_frame=False)
+    with gateway.frames.waiting(caller), _room(gateway, caller).holding(expected_bytes(request, limit)):
+        body = await _read_body(request, caller, gateway, limit)
+        answer = await gateway.frames.post_message(caller, body, arrival_of(request.scope))
+    return _negotiated(answer, accept, 202) if isinstance(answer, Receipt) else _handed_over(answer, accept, gateway)
 
 
 @v1.post("/sessions/{sid}/frames", openapi_extra=_TENSOR_BODY, responses=_FRAME_RESPONSES, response_class=Response)
@@ -186,8 +218,11 @@ async def post_frame(
     request: Request, caller: Ego, gateway: GatewayDep, accept: Annotated[str | None, Header()] = None
 ) -> Response:
     """A whole frame in one request by the ego."""
-    body = await _read_body(request, caller, gateway, whole_frame=True)
-    return _negotiated(await gateway.frames.post_frame(caller, body), accept)
+    limit = gateway.frames.body_limit(caller, whole_frame=True)
+    with gateway.frames.waiting(caller), _room(gateway, caller).holding(expected_bytes(request, limit)):
+        body = await _read_body(request, caller, gateway, limit)
+        answer = await gateway.frames.post_frame(caller, body, arrival_of(request.scope))
+    return _handed_over(answer, accept, gateway)
 
 
 @v1.get(
@@ -205,33 +240,30 @@ async def get_messages(
     return Response(kept, media_type=MSGPACK)
 
 
-@operations.get("/healthz")
-async def healthz() -> dict[str, str]:
-    """Whether the process lives."""
-    return {"status": "alive"}
+def _room(gateway: Gateway, caller: Caller) -> Share:
+    """What bodies of a session may take of the room for all."""
+    return gateway.bodies.share(caller.record.key_id, caller.record.session_id)
 
 
-@operations.get("/readyz")
-async def readyz(gateway: GatewayDep) -> dict[str, str]:
-    """Whether the gateway is warm and able to serve."""
-    gateway.engine.check_ready()
-    return {"status": "ready"}
-
-
-@operations.get("/metrics", response_class=Response)
-async def metrics(gateway: GatewayDep) -> Response:
-    """Counters and timings for Prometheus."""
-    return Response(gateway.metrics.render(), media_type="text/plain; version=0.0.4; charset=utf-8")
-
-
-async def _read_body(request: Request, caller: Caller, gateway: Gateway, *, whole_frame: bool) -> bytes:
+async def _read_body(request: Request, caller: Caller, gateway: Gateway, limit: int) -> bytes:
     """The body of a tensor request, read only as far as the detector's layout allows; a refusal goes on record."""
     try:
         check_type(request, *MSGPACK_TYPES)
-        return await read_bounded(request, gateway.frames.body_limit(caller, whole_frame=whole_frame))
+        return await read_bounded(request, limit)
     except Refused as refused:
         await gateway.frames.refuse(caller, refused)
         raise
+
+
+def _handed_over(answered: Answered, accept: str | None, gateway: Gateway) -> Response:
+    """An answer that says whether it is in time, decided as late as can be: with its bytes ready to be sent."""
+    answer = answered.now()
+    response = _negotiated(answer, accept)
+    if answer.deadline_met and not answered.in_time:
+        answer = answered.now()
+        response = _negotiated(answer, accept)
+    gateway.frames.deciding.tell(answered, answer)
+    return response
 
 
 def _negotiated(answer: BaseModel, accept: str | None, status: int = 200) -> Response:

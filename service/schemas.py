@@ -22,6 +22,7 @@ from pydantic import (
     model_validator,
 )
 
+from robosac.answers import LogReceipt
 from robosac.calibrated import calibration_digest, calibration_of
 from robosac.defenses import DefenseSettings, Kinds, shipped
 from robosac.defenses.group_testing import CalibrationError
@@ -201,6 +202,21 @@ class SessionCreated(BaseModel):
     latency_budget_ms: float
     gather_ms: float
     frame_period_ms: float
+    receipt: LogReceipt = Field(description="The log's beginning, signed by the gateway.")
+
+
+class GatewayKey(BaseModel):
+    """One of the gateway's public keys."""
+
+    key_id: str
+    public_key: str = Field(description="Ed25519, 32 bytes in base64.")
+    signs: bool = Field(description="Whether it signs now; what the others signed before is still good.")
+
+
+class GatewayKeyList(BaseModel):
+    """The gateway's public keys."""
+
+    keys: list[GatewayKey]
 
 
 class ChangedTeam(BaseModel):
@@ -238,6 +254,7 @@ class SessionState(BaseModel):
     )
     audit_seq: int = Field(description="Number of the latest audit record.")
     audit_head: str = Field(description="SHA-256 of the latest audit record: with it a cut-off log is found out.")
+    receipt: LogReceipt = Field(description="The same end of the log, signed by the gateway.")
     next_seed_commitment: str = Field(description="SHA-256 of the seed of the next frame's draws.")
 
 
@@ -247,3 +264,4 @@ class Receipt(BaseModel):
     frame: int
     vehicle_id: str
     status: Literal["accepted"] = "accepted"
+    receipt: LogReceipt = Field(description="The log's end at this moment, signed by the gateway.")

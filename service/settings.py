@@ -24,6 +24,9 @@ class Settings(BaseSettings):
     extra_defenses: Annotated[tuple[str, ...], NoDecode] = Field(
         (), description="Defences beside those that ship: module:callable or entry points, separated by commas."
     )
+    allow_other_weights: bool = Field(
+        False, description="Whether sessions go on after a start with other weights of their detector's name."
+    )
     api_keys: Annotated[tuple[SecretStr, ...], NoDecode] = Field(
         (), description="Keys that open sessions, separated by commas; without any, only loopback is served."
     )
@@ -31,9 +34,12 @@ class Settings(BaseSettings):
     token_secrets: Annotated[tuple[SecretStr, ...], NoDecode] = Field(
         (), description="Secrets of tokens, separated by commas: the first signs, all verify; else the store keeps one."
     )
+    gateway_key_file: Path | None = Field(
+        None, description="File of the gateway's own keys, one a line: the first signs; else the store keeps one."
+    )
     token_ttl_s: float = Field(86_400.0, ge=1, description="How long a vehicle's token lives.")
     latency_budget_ms: float = Field(
-        200.0, gt=0, le=60_000, description="Budget of sessions that name none: from a frame's last byte to its answer."
+        200.0, gt=0, le=60_000, description="Budget of sessions that name none: from a frame's head to its answer."
     )
     gather_ms: float = Field(
         100.0,
@@ -44,7 +50,20 @@ class Settings(BaseSettings):
     database_url: str = Field("sqlite:///robosac.db", repr=False, description="Where sessions and audit logs are kept.")
     max_body_bytes: int = Field(32 * 2**20, ge=1024, description="Largest request body.")
     body_timeout_s: float = Field(10.0, gt=0, description="Time that a body may take from first to last byte.")
+    max_inflight_bytes: int = Field(
+        2**29, ge=2**20, description="Bodies of all requests in hand; beyond, more are refused unread."
+    )
+    max_inflight_bytes_per_key: int = Field(2**28, ge=2**20, description="The same of the sessions of one API key.")
+    max_budget_ms: float = Field(60_000, gt=0, le=60_000, description="Longest latency budget of a session.")
+    max_gather_ms: float = Field(60_000, ge=0, le=60_000, description="Longest wait for teammates of a session.")
+    max_hypotheses: int = Field(1000, ge=1, description="Hypotheses tested in a frame, whatever its budget.")
+    max_frame_jump: int = Field(
+        1_000_000, ge=1, description="By how much a frame's number may exceed the latest answered one."
+    )
     max_sessions: int = Field(10_000, ge=1, description="Open sessions at a time.")
+    max_sessions_per_key: int = Field(
+        2000, ge=1, description="Open sessions of one API key at a time, where one is asked for."
+    )
     max_teammates: int = Field(63, ge=1, le=1024, description="Teammates of one session.")
     max_pending_frames: int = Field(
         4, ge=1, description="Frames after the next for which a teammate's message is kept."
@@ -59,6 +78,12 @@ class Settings(BaseSettings):
     )
     session_idle_s: float = Field(3600.0, gt=0, description="A session unused for longer is ended.")
     audit_retention_s: float = Field(7 * 86400.0, gt=0, description="How long the log of an ended session can be read.")
+    audit_max_records: int = Field(
+        2_000_000, ge=1, description="Records of one session's log; beyond, its frames are refused. One has about 2 kB."
+    )
+    audit_full_every: int = Field(
+        200, ge=1, le=100_000, description="Frames from one audit record with the whole state to the next."
+    )
     log_level: Literal["debug", "info", "warning", "error"] = Field("info", description="Least of what is logged.")
     log_format: Literal["json", "console"] = Field("json", description="One JSON object a line, or for the eye.")
     torch_threads: int = Field(1, ge=1, description="Threads of one detector pass; at this size one is fastest.")

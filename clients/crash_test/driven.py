@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import json
-from collections.abc import Iterator, Mapping
+from collections.abc import Iterator
 from dataclasses import dataclass, field
 from typing import Any
 
@@ -11,7 +11,9 @@ from clients.client import GatewayClient, OpenedSession, VehicleClient
 from clients.errors import AccessDenied, GatewayError
 from clients.load_test import EGO, Bodies
 from robosac.answers import FrameAnswer
-from robosac.audit import GENESIS, commitment, digest, seal
+from robosac.audit import GENESIS, commitment, digest, expanded, seal
+from robosac.audit.compact import logged
+from robosac.audit.packing import state_digest
 
 
 @dataclass
@@ -30,7 +32,7 @@ class Driven:
     """These three are of the last line that was checked: its number, its digest, its commitment to the next seed."""
     answered: int = 0
     last_frame: int = -1
-    state: Mapping[str, Any] = field(default_factory=dict)
+    state_digest: str | None = None
     """These three are what the log says."""
 
     def ego(self, gateway: GatewayClient) -> VehicleClient:
@@ -55,11 +57,13 @@ class Driven:
             if record["frame"] <= self.last_frame:
                 yield f"frame {record['frame']} was decided after frame {self.last_frame}"
             answer = self.acknowledged.pop(record["frame"], None)
-            if answer is not None and answer.as_json() != FrameAnswer.model_validate(record).as_json():
+            if answer is not None and _recorded(answer) != _recorded(FrameAnswer.model_validate(expanded(record))):
                 yield f"frame {record['frame']} is in the log with another result than was acknowledged"
             self.answered, self.last_frame = self.answered + 1, record["frame"]
         self.commitment = record.get("next_seed_commitment", self.commitment)
-        self.state = record.get("state", self.state)
+        known = expanded(record)
+        own = state_digest(known["state"]) if "state" in known else self.state_digest
+        self.state_digest = known.get("state_digest", own)
 
     async def check(self, gateway: GatewayClient, bodies: Bodies) -> list[str]:
         """What is wrong with the session after a restart; posts its next frame."""
@@ -74,8 +78,9 @@ class Driven:
             "next_seed_commitment": self.commitment,
             "frames_answered": self.answered,
             "last_frame": self.last_frame if self.answered else None,
-            "state": self.state,
+            "state_digest": self.state_digest,
         }
+        state = {**state, "state_digest": state_digest(state["state"])}
         wrong += [f"{name} is {state[name]!r}, not {due!r}" for name, due in expected.items() if state[name] != due]
         if not before <= self.last_frame < self.next_frame:
             wrong.append(f"the last frame is {self.last_frame}")
@@ -94,3 +99,8 @@ class Driven:
         except AccessDenied as error:
             return [] if error.status == 403 else [f"the token of {name} is worth nothing any more"]
         return [f"{name} was taken for the ego"]
+
+
+def _recorded(answer: FrameAnswer) -> dict[str, Any]:
+    """What a record and an answer say alike: all but the time, which went on after the record was written."""
+    return {name: value for name, value in logged(answer).items() if name not in ("deadline_met", "timings_ms")}

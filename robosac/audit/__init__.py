@@ -1,6 +1,24 @@
 """The audit log: how its records are chained, and what can be proved from them."""
 
-from robosac.audit.chain import GENESIS, commitment, digest, seal
-from robosac.audit.verification import Fault, Finding, verify
+from robosac.audit.chain import GENESIS, Unsealed, commitment, digest, seal
+from robosac.audit.compact import FULL_EVERY, Writer, compact
+from robosac.audit.expanding import expanded
+from robosac.audit.findings import Fault, Finding
+from robosac.audit.receipts import Receipts
+from robosac.audit.verification import verify
 
-__all__ = ["GENESIS", "Fault", "Finding", "commitment", "digest", "seal", "verify"]
+__all__ = [
+    "FULL_EVERY",
+    "GENESIS",
+    "Fault",
+    "Finding",
+    "Receipts",
+    "Unsealed",
+    "Writer",
+    "commitment",
+    "compact",
+    "digest",
+    "expanded",
+    "seal",
+    "verify",
+]

@@ -9,6 +9,7 @@ from __future__ import annotations
 
 import hashlib
 from collections.abc import Mapping
+from dataclasses import InitVar, dataclass, field
 from typing import Any
 
 import rfc8785
@@ -17,13 +18,42 @@ GENESIS = "0" * 64
 """``previous`` of a log's first record."""
 
 
+@dataclass(frozen=True)
+class Unsealed:
+    """A record whose place in the log is not known yet; its parts are in canonical form, so that `seal` costs little.
+
+    Parameters
+    ----------
+    event : mapping
+        What the record says; JSON values, integers below 2**53.
+
+    Raises
+    ------
+    rfc8785.CanonicalizationError
+        If a value has no canonical form, such as NaN.
+    """
+
+    event: InitVar[Mapping[str, Any]]
+    parts: Mapping[str, bytes] = field(init=False)
+
+    def __post_init__(self, event: Mapping[str, Any]) -> None:
+        object.__setattr__(self, "parts", {name: rfc8785.dumps(value) for name, value in event.items()})
+
+    def seal(self, session_id: str, seq: int, previous: str) -> str:
+        """The line of the record; see `seal`."""
+        place: dict[str, Any] = {"session_id": session_id, "seq": seq, "previous": previous}
+        parts = {**self.parts, **{name: rfc8785.dumps(value) for name, value in place.items()}}
+        ordered = sorted(parts.items(), key=lambda part: part[0].encode("utf-16be"))  # as RFC 8785 has it
+        return (b"{" + b",".join(rfc8785.dumps(name) + b":" + value for name, value in ordered) + b"}").decode()
+
+
 def seal(event: Mapping[str, Any], session_id: str, seq: int, previous: str) -> str:
     """The line of a record.
 
     Parameters
     ----------
     event : mapping
-        What the record says; JSON values, integers below 2**53.
+        As `Unsealed` takes it.
     session_id : str
     seq : int
         Number of the record.
@@ -33,10 +63,9 @@ def seal(event: Mapping[str, Any], session_id: str, seq: int, previous: str) -> 
     Raises
     ------
     rfc8785.CanonicalizationError
-        If a value has no canonical form, such as NaN.
+        As `Unsealed`.
     """
-    line: bytes = rfc8785.dumps({**event, "session_id": session_id, "seq": seq, "previous": previous})
-    return line.decode()
+    return Unsealed(event).seal(session_id, seq, previous)
 
 
 def digest(line: str) -> str:

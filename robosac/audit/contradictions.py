@@ -6,7 +6,6 @@ from collections.abc import Collection, Iterator
 
 from robosac.answers import Reason, Source, Verdict
 from robosac.audit.events import FrameAnswered
-from robosac.defenses import trusted_in
 
 
 def contradictions(
@@ -42,7 +41,7 @@ def _of_answer(answer: FrameAnswered, trusted: Collection[str] | None) -> Iterat
     elif trusted is not None and not accepted <= set(trusted):
         yield f"{_listed(accepted - set(trusted))} accepted as trusted, but not on the trust list before"
     if trusted is not None:
-        gained = set(trusted_in(answer.state)) - set(trusted).union(*verified)
+        gained = set(answer.trusts) - set(trusted).union(*verified)
         if gained:
             yield f"{_listed(gained)} on the trust list without a consensus"
 

@@ -10,12 +10,21 @@ import base64
 import json
 from collections.abc import Mapping
 from datetime import UTC, datetime
-from typing import Annotated, Any, Literal, NoReturn, get_args
+from typing import Annotated, Any, Literal, NoReturn, Self, get_args
 
 import rfc8785
-from pydantic import AfterValidator, BeforeValidator, Field, PlainSerializer, ValidationError, field_validator
+from pydantic import (
+    AfterValidator,
+    BeforeValidator,
+    Field,
+    PlainSerializer,
+    ValidationError,
+    field_validator,
+    model_validator,
+)
 
 from robosac.answers import FrameAnswer, Pose, Reason, Typed
+from robosac.audit.expanding import expanded
 from robosac.defenses import trusted_in
 
 
@@ -73,6 +82,8 @@ class SessionOpened(_Event):
     version: str
     ego_id: str
     teammates: tuple[str, ...]
+    format: int = 1
+    """Of the log's records, see `robosac.audit.expanding`."""
     detector: str
     weights_digest: str
     calibration_digest: str | None = None
@@ -98,6 +109,20 @@ class TeamChanged(_Event):
     state: State
 
 
+class DetectorChanged(_Event):
+    """The gateway was started again with other weights, or another calibration, of the detector's name.
+
+    Where the operator did not allow that the session goes on with them, ``accepted`` is false, and it stands still.
+    """
+
+    event: Literal["detector_changed"] = "detector_changed"
+    detector: str
+    weights_digest: str
+    calibration_digest: str | None = None
+    screening: dict[str, MessageBounds] | None = None
+    accepted: bool
+
+
 class FrameAnswered(_Event, FrameAnswer):
     """A frame is decided: the answer, and all that it takes to recompute it.
 
@@ -105,6 +130,9 @@ class FrameAnswered(_Event, FrameAnswer):
     ego's among them. ``previous_frame`` is the frame of the previous answer that the fusion was given. Refusals that
     were too many to get a record each are counted in ``unlogged_refusals``, by vehicle; ``?`` stands for callers
     without a valid token.
+
+    A record that is not full has no ``state``, but its ``state_digest`` (`robosac.audit.packing.state_digest`) and whom
+    it trusts.
     """
 
     event: Literal["frame_answered"] = "frame_answered"
@@ -114,7 +142,9 @@ class FrameAnswered(_Event, FrameAnswer):
     previous_frame: int | None = None
     out_of_time: bool
     fault: str | None = None
-    state: State
+    state: State | None = Field(None, exclude_if=lambda state: state is None)
+    state_digest: str | None = Field(None, exclude_if=lambda digest: digest is None)
+    trusted: tuple[str, ...] | None = Field(None, exclude_if=lambda names: names is None)
     unlogged_refusals: dict[str, int] = Field(default_factory=dict)
     next_seed_commitment: str
 
@@ -124,6 +154,17 @@ class FrameAnswered(_Event, FrameAnswer):
         int(seed, 16)
         bytes.fromhex(seed)
         return seed
+
+    @model_validator(mode="after")
+    def _check_state_is_known(self) -> Self:
+        if self.state is None and (self.state_digest is None or self.trusted is None):
+            raise ValueError("a record without state needs state_digest and trusted")
+        return self
+
+    @property
+    def trusts(self) -> tuple[str, ...]:
+        """The trust list after the frame."""
+        return trusted_in(self.state) if self.state is not None else self.trusted or ()
 
 
 class MessageRefused(_Event):
@@ -174,6 +215,7 @@ class SessionEnded(_Event):
 Event = (
     SessionOpened
     | TeamChanged
+    | DetectorChanged
     | FrameAnswered
     | MessageRefused
     | AccessRefused
@@ -209,14 +251,21 @@ def event_on(line: bytes) -> Event | None:
     RecordError
         If it is not a JSON object, or not what an event of its kind has to be.
     """
-    kind = _KINDS.get(str(read(line).get("event")))
+    return event_of(read(line))
+
+
+def event_of(record: Mapping[str, Any]) -> Event | None:
+    """As `event_on`, of a record that was read already."""
+    kind = _KINDS.get(str(record.get("event")))
     if kind is None:
         return None
     try:
-        return kind.model_validate_json(line, strict=True)
+        return kind.model_validate_json(json.dumps(expanded(record)), strict=True)
     except ValidationError as error:
         first = error.errors(include_url=False, include_input=False)[0]
         raise RecordError(f"{'.'.join(map(str, first['loc']))}: {first['msg']}") from error
+    except (ValueError, RecursionError) as error:
+        raise RecordError(str(error)) from error
 
 
 def is_canonical(line: bytes, record: Mapping[str, Any]) -> bool:

@@ -20,7 +20,7 @@ from robosac.audit.events import (
     Proof,
     SessionOpened,
     TeamChanged,
-    event_on,
+    event_of,
     read,
 )
 from robosac.defenses import Reference
@@ -120,7 +120,7 @@ class _Case:
         record = read(line)
         self.head = digest(line.decode())
         self.last_seq, self.session_id = int(record["seq"]), str(record["session_id"])
-        match event_on(line):
+        match event_of(record):
             case SessionOpened() as opened:
                 self.session = opened
                 self.key = opened.public_keys.get(self.vehicle)
@@ -175,8 +175,8 @@ class _Case:
         self.location = {"frame": answer.frame, "worldFromSensor": answer.ego_pose.reshape(-1).tolist()}
 
     def _take_equivocation(self, lie: Equivocation) -> None:
-        if lie.vehicle_id == self.vehicle:
-            first = lie.first if lie.first.signature else self.proofs.get(lie.first.digest, lie.first)
+        first = lie.first if lie.first.signature else self.proofs.get(lie.first.digest, lie.first)
+        if lie.vehicle_id == self.vehicle and first.signature and lie.second.signature:  # else nothing proves it
             obs = {"frame": lie.frame, "time": lie.time}
             self._observe("message", "equivocation", SAME_STATION, obs, lie.frame, [first, lie.second])
 

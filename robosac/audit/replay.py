@@ -4,8 +4,7 @@ from __future__ import annotations
 
 import json
 import math
-from collections import deque
-from collections.abc import Iterable, Iterator, Mapping, Sequence
+from collections.abc import Iterator, Mapping, Sequence
 from dataclasses import dataclass
 from typing import Any
 
@@ -13,7 +12,10 @@ import numpy as np
 
 from robosac import wire
 from robosac.answers import ContradictedBox, Support, TestedHypothesis
-from robosac.audit.events import FrameAnswered, RecordError, SessionOpened, TeamChanged, event_on
+from robosac.audit.decisions import LoggedDecision, ReplayError, find
+from robosac.audit.events import FrameAnswered
+from robosac.audit.packing import state_digest
+from robosac.boxes import BOX_UNITS, FloatArray
 from robosac.budget import DomainError
 from robosac.calibrated import calibration_digest, calibration_of
 from robosac.deadline import Recorded
@@ -21,32 +23,18 @@ from robosac.defenses import Defense, Kinds, Outcome, State, build, read_setting
 from robosac.detectors import Message, Preparer
 from robosac.faults import in_short
 from robosac.fusion import FusionResult
-from robosac.previous import PreviousAnswer
 from robosac.screening import MEMORY, Bounds, Screening
 from robosac.session import Session
+
+__all__ = ["Difference", "LoggedDecision", "ReplayError", "find", "replay"]
 
 JACCARD_TOLERANCE = 1e-9
 STATE_TOLERANCE = 2e-6
 """What it holds of boxes is rounded to 1e-6."""
 BOX_TOLERANCE = 1e-6
 """Metres, radians and score: what another order of summation may change."""
-
-
-class ReplayError(ValueError):
-    """A log or messages from which the decision cannot be made again."""
-
-
-@dataclass(frozen=True)
-class LoggedDecision:
-    """A decision, and what the log says it was made from."""
-
-    line: int
-    """Of the log, from 1 on."""
-    session: SessionOpened
-    state: State
-    """The defence's, before the frame."""
-    previous: PreviousAnswer | None
-    answer: FrameAnswered
+WHOLE = 1e-6
+"""As near to a whole number of units a logged value is taken to be rounded."""
 
 
 @dataclass(frozen=True)
@@ -62,53 +50,18 @@ class Difference:
         return f"{self.what}: {self.detail}"
 
 
-def find(lines: Iterable[bytes], frame: int) -> LoggedDecision:
-    """The decision about a frame, and all it was made from but the messages.
-
-    Parameters
-    ----------
-    lines : iterable of bytes
-        Of the log. Whether it can be relied on is for `robosac.audit.verify` to say.
-    frame : int
-
-    Raises
-    ------
-    ReplayError
-        If the log does not hold the decision, or not what came before it.
-    """
-    session: SessionOpened | None = None
-    state: State = {}
-    recent: deque[FrameAnswered] = deque(maxlen=2)
-    for number, line in enumerate(lines, 1):
-        try:
-            event = event_on(line.removesuffix(b"\n"))
-        except RecordError as error:
-            raise ReplayError(f"line {number}: {error}") from error
-        if isinstance(event, SessionOpened):
-            session = event
-        if isinstance(event, FrameAnswered):
-            if session is None:
-                raise ReplayError("the log does not begin with the session's opening")
-            if event.frame == frame:
-                return LoggedDecision(number, session, state, _before(event, recent), event)
-            recent.append(event)
-        if isinstance(event, SessionOpened | TeamChanged | FrameAnswered):
-            state = event.state
-    raise ReplayError(f"the log holds no answer to frame {frame}")
-
-
 def replay(decision: LoggedDecision, body: bytes, detector: Preparer, kinds: Kinds | None = None) -> list[Difference]:
     """Make a decision again and compare.
 
     Jaccard indices are compared to `JACCARD_TOLERANCE`, boxes to `BOX_TOLERANCE`, the defence's state to
     `STATE_TOLERANCE`; times are not. A decision that the deadline cut short is made again with one that passes after as
-    many hypotheses.
+    many hypotheses. Where the log holds only the digest of what was remembered, the body has to hold it.
 
     Parameters
     ----------
     decision : LoggedDecision
     body : bytes
-        The messages, as a whole frame (`robosac.wire.read_frame`).
+        The messages, as a whole frame (`robosac.wire.read_frame`), as the gateway keeps it.
     detector : Preparer
         The one that the session had.
     kinds : mapping, optional
@@ -137,28 +90,23 @@ def replay(decision: LoggedDecision, body: bytes, detector: Preparer, kinds: Kin
         defense = build(settings, lambda: calibration_of(detector.info))
     except DomainError as error:
         raise ReplayError(f"the log's settings make no defence: {error}") from error
-    messages = _read_messages(decision, body, detector)
+    messages, states = _read_messages(decision, body, detector)
     wrong = list(_compare_digests(logged, messages))
     if wrong:
         return wrong
-    made = _fuse(decision, defense, messages, detector)
-    return [*_compare(logged, made), *_compare_provenance(logged, made, decision.session.ego_id)]
+    before = decision.state if decision.state is not None else _kept_state(states, "before", decision.state_digest)
+    if before is None:
+        raise ReplayError("the log has only the digest of what was remembered before, the messages lack it")
+    after = logged.state if logged.state is not None else _kept_state(states, "after", logged.state_digest)
+    made = _fuse(decision, before, defense, messages, detector)
+    differences = [*_compare(logged, made), *_compare_state(logged, after, made)]
+    return [*differences, *_compare_provenance(decision, made)]
 
 
-def _before(answer: FrameAnswered, recent: Iterable[FrameAnswered]) -> PreviousAnswer | None:
-    """The previous answer that a decision was given, with its motion since the answer before it."""
-    if answer.previous_frame is None:
-        return None
-    by_frame = {earlier.frame: earlier for earlier in recent}
-    last = by_frame.get(answer.previous_frame)
-    if last is None:
-        raise ReplayError(f"the log lacks frame {answer.previous_frame}, the previous answer of frame {answer.frame}")
-    older = None if last.previous_frame is None else by_frame.get(last.previous_frame)
-    then = None if older is None else PreviousAnswer.of(older.frame, older.ego_pose, older.boxes)
-    return PreviousAnswer.of(last.frame, last.ego_pose, last.boxes, then)
-
-
-def _read_messages(decision: LoggedDecision, body: bytes, detector: Preparer) -> dict[str, Message]:
+def _read_messages(
+    decision: LoggedDecision, body: bytes, detector: Preparer
+) -> tuple[dict[str, Message], Mapping[str, bytes]]:
+    """The messages, and what was remembered before and after, where that was kept."""
     ego_id = decision.session.ego_id
     try:
         envelope = wire.read_frame(body)
@@ -166,10 +114,19 @@ def _read_messages(decision: LoggedDecision, body: bytes, detector: Preparer) ->
             raise ReplayError(f"the messages are of frame {envelope.frame}, not {decision.answer.frame}")
         messages = {ego_id: wire.check_message(envelope.ego, detector.info, "ego", "ego")}
         for name, payload in envelope.teammates.items():
-            messages[str(name)] = wire.check_message(payload, detector.info, "teammate", f"teammates.{name}")
+            messages[name] = wire.check_message(payload, detector.info, "teammate", f"teammates.{name}")
     except wire.WireError as error:
         raise ReplayError(f"not the messages of a frame: {error}") from error
-    return messages
+    return messages, envelope.states
+
+
+def _kept_state(states: Mapping[str, bytes], which: str, digest: str | None) -> State | None:
+    """A state that was kept with the messages; None if it is not the one in the log."""
+    try:
+        state: State = json.loads(states.get(which, b""))
+        return state if state_digest(state) == digest else None
+    except (ValueError, TypeError, RecursionError):
+        return None
 
 
 def _compare_digests(logged: FrameAnswered, messages: dict[str, Message]) -> Iterator[Difference]:
@@ -182,9 +139,11 @@ def _compare_digests(logged: FrameAnswered, messages: dict[str, Message]) -> Ite
             yield Difference("messages", f"that of {name} is not the one in the log")
 
 
-def _fuse(decision: LoggedDecision, defense: Defense, messages: dict[str, Message], detector: Preparer) -> FusionResult:
+def _fuse(
+    decision: LoggedDecision, state: State, defense: Defense, messages: dict[str, Message], detector: Preparer
+) -> FusionResult:
     logged, previous = decision.answer, decision.previous
-    saved = {"state": decision.state, "previous": None if previous is None else previous.as_json()}
+    saved = {"state": state, "previous": None if previous is None else previous.as_json()}
     session = Session(detector, decision.session.teammates, defense, saved, screening=_screening(decision))
     teammates = dict(messages)
     ego = teammates.pop(decision.session.ego_id)
@@ -193,11 +152,25 @@ def _fuse(decision: LoggedDecision, defense: Defense, messages: dict[str, Messag
 
 
 def _screening(decision: LoggedDecision) -> Screening | None:
-    """The tests of messages that the frame was put to; what they remember tells that there were any."""
-    if MEMORY not in decision.answer.state:
+    """The tests of messages that the frame was put to."""
+    if not _was_screened(decision):
         return None
     known = decision.session.screening or {}
     return Screening({name: Bounds.from_json(dict(bounds)) for name, bounds in known.items()})
+
+
+def _was_screened(decision: LoggedDecision) -> bool:
+    """Whether messages were tested: what the tests remember tells it, or where that is not at hand, the opening."""
+    state = decision.answer.state
+    return decision.session.screening is not None if state is None else MEMORY in state
+
+
+def _compare_state(logged: FrameAnswered, after: State | None, made: FusionResult) -> Iterator[Difference]:
+    if after is not None:
+        if not _agree(dict(made.state), dict(after)):
+            yield Difference("state", f"{_shown(dict(made.state))}, logged {_shown(dict(after))}")
+    elif (digest := state_digest(made.state)) != logged.state_digest:
+        yield Difference("state", f"of digest {digest}, logged {logged.state_digest}")
 
 
 def _compare(logged: FrameAnswered, made: FusionResult) -> Iterator[Difference]:
@@ -210,21 +183,29 @@ def _compare(logged: FrameAnswered, made: FusionResult) -> Iterator[Difference]:
     ]
     for name, why in made.rejected.items():
         compared.append(("rejected", f"{name} {why.reason.value}", f"{name} {reasons.get(name)}"))
-    compared.append(("state", dict(made.state), dict(logged.state)))
     for what, now, then in compared:
         if not _agree(now, then):
             yield Difference(what, f"{_shown(now)}, logged {_shown(then)}")
     yield from _compare_hypotheses(logged, made)
     if made.boxes.shape != logged.boxes.shape:
         yield Difference("boxes", f"{len(made.boxes)} of them, logged {len(logged.boxes)}")
-    elif (farthest := float(np.abs(made.boxes - logged.boxes).max(initial=0.0))) > BOX_TOLERANCE:
+    elif (farthest := _farthest(made.boxes, logged.boxes)) > BOX_TOLERANCE:
         yield Difference("boxes", f"up to {farthest:.3g} from those logged")
 
 
-def _compare_provenance(logged: FrameAnswered, made: FusionResult, ego_id: str) -> Iterator[Difference]:
+def _farthest(made: FloatArray, logged: FloatArray) -> float:
+    """How far boxes (n, 6) are from those logged, beyond what they may be by being rounded in the log."""
+    units = np.array(BOX_UNITS, dtype=np.float64)
+    rounded = np.abs(logged * units - np.round(logged * units)) < WHOLE
+    apart = np.abs(made - logged) - np.where(rounded, 0.5 / units, 0.0)
+    return float(apart.max(initial=0.0))
+
+
+def _compare_provenance(decision: LoggedDecision, made: FusionResult) -> Iterator[Difference]:
     """On whose word boxes stand, which are left out, and whose maps are alike; older versions wrote none of it."""
+    logged, ego_id = decision.answer, decision.session.ego_id
     alike = [[each.as_json() for each in both] for both in (made.likenesses(ego_id), logged.alike)]
-    if MEMORY in logged.state and not _agree(*alike):
+    if _was_screened(decision) and not _agree(*alike):
         yield Difference("alike", f"{_shown(alike[0])}, logged {_shown(alike[1])}")
     supports: list[tuple[str, Sequence[Support] | None, Sequence[Support] | None]] = [
         ("support", made.support(ego_id), logged.support),
@@ -241,7 +222,7 @@ def _compare_provenance(logged: FrameAnswered, made: FusionResult, ego_id: str) 
             if _whose(mine) != _whose(theirs):
                 yield Difference(what, f"box {i}: {_shown(_whose(mine))}, logged {_shown(_whose(theirs))}")
             elif isinstance(mine, ContradictedBox) and isinstance(theirs, ContradictedBox):
-                farthest = float(np.abs(np.subtract(mine.box, theirs.box)).max())
+                farthest = _farthest(np.array(mine.box), np.array(theirs.box))
                 if farthest > BOX_TOLERANCE:
                     yield Difference(what, f"box {i}: up to {farthest:.3g} from the one logged")
 

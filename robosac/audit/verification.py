@@ -5,8 +5,9 @@ from __future__ import annotations
 import hashlib
 from collections.abc import Iterable, Mapping
 from dataclasses import dataclass, field
-from enum import StrEnum
 from typing import Any
+
+from cryptography.hazmat.primitives.asymmetric.ed25519 import Ed25519PublicKey
 
 from robosac.audit.chain import GENESIS, commitment
 from robosac.audit.contradictions import contradictions
@@ -18,54 +19,19 @@ from robosac.audit.events import (
     SessionEnded,
     SessionOpened,
     TeamChanged,
-    event_on,
+    event_of,
     is_canonical,
     read,
 )
+from robosac.audit.expanding import FORMAT
+from robosac.audit.findings import Fault, Finding
+from robosac.audit.receipts import Receipts
 from robosac.consensus import DEFAULT_THRESHOLD
 from robosac.defenses import trusted_in
-from robosac.signatures import is_valid, read_public_key
+from robosac.signatures import is_valid, is_valid_v1, read_public_key
 
 
-class Fault(StrEnum):
-    """What is wrong."""
-
-    NOT_JSON = "not-json"
-    NOT_CANONICAL = "not-canonical"
-    MALFORMED = "malformed"
-    """Something that the event has to say is missing, or of the wrong kind."""
-    MISPLACED = "misplaced"
-    """A session that is opened twice or not at all, or goes on after its end."""
-    WRONG_SESSION = "wrong-session"
-    WRONG_SEQ = "wrong-seq"
-    BROKEN_LINK = "broken-link"
-    """``previous`` is not the digest of the line before."""
-    WRONG_HEAD = "wrong-head"
-    WRONG_SEED = "wrong-seed"
-    """A seed that is not the one that was committed to."""
-    FRAME_ORDER = "frame-order"
-    CONTRADICTION = "contradiction"
-    BAD_SIGNATURE = "bad-signature"
-
-
-@dataclass(frozen=True)
-class Finding:
-    """Something wrong in a log."""
-
-    line: int
-    """From 1 on; 0 for an empty log."""
-    seq: int | None
-    """As the record gives it, where it does."""
-    fault: Fault
-    detail: str
-    """For a human."""
-
-    def __str__(self) -> str:
-        where = f"line {self.line}" if self.seq is None else f"line {self.line} (seq {self.seq})"
-        return f"{where}: {self.fault}: {self.detail}"
-
-
-def verify(lines: Iterable[bytes], head: str | None = None) -> list[Finding]:
+def verify(lines: Iterable[bytes], head: str | None = None, receipts: Receipts | None = None) -> list[Finding]:
     """Check an audit log.
 
     A line is read only once, and no more is kept than what the next has to agree with. Each fault is reported once: a
@@ -78,13 +44,15 @@ def verify(lines: Iterable[bytes], head: str | None = None) -> list[Finding]:
     head : str, optional
         What the digest of the last line must be. Without it, nobody can tell whether the end is missing, or whether the
         last record was changed.
+    receipts : Receipts, optional
+        Ends of the log that the gateway signed before; each must still be in it.
 
     Returns
     -------
     list of Finding
         In the order of the lines; empty if nothing is wrong.
     """
-    run = _Verification(head)
+    run = _Verification(head, receipts)
     for line in lines:
         run.take(line.removesuffix(b"\n"))
     run.finish()
@@ -102,17 +70,21 @@ class _History:
     trusted: tuple[str, ...] | None = None
     keys: dict[str, str] = field(default_factory=dict)
     doubtful: set[str] = field(default_factory=set)
+    format: int = FORMAT
+    latest: FrameAnswered | None = None
 
     def doubt(self) -> None:
         """Forget all that a missing or changed record may have changed."""
-        self.commitment = self.frame = self.trusted = None
+        self.commitment = self.frame = self.trusted = self.latest = None
         self.doubtful = set(self.keys)
 
 
 class _Verification:
-    def __init__(self, head: str | None) -> None:
+    def __init__(self, head: str | None, receipts: Receipts | None) -> None:
         self.findings: list[Finding] = []
         self._head = head
+        self._receipts = receipts
+        self._promised: dict[int, str] | None = None
         self._head_seen_at: int | None = None
         self._line = 0
         self._seq: int | None = None
@@ -132,6 +104,7 @@ class _Verification:
             self._head_seen_at = self._line
         record = self._read(line)
         self._damaged = record is None
+        self._check_promise(record)
         if record is None:
             self._expected_seq += 1
             self._history.doubt()
@@ -141,7 +114,7 @@ class _Verification:
                 self._history = _History()
             self._history.doubt()
         try:
-            self._check(record, line)
+            self._check(record)
         except RecordError as error:
             self._find(Fault.MALFORMED, str(error))
             self._history.doubt()
@@ -157,6 +130,26 @@ class _Verification:
                 else f"the head is that of line {seen}; nothing vouches for the lines after it"
             )
             self._find(Fault.WRONG_HEAD, what)
+        if self._receipts is None:
+            return
+        for detail in self._receipts.contradictions(self._session):
+            self._find(Fault.BROKEN_PROMISE, detail)
+        if missing := sorted(self._promised or ()):
+            more = f", and {len(missing) - 1} more after it" if len(missing) > 1 else ""
+            self._find(Fault.BROKEN_PROMISE, f"the gateway signed a record {missing[0]}{more}; it is not in the log")
+        if not self._receipts.of(self._session):
+            self._find(Fault.BROKEN_PROMISE, "no receipt is of this session")
+
+    def _check_promise(self, record: Mapping[str, Any] | None) -> None:
+        """Compare a line with what the gateway signed of it."""
+        if self._receipts is None or record is None:
+            return
+        if self._promised is None:
+            session = record.get("session_id")
+            self._promised = dict(self._receipts.of(session if isinstance(session, str) else None))
+        promised = None if self._seq is None else self._promised.pop(self._seq, None)
+        if promised not in (None, self._digest):
+            self._find(Fault.BROKEN_PROMISE, f"the gateway signed {promised} as the digest of record {self._seq}")
 
     def _find(self, fault: Fault, detail: str) -> None:
         self.findings.append(Finding(self._line, self._seq, fault, detail))
@@ -193,13 +186,13 @@ class _Verification:
         self._session = session if isinstance(session, str) else self._session
         return len(self.findings) == found
 
-    def _check(self, record: Mapping[str, Any], line: bytes) -> None:
+    def _check(self, record: Mapping[str, Any]) -> None:
         if (record.get("event") == "session_opened") != (self._line == 1):
             self._find(Fault.MISPLACED, "the session is opened again" if self._line > 1 else "no session is opened")
         if self._ended:
             self._find(Fault.MISPLACED, "the session has ended before")
             self._ended = False
-        match event_on(line):
+        match event_of(record):
             case SessionOpened() as opened:
                 self._open(opened)
             case TeamChanged() as change:
@@ -208,11 +201,7 @@ class _Verification:
             case FrameAnswered() as answer:
                 self._check_answer(answer)
             case Equivocation() as lie:
-                if lie.first.digest == lie.second.digest:
-                    self._find(Fault.CONTRADICTION, "an equivocation of one message with itself")
-                if lie.first.signature is not None:
-                    self._check_signature(lie.vehicle_id, lie.first)
-                self._check_signature(lie.vehicle_id, lie.second)
+                self._check_equivocation(lie)
             case SessionEnded():
                 self._ended = True
 
@@ -223,6 +212,7 @@ class _Verification:
             threshold=threshold if isinstance(threshold, int | float) else None,
             commitment=opened.next_seed_commitment,
             trusted=trusted_in(opened.state),
+            format=opened.format,
         )
         self._enrol(opened.public_keys)
 
@@ -245,21 +235,46 @@ class _Verification:
         for detail in contradictions(answer, ego_id=known.ego_id, threshold=known.threshold, trusted=known.trusted):
             self._find(Fault.CONTRADICTION, f"frame {answer.frame}: {detail}")
         for name, proof in answer.messages.items():
-            self._check_signature(name, proof)
+            self._check_signature(name, answer.frame, proof)
+        known.latest = answer
         known.commitment = answer.next_seed_commitment
         known.frame = answer.frame
-        known.trusted = trusted_in(answer.state)
+        known.trusted = answer.trusts
 
-    def _check_signature(self, vehicle: str, proof: Proof) -> None:
+    def _check_equivocation(self, lie: Equivocation) -> None:
+        """Of somebody who signs, both messages must be signed for the frame, here or, the first, in its record."""
+        if lie.first.digest == lie.second.digest:
+            self._find(Fault.CONTRADICTION, "an equivocation of one message with itself")
+        known = self._history
+        if lie.vehicle_id not in known.keys:
+            return
+        first, latest = lie.first, known.latest
+        if first.signature is None and latest is not None and latest.frame == lie.frame:
+            seen = latest.messages.get(lie.vehicle_id, first)
+            first = seen if seen.digest == first.digest else first
+        if first.signature is None and known.format > 1:
+            self._find(Fault.NO_EVIDENCE, f"the first message of {lie.vehicle_id} is neither signed nor in the log")
+        elif first.signature is None or self._check_signature(lie.vehicle_id, lie.frame, first):
+            self._check_signature(lie.vehicle_id, lie.frame, lie.second)
+
+    def _check_signature(self, vehicle: str, frame: int, proof: Proof) -> bool:
+        """Tell of a message that a vehicle should have signed and did not; whether there is nothing to tell."""
         key = self._history.keys.get(vehicle)
         if key is None:
-            return
+            return True
         if proof.signature is None:
             detail = f"the message of {vehicle} is not signed, though it has registered a key"
-        elif not is_valid(read_public_key(key), self._session or "", proof.digest, proof.signature):
-            detail = f"the signature is not that of {vehicle} over its message"
+        elif not self._is_signed(read_public_key(key), vehicle, frame, proof.digest, proof.signature):
+            detail = f"the signature is not that of {vehicle} over its message for frame {frame}"
         else:
-            return
+            return True
         self._find(Fault.BAD_SIGNATURE, detail)
         if vehicle in self._history.doubtful:
             del self._history.keys[vehicle]
+        return False
+
+    def _is_signed(self, key: Ed25519PublicKey, vehicle: str, frame: int, digest: str, signature: bytes) -> bool:
+        session = self._session or ""
+        if is_valid(key, session, vehicle, frame, digest, signature):
+            return True
+        return self._history.format == 1 and is_valid_v1(key, session, digest, signature)

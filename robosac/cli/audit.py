@@ -12,7 +12,8 @@ from typing import Annotated
 import typer
 
 from robosac import detectors, wire
-from robosac.audit import digest, misbehaviour, verification
+from robosac.audit import Receipts, digest, misbehaviour, verification
+from robosac.audit.receipts import by_id
 from robosac.cli.blame import blaming
 
 app = typer.Typer(no_args_is_help=True, add_completion=False, help=__doc__)
@@ -26,8 +27,15 @@ def verify(
     head: Annotated[
         str | None, typer.Option(help="SHA-256 of the last line, from elsewhere: the session's 'audit_head'.")
     ] = None,
+    receipts: Annotated[
+        Path | None, typer.Option(help="Receipts that clients kept (JSON Lines); needs --gateway-key.")
+    ] = None,
+    gateway_key: Annotated[
+        list[str] | None, typer.Option(help="The gateway's public key, base64 (/v1/keys); may be given again.")
+    ] = None,
 ) -> None:
     """Check that nothing in a log was changed, and that it does not contradict itself; 1 if something is wrong."""
+    promised = None if receipts is None else _read_receipts(receipts, gateway_key or [])
     if head is not None and re.fullmatch("[0-9a-f]{64}", head) is None:
         raise typer.BadParameter("must be 64 hexadecimal digits, lower case", param_hint="--head")
     count, last = 0, b""
@@ -39,12 +47,16 @@ def verify(
             yield last
 
     with blaming("FILE", OSError), file.open("rb") as lines:
-        findings = verification.verify(counted(lines), head)
+        findings = verification.verify(counted(lines), head, promised)
     for finding in findings:
         _say(finding)
+    for doubt in promised.doubts if promised else ():
+        _say(f"{receipts}: {doubt}", err=True)
     if findings:
         _say(f"{file}: findings: {len(findings)}")
         raise typer.Exit(1)
+    if promised is not None:
+        _say(f"{file}: as {len(promised.heads)} receipts promised")
     proved = "which is the head given" if head else "to be compared with a head from elsewhere"
     _say(f"{file}: {count} records, nothing wrong; head {digest(last.decode().removesuffix(chr(10)))}, {proved}")
 
@@ -118,6 +130,15 @@ def report(
     with blaming("--out", OSError):
         out.write_text(text)
     _say(f"{out}: {len(fields['report']['content']['v2xPduEvidence'])} observations of {vehicle}")
+
+
+def _read_receipts(file: Path, keys: list[str]) -> Receipts:
+    if not keys:
+        raise typer.BadParameter("is needed: without it anybody could have signed", param_hint="--gateway-key")
+    with blaming("--gateway-key", ValueError):
+        known = by_id(keys)
+    with blaming("--receipts", OSError), file.open("rb") as lines:
+        return Receipts.read(lines, known)
 
 
 def _load(wanted: str | None, logged: str) -> detectors.Detector:

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 from collections.abc import Sequence
 from math import comb
-from typing import Literal
+from typing import ClassVar, Literal
 
 import numpy as np
 from pydantic import Field
@@ -44,6 +44,7 @@ class A2CP(ConsensusSettings):
         max_length=64,
         description="Ascending in [0, 1), multiples of 1 / S; by default all that the team size allows.",
     )
+    budgets: ClassVar[tuple[str, ...]] = ("sampling_budget",)
     sampling_budget: Budget = DEFAULT_BUDGET
     confidence: Confidence = DEFAULT_CONFIDENCE
 

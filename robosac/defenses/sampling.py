@@ -4,7 +4,7 @@ from __future__ import annotations
 
 from collections.abc import Sequence
 from math import comb
-from typing import Annotated, Any, Self
+from typing import Annotated, Any, ClassVar, Self
 
 import numpy as np
 from pydantic import Field, PrivateAttr
@@ -34,6 +34,7 @@ class Sampling(Memoryless):
     given, it guarantees so many collaborators by that law, but at least 1. If neither is, the budget is 7.
     """
 
+    budgets: ClassVar[tuple[str, ...]] = ("sampling_budget",)
     attacker_ratio: float = Field(0.2, gt=0, lt=1, description="Assumed share of attackers among the teammates.")
     sampling_budget: Budget | None = None
     collaborators: int | None = Field(None, ge=1, le=1024, description="Teammates in a hypothesis.")

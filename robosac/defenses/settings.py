@@ -32,6 +32,8 @@ class DefenseSettings(BaseModel):
 
     needs_calibration: ClassVar[bool] = False
     """Whether the defence works only with what ``robosac calibrate`` has made for the detector."""
+    budgets: ClassVar[tuple[str, ...]] = ()
+    """Settings that say how many hypotheses a frame may take."""
     kind: str
 
     @classmethod

@@ -12,6 +12,7 @@ from starlette.types import ASGIApp, Receive, Scope, Send
 from service import problems
 from service.deciding.admission import Admission
 from service.errors import Kind, Refused
+from service.sessions.live import LiveSession
 
 TARGET_BYTES = 2048
 HEADERS = 128
@@ -76,16 +77,16 @@ def is_local(scope: Scope) -> bool:
     return (getattr(address, "ipv4_mapped", None) or address).is_loopback
 
 
-def capacity_check(admission: Admission, budget_s: Callable[[str], float | None]) -> Callable[[Scope], None]:
+def capacity_check(admission: Admission, in_use: Callable[[str], LiveSession | None]) -> Callable[[Scope], None]:
     """A check that refuses whole frames beyond capacity, before anything is authenticated or looked up.
 
-    ``budget_s`` gives the latency budget of a session that is in use, by its id; None if it is not.
+    ``in_use`` gives what is held of a session that is in use, by its id; None if it is not.
     """
 
     def check(scope: Scope) -> None:
         found = _FRAMES_PATH.fullmatch(scope["path"]) if scope["method"] == "POST" else None
-        budget = budget_s(found[1]) if found else None
-        if found and budget is not None:
-            admission.check(found[1], budget)
+        live = in_use(found[1]) if found else None
+        if found and live is not None:
+            admission.check(live.key, found[1], live.budget_s)
 
     return check

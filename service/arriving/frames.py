@@ -2,26 +2,32 @@
 
 from __future__ import annotations
 
+import asyncio
+import contextlib
 import time
+from collections.abc import AsyncIterator, Callable
+from contextlib import AbstractContextManager
 from dataclasses import dataclass
-from typing import Any
+from typing import TypeVar
 
 from robosac import wire
-from robosac.answers import FrameAnswer, Reason
-from robosac.audit.events import Proof
-from robosac.defenses import Rejection
-from robosac.detectors import Role
-from robosac.signatures import is_valid, read_public_key
+from robosac.answers import Reason
+from service.arriving.bodies import SMALL_BYTES
+from service.arriving.checking import InFrame, read_frame, read_message, reason_of
 from service.deciding.admission import Admission
-from service.deciding.answering import Asked, Deciding
-from service.errors import Kind, Refused, Unusable
+from service.deciding.answering import Deciding
+from service.deciding.asked import Answered, Asked
+from service.deciding.keeping import GRACE_S
+from service.errors import Kind, Refused, StoreTooSlow, StoreUnavailable, Unusable
+from service.keeping.record import SessionRecord
 from service.schemas import Receipt
 from service.sessions.gathering import Contradiction, Received
 from service.sessions.live import Caller
 from service.sessions.sessions import Sessions
 from service.watching.metrics import Metrics
 
-STRANGERS_NAMED = 8
+T = TypeVar("T")
+
 SLACK_BYTES = 64 * 1024
 """What a message may have besides its tensors."""
 
@@ -34,56 +40,36 @@ class Frames:
     deciding: Deciding
     metrics: Metrics
     admission: Admission
+    max_jump: int
+    """By how much a frame's number may exceed the latest answered one."""
 
-    async def post_message(self, caller: Caller, body: bytes) -> FrameAnswer | Receipt:
-        """A vehicle's own message: kept for a teammate, answered for the ego."""
-        arrived = time.perf_counter()
-        frame = None
-        try:
-            envelope = wire.read_message(body)
-            frame = envelope.frame
-            if envelope.vehicle_id != caller.vehicle_id:
-                detail = f"the token of {caller.vehicle_id} cannot speak for another vehicle"
-                raise Unusable(Kind.WRONG_VEHICLE, Reason.UNAUTHENTICATED, detail, "vehicle_id")
-            received = _check(caller, caller.vehicle_id, frame, envelope.payload, "")
-        except (wire.WireError, Unusable) as error:
-            await self.refuse(caller, error, frame)
-            raise
+    async def post_message(self, caller: Caller, body: bytes, arrived: float) -> Answered | Receipt:
+        """A vehicle's own message, whose request came then: kept for a teammate, answered for the ego."""
+        frame, received = await self._read(caller, body, read_message)
         if not caller.is_ego:
-            await self._keep(caller, frame, received)
-            return Receipt(frame=frame, vehicle_id=caller.vehicle_id)
+            record = await self._keep(caller, frame, received)
+            return Receipt(frame=frame, vehicle_id=caller.vehicle_id, receipt=self.sessions.keys.receipt(record))
         asked = Asked(caller, frame, received, arrived)
         asked.spent("receive", arrived)
         return await self._answer(asked, gather=True)
 
-    async def post_frame(self, caller: Caller, body: bytes) -> FrameAnswer:
-        """A whole frame from the ego; a teammate whose part is malformed is left out, and the frame is answered."""
-        arrived = time.perf_counter()
-        frame = None
-        try:
-            envelope = wire.read_frame(body)
-            frame = envelope.frame
-            ego = _check(caller, caller.vehicle_id, frame, envelope.ego, "ego")
-        except (wire.WireError, Unusable) as error:
-            await self.refuse(caller, error, frame)
-            raise
-        asked = Asked(caller, frame, ego, arrived)
-        for name in caller.record.teammates:
-            if name not in envelope.teammates:
-                continue
-            try:
-                asked.messages[name] = _check(caller, name, frame, envelope.teammates[name], f"teammates.{name}")
-            except (wire.WireError, Unusable) as error:
-                reason = _reason(error)
-                asked.unusable[name] = Rejection(reason, {"field": error.field, "detail": error.detail})
-                self.metrics.refused(reason.value)
-        strangers = [name for name in envelope.teammates if name not in caller.record.teammates]
-        for name in strangers[:STRANGERS_NAMED]:
-            asked.unusable[str(name)[:64]] = Rejection(
-                Reason.UNAUTHENTICATED, {"detail": "not enrolled in this session"}
-            )
+    async def post_frame(self, caller: Caller, body: bytes, arrived: float) -> Answered:
+        """A whole frame from the ego, whose request came then. A teammate whose part is malformed is left out, and the
+        frame is answered.
+        """
+        frame, parts = await self._read(caller, body, read_frame)
+        for name in parts.malformed:
+            self.metrics.refused(parts.unusable[name].reason.value)
+        asked = Asked(caller, frame, parts.ego, arrived, parts.messages, parts.unusable)
         asked.spent("receive", arrived)
         return await self._answer(asked, gather=False)
+
+    def waiting(self, caller: Caller) -> AbstractContextManager[None]:
+        """Count a request of an ego among its frames that wait, from before its body is read; refuse one too many.
+
+        A teammate's request is not counted.
+        """
+        return self.admission.waiting(caller.record.session_id) if caller.is_ego else contextlib.nullcontext()
 
     def body_limit(self, caller: Caller, *, whole_frame: bool) -> int:
         """Bytes that a message, or a whole frame, of a session's detector may have."""
@@ -93,45 +79,71 @@ class Frames:
 
     async def refuse(self, caller: Caller, error: wire.WireError | Refused, frame: int | None = None) -> None:
         """Record a message that does not count; ``frame`` is the one that it was for, if that is known."""
-        reason = _reason(error)
+        reason = reason_of(error)
         if not caller.is_ego:
             caller.live.gathering.refuse(caller.vehicle_id, frame, reason, error.detail)
         await self.sessions.journal.refusal(caller, reason, error.detail, frame, error.field or "")
 
-    async def _answer(self, asked: Asked, *, gather: bool) -> FrameAnswer:
-        caller, frame = asked.caller, asked.frame
-        with self.admission.frame(caller.record.session_id, caller.live.budget_s):
-            async with caller.live.lock:
-                try:
-                    await self._check_ego(caller, frame, asked.ego)
-                except Unusable as error:
-                    await self.refuse(caller, error, frame)
-                    raise
+    async def _read(self, caller: Caller, body: bytes, read: Callable[[Caller, bytes], T]) -> T:
+        """What a body holds, read off the event loop where that takes long; a refusal goes on record."""
+        try:
+            return read(caller, body) if len(body) <= SMALL_BYTES else await asyncio.to_thread(read, caller, body)
+        except InFrame as error:
+            await self.refuse(caller, error.what, error.frame)
+            raise error.what from error.what.__cause__
+
+    async def _answer(self, asked: Asked, *, gather: bool) -> Answered:
+        caller, session_id = asked.caller, asked.caller.record.session_id
+        try:
+            async with _its_turn(asked):
+                await self._check_ego_on_record(asked)
                 if gather:
                     began, until = time.perf_counter(), asked.arrived + caller.record.gather_ms / 1e3
-                    asked.messages = await caller.live.gathering.collect(frame, until)
+                    asked.messages = await caller.live.gathering.collect(asked.frame, until)
                     asked.spent("gather", began)
-                return await self.deciding.answer(asked)
+                with self.admission.frame(caller.live.key, session_id, asked.due - time.perf_counter()):
+                    return await self.deciding.answer(asked)
+        except (StoreUnavailable, StoreTooSlow):
+            if time.perf_counter() > asked.due:
+                self.metrics.late()
+            raise
+
+    async def _check_ego_on_record(self, asked: Asked) -> None:
+        """As `_check_ego`; a refusal goes on record."""
+        await self.deciding.settled(asked)
+        try:
+            await self._check_ego(asked.caller, asked.frame, asked.ego)
+        except Unusable as error:
+            await self.refuse(asked.caller, error, asked.frame)
+            raise
 
     async def _check_ego(self, caller: Caller, frame: int, ego: Received) -> None:
         """Refuse an ego's message that is not for a new frame, or from where the ego cannot be."""
         record = await self.sessions.current(caller)
+        self.sessions.store.check_room(record)  # before anything is computed that could not be kept
         if record.last_frame is not None and frame <= record.last_frame:
             reason = Reason.REPLAYED if frame == record.last_frame else Reason.STALE
-            before = caller.live.ego_digest if reason is Reason.REPLAYED else None
-            if before not in (None, ego.digest):
-                await self.sessions.journal.equivocation(caller, frame, Proof(digest=str(before)), ego)
+            before = caller.live.ego_proof if reason is Reason.REPLAYED else None
+            if before is not None and before.digest != ego.digest:
+                await self.sessions.journal.equivocation(caller, frame, before, ego)
             detail = f"frames must increase; the latest answered is {record.last_frame}"
             raise Unusable(Kind.STALE_FRAME, reason, detail)
+        self._check_jump(frame, record.last_frame)
         doubt = caller.live.motion.implausible(caller.vehicle_id, frame, ego.message.pose)
         if doubt is not None:
             raise Unusable(Kind.IMPLAUSIBLE_POSE, Reason.MALFORMED, doubt, "ego.pose")
 
-    async def _keep(self, caller: Caller, frame: int, received: Received) -> None:
-        await self.sessions.current(caller)
-        if self.sessions.backlog.full:
-            raise Refused(Kind.OVERLOADED, "too many messages are waiting for their egos")
+    def _check_jump(self, frame: int, latest: int | None) -> None:
+        """Refuse a frame so far after the latest that no later one would be left, or that a vehicle may be anywhere."""
+        if latest is not None and frame - latest > self.max_jump:
+            detail = f"frame {frame} is more than {self.max_jump} (ROBOSAC_MAX_FRAME_JUMP) after the latest, {latest}"
+            raise Unusable(Kind.TOO_FAR_AHEAD, Reason.MALFORMED, detail)
+
+    async def _keep(self, caller: Caller, frame: int, received: Received) -> SessionRecord:
+        record = await self.sessions.current(caller)
         try:
+            closed = caller.live.gathering.closed
+            self._check_jump(frame, None if closed < 0 else closed)
             caller.live.gathering.offer(frame, caller.vehicle_id, received)
         except Contradiction as lie:
             await self.sessions.journal.equivocation(caller, frame, lie.first, received)
@@ -139,29 +151,19 @@ class Frames:
         except Unusable as refused:
             await self.sessions.journal.refusal(caller, refused.reason, refused.detail, frame, "frame")
             raise
+        return record
 
 
-def _reason(error: wire.WireError | Refused) -> Reason:
-    return error.reason if isinstance(error, Unusable) else Reason.MALFORMED
-
-
-def _check(caller: Caller, vehicle: str, frame: int, payload: Any, path: str) -> Received:
-    """A message that is well-formed and, where its sender signs, signed.
-
-    Raises
-    ------
-    WireError, Unusable
-    """
-    role: Role = "ego" if vehicle == caller.record.ego_id else "teammate"
-    message = wire.check_message(payload, caller.live.detector.info, role, path)
-    signature = wire.read_signature(payload, path)
-    received = Received(message, wire.content_digest(frame, vehicle, message), signature)
-    key = caller.record.public_keys.get(vehicle)
-    if key is not None:
-        field = f"{path}.signature" if path else "signature"
-        if signature is None:
-            raise Unusable(Kind.BAD_SIGNATURE, Reason.UNAUTHENTICATED, f"messages of {vehicle} must be signed", field)
-        if not is_valid(read_public_key(key), caller.record.session_id, received.digest, signature):
-            detail = f"not the signature of {vehicle} over this message for this session"
-            raise Unusable(Kind.BAD_SIGNATURE, Reason.UNAUTHENTICATED, detail, field)
-    return received
+@contextlib.asynccontextmanager
+async def _its_turn(asked: Asked) -> AsyncIterator[None]:
+    """Hold the session's lock for a block, if it comes before it is of no use any more."""
+    lock = asked.caller.live.lock
+    try:
+        async with asyncio.timeout(max(asked.due - time.perf_counter(), 0.0) + GRACE_S):
+            await lock.acquire()
+    except TimeoutError:
+        raise Refused(Kind.OVERLOADED, "the frame before this one took too long") from None
+    try:
+        yield
+    finally:
+        lock.release()

@@ -28,6 +28,12 @@ def announced_bytes(headers: Headers) -> int:
     return int(announced) if announced.isdecimal() and len(announced) < 20 else 0
 
 
+def expected_bytes(request: Request, limit: int) -> int:
+    """The most that a request's body may take here: what it announces, or else as much as is read."""
+    announced = announced_bytes(request.headers)
+    return announced if 0 < announced <= limit else 0 if announced > limit else limit
+
+
 async def read_bounded(request: Request, limit: int) -> bytes:
     """The body, never more than ``limit`` bytes of it; what is announced as more is not read at all.
 

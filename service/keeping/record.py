@@ -36,14 +36,24 @@ class SessionRecord:
     frames_answered: int = 0
     state: Mapping[str, Any] = field(default_factory=dict)
     """What the defence remembers."""
+    weights_digest: str | None = None
+    calibration_digest: str | None = None
+    """Of the detector that it was opened with, or that the operator let it go on with; both None if not known."""
     ended_at: str | None = None
     """RFC 3339, UTC; the log of an ended session can still be read."""
     audit_seq: int = 0
     """Number of the latest audit record; the first is 1."""
     audit_head: str = GENESIS
     """`robosac.audit.digest` of the latest record."""
+    key_id: str = ""
+    """Which API key opened it (`service.sessions.identity.ApiKeys.check`); empty where none was asked for."""
     revision: int = 0
     """Changes to the session so far, other than to its log."""
+
+    @property
+    def purging(self) -> bool:
+        """Whether its log is being purged, and is not whole any more."""
+        return not self.token_ids
 
 
 def new_seed() -> str:

@@ -22,6 +22,8 @@ sessions = Table(
     Column("public_keys", Text, nullable=False),
     Column("state", Text, nullable=False),
     Column("detector", Text, nullable=False),
+    Column("weights_digest", Text),
+    Column("calibration_digest", Text),
     Column("latency_budget_ms", Double, nullable=False),
     Column("gather_ms", Double, nullable=False),
     Column("frame_period_ms", Double, nullable=False),
@@ -33,6 +35,7 @@ sessions = Table(
     Column("audit_seq", BigInteger, nullable=False),
     Column("audit_head", Text, nullable=False),
     Column("revision", BigInteger, nullable=False),
+    Column("key_id", Text, nullable=False, server_default=""),
     Column("touched_at", Double, nullable=False),  # Unix time of the last audit record
 )
 _open, _ended = sessions.c.ended_at.is_(None), sessions.c.ended_at.is_not(None)

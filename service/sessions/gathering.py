@@ -13,6 +13,7 @@ from robosac.audit.events import Proof
 from robosac.defenses import Rejection
 from robosac.detectors import Message
 from service.errors import Kind, Refused, Unusable
+from service.sessions.room import Share
 
 REMEMBERED_FRAMES = 8
 """Answered frames for which a message that comes again is told from one that says something else."""
@@ -48,19 +49,6 @@ class Contradiction(Refused):
         self.first = first
 
 
-class Backlog:
-    """Bytes of all messages that wait, of all sessions, and the most that they may be."""
-
-    def __init__(self, limit: int) -> None:
-        self.limit = limit
-        self.nbytes = 0
-
-    @property
-    def full(self) -> bool:
-        """Whether no more may be kept."""
-        return self.nbytes >= self.limit
-
-
 class Gathering:
     """Collects one message per teammate and frame.
 
@@ -74,19 +62,20 @@ class Gathering:
         Enrolled teammates.
     max_ahead : int
         Frames kept per teammate besides the next.
-    backlog : Backlog
-        Shared by all sessions.
+    room : Share
+        What the session's messages may take of the room for those of all sessions.
     closed : int
         Frames up to this one are answered.
     """
 
-    def __init__(self, team: Sequence[str], max_ahead: int, backlog: Backlog, closed: int = -1) -> None:
+    def __init__(self, team: Sequence[str], max_ahead: int, room: Share, closed: int = -1) -> None:
         self._pending: dict[str, dict[int, Received | None]] = {name: {} for name in team}
         self._said: dict[str, dict[int, Proof]] = {name: {} for name in team}
         self._refusals: dict[str, tuple[int | None, Rejection]] = {}
         self._max_ahead = max_ahead
-        self._backlog = backlog
-        self._closed = closed
+        self._room = room
+        self._closed = self._closed_before = closed
+        self._set_aside: dict[str, tuple[int | None, Rejection]] = {}
         self._arrival = asyncio.Event()
 
     @property
@@ -105,6 +94,8 @@ class Gathering:
             sender has left meanwhile (``unauthenticated``).
         Contradiction
             If the sender said something else about the frame before.
+        Refused
+            If there is no room for it (``overloaded``).
         """
         mine = self._pending.get(sender)
         if mine is None:
@@ -123,9 +114,10 @@ class Gathering:
             detail = f"frame {frame} is answered; the latest answered is {self._closed}"
             self.refuse(sender, frame, reason, detail)
             raise Unusable(Kind.STALE_FRAME, reason, detail)
+        self._room.check(received.nbytes)
         self._put(mine, frame, received)
         self._said[sender][frame] = received.proof
-        if len(mine) > self._max_ahead + 1:
+        if sum(later > self._closed for later in mine) > self._max_ahead + 1:
             farthest = max(mine)
             self._drop(sender, farthest)
             del self._said[sender][farthest]
@@ -170,14 +162,24 @@ class Gathering:
         self._said = {name: self._said.get(name, {}) for name in team}
         self._refusals = {name: refusal for name, refusal in self._refusals.items() if name in self._pending}
 
+    def begin(self, frame: int) -> None:
+        """A frame is being decided: what comes for it from now on is late, what is in stays until `close`."""
+        if frame > self._closed:
+            self._closed_before, self._closed = self._closed, frame
+            self._set_refusals_aside(frame)
+
+    def reopen(self, frame: int) -> None:
+        """The frame in hand was not kept after all: it can be asked for again, and its messages are still there."""
+        if self._closed == frame:
+            self._closed = self._closed_before
+            self._refusals = self._set_aside | self._refusals
+
     def close(self, frame: int) -> None:
-        """A frame is being answered: it and all before it are over."""
+        """A frame is answered: it and all before it are over."""
+        if frame > self._closed:
+            self._set_refusals_aside(frame)
         self._closed = frame
-        self._refusals = {
-            name: (refused_for, rejection)
-            for name, (refused_for, rejection) in self._refusals.items()
-            if refused_for is not None and refused_for > frame
-        }
+        self._set_aside = {}
         for name, mine in self._pending.items():
             self._forget(name, [f for f in mine if f <= frame])
             said = self._said[name]
@@ -188,16 +190,23 @@ class Gathering:
         """Let go of everything."""
         self.change_team(())
 
+    def _set_refusals_aside(self, frame: int) -> None:
+        """Let those count no more that were for a frame up to this one."""
+        later = {name: told for name, told in self._refusals.items() if told[0] is not None and told[0] > frame}
+        self._set_aside = {name: told for name, told in self._refusals.items() if name not in later}
+        self._refusals = later
+
     def _put(self, mine: dict[int, Received | None], frame: int, received: Received | None) -> None:
         before = mine.get(frame)
-        if received is None and frame <= self._closed:
+        if received is None and frame <= self._closed and frame not in mine:
             return
         mine[frame] = received
-        self._backlog.nbytes += (received.nbytes if received else 0) - (before.nbytes if before else 0)
+        self._room.add((received.nbytes if received else 0) - (before.nbytes if before else 0))
 
     def _drop(self, sender: str, frame: int) -> None:
         dropped = self._pending[sender].pop(frame)
-        self._backlog.nbytes -= dropped.nbytes if dropped else 0
+        if dropped is not None:
+            self._room.add(-dropped.nbytes)
 
     def _forget(self, sender: str, frames: Sequence[int]) -> None:
         for frame in frames:

@@ -25,9 +25,10 @@ from service.settings import Settings
 
 API_KEY_LENGTH = 16
 SECRET_LENGTH = 32
+KEY_ID_LENGTH = 16
 TOKEN_BYTES = 4096
 """A longer token is not looked at."""
-LEEWAY_S = 5.0
+LEEWAY_S = 10.0
 """How far the clocks of two gateways may be apart."""
 ISSUER = AUDIENCE = "robosac-gateway"
 ALGORITHM = "HS256"
@@ -72,8 +73,16 @@ class ApiKeys:
     def __bool__(self) -> bool:
         return bool(self._digests)
 
-    def check(self, key: str | None) -> None:
+    def __len__(self) -> int:
+        return len(self._digests)
+
+    def check(self, key: str | None) -> str:
         """Refuse whoever has none of the keys. Every key is compared, so that the time tells nothing.
+
+        Returns
+        -------
+        str
+            What sessions that the key opens are known by as the key's; empty where no key is asked for.
 
         Raises
         ------
@@ -81,11 +90,12 @@ class ApiKeys:
             With the kind ``unauthenticated``.
         """
         if not self:
-            return
+            return ""
         given = sha256((key or "").encode()).digest()
         matches = [hmac.compare_digest(given, digest) for digest in self._digests]
         if not any(matches):
             raise Refused(Kind.UNAUTHENTICATED, "an API key is needed as a bearer token")
+        return sha256(b"robosac key of a session\0" + given).hexdigest()[:KEY_ID_LENGTH]
 
 
 @dataclass(frozen=True)
@@ -161,6 +171,8 @@ class Tokens:
         is_latest = record.token_ids.get(vehicle) == claims["jti"]
         if not is_latest or claims["role"] != _role(vehicle == record.ego_id):
             raise TokenRefused(RENEWED, vehicle)
+        if claims["iat"] > self._clock() + LEEWAY_S:
+            raise TokenRefused("the token is from the future: the gateways' clocks are too far apart", vehicle)
         if claims["exp"] <= self._clock() - LEEWAY_S:
             raise TokenRefused("the token has expired", vehicle, Kind.TOKEN_EXPIRED)
         return vehicle
@@ -178,13 +190,13 @@ class Tokens:
                     audience=AUDIENCE,
                     issuer=ISSUER,
                     leeway=LEEWAY_S,
-                    options={"require": list(CLAIMS), "strict_aud": True, "verify_exp": False},
+                    options={"require": list(CLAIMS), "strict_aud": True, "verify_exp": False, "verify_iat": False},
                 )
             except jwt.InvalidSignatureError:
                 continue
             except (jwt.PyJWTError, ValueError, RecursionError):  # what is not a token at all may fail in any way
                 return None
-            return claims if isinstance(claims["exp"], int) else None
+            return claims if isinstance(claims["exp"], int) and isinstance(claims["iat"], int) else None
         return None
 
 

@@ -11,7 +11,7 @@ import structlog
 
 from robosac.answers import Reason
 from robosac.audit.events import AccessRefused, Equivocation, Event, MessageRefused, Proof
-from service.errors import SessionOver, TokenRefused
+from service.errors import AuditFull, SessionOver, TokenRefused
 from service.keeping.store import Store
 from service.sessions.gathering import Received
 from service.sessions.live import REFUSALS_LOGGED, STRANGERS, Caller, LiveSession
@@ -64,5 +64,5 @@ class Journal:
         return live.refusals[who] <= REFUSALS_LOGGED
 
     async def _append(self, session_id: str, event: Event) -> None:
-        with contextlib.suppress(SessionOver):
+        with contextlib.suppress(SessionOver, AuditFull):
             await self.store.log(session_id, event)

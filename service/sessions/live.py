@@ -5,10 +5,10 @@ from __future__ import annotations
 import asyncio
 import time
 from collections import Counter
-from collections.abc import Iterator
-from contextlib import contextmanager
+from collections.abc import Mapping
 from dataclasses import dataclass, field
 
+from robosac.audit.events import Proof
 from robosac.detectors import Detector, Role
 from robosac.session import Session
 from service.keeping.record import SessionRecord
@@ -26,7 +26,7 @@ class LiveSession:
     """What a session holds in this process only; the lock is held while a frame is answered or the team changes.
 
     The store is right about what ``session`` remembers; only the previous answer is known to this process alone. It and
-    ``ego_digest`` are of the frame ``answered``, the latest that this process answered.
+    ``ego_proof`` are of the frame ``answered``, the latest that this process answered.
     """
 
     session: Session
@@ -35,12 +35,16 @@ class LiveSession:
     gathering: Gathering
     motion: Motion
     budget_s: float
+    key: str = ""
+    """Which API key opened it (`service.sessions.identity.ApiKeys`)."""
     answered: int | None = None
-    ego_digest: str | None = None
+    ego_proof: Proof | None = None
     lock: asyncio.Lock = field(default_factory=asyncio.Lock)
     last_used: float = field(default_factory=time.monotonic)
     refusals: Counter[str] = field(default_factory=Counter)
     renewals: Counter[str] = field(default_factory=Counter)
+    settling: asyncio.Task[None] | None = None
+    """A decision that nobody waits for any more, and of which it is not known yet whether it is kept."""
 
     def follow(self, record: SessionRecord) -> None:
         """Catch up with what another process did to the session, if one did."""
@@ -51,21 +55,17 @@ class LiveSession:
             self.gathering.close(record.last_frame)
         self.session.state = record.state
         if record.last_frame != self.answered:
-            self.session.previous = self.ego_digest = None
+            self.session.previous = self.ego_proof = None
 
-    @contextmanager
-    def unlogged(self) -> Iterator[dict[str, int]]:
-        """Refusals by vehicle that got no record since the last decision, for the block that keeps the next one.
-
-        After the block all counts begin again. If it fails, they go on.
-        """
+    def count_anew(self) -> Counter[str]:
+        """Refusals by vehicle since the last decision; all counts begin again, unless they are given back."""
         counted, self.refusals = self.refusals, Counter()
-        try:
-            yield {name: n - REFUSALS_LOGGED for name, n in counted.items() if n > REFUSALS_LOGGED}
-        except BaseException:
-            self.refusals.update(counted)
-            raise
-        self.renewals.clear()
+        return counted
+
+
+def unlogged(counted: Mapping[str, int]) -> dict[str, int]:
+    """Of counted refusals, how many got no record of their own."""
+    return {name: n - REFUSALS_LOGGED for name, n in counted.items() if n > REFUSALS_LOGGED}
 
 
 @dataclass(frozen=True)

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import asyncio
 import secrets
 from dataclasses import dataclass
 from importlib.metadata import version
@@ -40,8 +41,8 @@ class Opening:
     tokens: Tokens
     sessions: Sessions
 
-    async def open(self, request: SessionRequest) -> SessionCreated:
-        """Begin a session; the answer is the only place where its tokens are shown.
+    async def open(self, request: SessionRequest, key_id: str = "") -> SessionCreated:
+        """Begin a session of an API key; the answer is the only place where its tokens are shown.
 
         Raises
         ------
@@ -50,9 +51,10 @@ class Opening:
         """
         info = self._detector(self.settings.detector if request.detector is None else request.detector)
         check_size(request.teammates, self.settings.max_teammates)
-        defense, state = _defense(request, info)
+        defense, state = await asyncio.to_thread(_defense, request, info)  # files are read the first time
+        _check_hypotheses(defense, self.settings.max_hypotheses)
         budget_ms, gather_ms = self._times(request)
-        already_open = await self._count_if_there_is_room()
+        already_open = await self._count_if_there_is_room(key_id)
         session_id = secrets.token_hex(16)
         vehicles = (request.ego_id, *request.teammates)
         tokens = {v: self.tokens.issue(session_id, v, is_ego=v == request.ego_id) for v in vehicles}
@@ -70,8 +72,11 @@ class Opening:
             created_at=now(),
             seed=self.sessions.draw_seed(),
             state=state,
+            key_id=key_id,
+            weights_digest=info.weights_digest,
+            calibration_digest=calibration_digest(info),
         )
-        await self.store.create(record, _first_record(record, info))
+        kept = await self.store.create(record, await asyncio.to_thread(_first_record, record, info))
         self.sessions.begin(record)
         self.metrics.sessions.set(already_open + 1)
         team = {"ego_id": record.ego_id, "teammates": len(record.teammates)}
@@ -84,6 +89,7 @@ class Opening:
             "tokens_expire_at": own.expires_at,
             "detector": info,
             "defense": defense,
+            "receipt": self.sessions.keys.receipt(kept),
         }
         return SessionCreated.model_validate(shown)
 
@@ -96,16 +102,27 @@ class Opening:
 
     def _times(self, request: SessionRequest) -> tuple[float, float]:
         """Latency budget and longest wait for teammates, milliseconds."""
-        budget_ms = request.latency_budget_ms or self.settings.latency_budget_ms
-        gather_ms = min(self.settings.gather_ms, budget_ms / 2) if request.gather_ms is None else request.gather_ms
+        settings = self.settings
+        budget_ms = request.latency_budget_ms or min(settings.latency_budget_ms, settings.max_budget_ms)
+        default_ms = min(settings.gather_ms, settings.max_gather_ms, budget_ms / 2)
+        gather_ms = default_ms if request.gather_ms is None else request.gather_ms
+        for name, asked, most in (
+            ("latency_budget_ms", budget_ms, settings.max_budget_ms),
+            ("gather_ms", gather_ms, settings.max_gather_ms),
+        ):
+            if asked > most:
+                cap = "ROBOSAC_MAX_BUDGET_MS" if name == "latency_budget_ms" else "ROBOSAC_MAX_GATHER_MS"
+                raise Refused(Kind.INVALID_REQUEST, f"at most {most:g} ms are allowed ({cap})", name)
         if gather_ms > budget_ms:
             detail = f"must not exceed the latency budget of {budget_ms:g} ms"
             raise Refused(Kind.INVALID_REQUEST, detail, "gather_ms")
         return budget_ms, gather_ms
 
-    async def _count_if_there_is_room(self) -> int:
+    async def _count_if_there_is_room(self, key_id: str) -> int:
         """Open sessions."""
-        already_open = await self.store.count()
+        already_open, most = await self.store.count(), self.settings.max_sessions_per_key
+        if key_id and already_open >= most and await self.store.count(key_id) >= most:
+            raise Refused(Kind.TOO_MANY_SESSIONS, f"a key may have {most} open sessions (ROBOSAC_MAX_SESSIONS_PER_KEY)")
         if already_open >= self.settings.max_sessions:
             raise Refused(Kind.TOO_MANY_SESSIONS, "the gateway holds as many sessions as it may")
         return already_open
@@ -124,14 +141,20 @@ def _defense(request: SessionRequest, info: DetectorInfo) -> tuple[DefenseSettin
     return settings, defense.initial_state(request.teammates)
 
 
+def _check_hypotheses(defense: DefenseSettings, most: int) -> None:
+    """Refuse a defence that is to test more hypotheses in a frame than an operator allows."""
+    for name in defense.budgets:
+        if (getattr(defense, name) or 0) > most:
+            detail = f"at most {most} hypotheses of a frame are tested (ROBOSAC_MAX_HYPOTHESES)"
+            raise Refused(Kind.INVALID_REQUEST, detail, f"defense.{name}")
+
+
 def _first_record(record: SessionRecord, info: DetectorInfo) -> SessionOpened:
     kept = {name: value for name, value in vars(record).items() if name in SessionOpened.model_fields}
     return SessionOpened(
         **kept,
         time=record.created_at,
         version=version("robosac"),
-        weights_digest=info.weights_digest,
-        calibration_digest=calibration_digest(info),
         screening={name: bounds.as_json() for name, bounds in screening_for(info).bounds.items()},
         next_seed_commitment=commitment(record.seed),
     )

@@ -5,7 +5,7 @@ from __future__ import annotations
 import asyncio
 import contextlib
 import time
-from collections.abc import Callable
+from collections.abc import AsyncIterator, Callable
 from dataclasses import dataclass
 
 import structlog
@@ -18,14 +18,17 @@ from robosac.defenses import known, read_settings, suspicion_in
 from robosac.session import Session, defense_for
 from service.engine import Engine
 from service.errors import Kind, Refused, SessionOver, TokenRefused
+from service.keeping.gateway_keys import GatewayKeys
 from service.keeping.record import SessionRecord, new_seed
-from service.keeping.store import Store
+from service.keeping.store import PAGE, Store
 from service.schemas import SessionState
-from service.sessions.gathering import Backlog, Gathering
+from service.sessions.detectors import OTHER_WEIGHTS, detector_changed, has_changed
+from service.sessions.gathering import Gathering
 from service.sessions.identity import Tokens
 from service.sessions.journal import Journal
 from service.sessions.live import Caller, LiveSession
 from service.sessions.motion import Motion
+from service.sessions.room import Room
 from service.settings import Settings
 from service.watching.metrics import Metrics
 
@@ -47,12 +50,14 @@ class Sessions:
     engine: Engine
     metrics: Metrics
     tokens: Tokens
+    keys: GatewayKeys
     draw_seed: Callable[[], str] = new_seed
 
     def __post_init__(self) -> None:
         self._live: dict[str, LiveSession] = {}
+        self._standing: set[str] = set()
         self.defenses = known(self.settings.extra_defenses)
-        self.backlog = Backlog(self.settings.max_pending_bytes)
+        self.backlog = Room(self.settings.max_pending_bytes, name="ROBOSAC_MAX_PENDING_BYTES")
         self.journal = Journal(self.store, self.metrics)
 
     def begin(self, record: SessionRecord) -> None:
@@ -73,6 +78,7 @@ class Sessions:
             self._forget(session_id)
             raise SessionOver("there is no such session; it may have ended or expired")
         vehicle = await self._holder(record, token)
+        record = await self._noting_other_weights(record)
         live = self._live_session(record)
         live.follow(record)
         live.last_used = time.monotonic()
@@ -87,21 +93,31 @@ class Sessions:
             raise refused
         return caller
 
-    def budget_s(self, session_id: str) -> float | None:
-        """Latency budget of a session that is in use."""
-        live = self._live.get(session_id)
-        return None if live is None else live.budget_s
+    def in_use(self, session_id: str) -> LiveSession | None:
+        """What this process holds of a session; None if it is not in use here."""
+        return self._live.get(session_id)
 
-    async def audit_log(self, session_id: str, token: str | None, after: int) -> list[str]:
-        """Lines of the log with a number above ``after``, for the ego; of a session no longer served, too."""
+    async def audit_log(self, session_id: str, token: str | None, after: int, limit: int) -> AsyncIterator[str]:
+        """Pages of the log, for the ego; of a session no longer served, too.
+
+        They hold the records numbered above ``after``, at most ``limit`` of them, and end where the log ends now.
+        """
         record = await self.store.get(session_id)
-        if record is None:
+        if record is None or record.purging:
             raise SessionOver("there is no such session; its log may have been purged")
         if record.ended_at is None and self._is_served(record):
             await self.authenticate_ego(session_id, token)
         elif (vehicle := await self._holder(record, token)) != record.ego_id:
             raise _ego_only(vehicle)
-        return await self.store.audit(session_id, after)
+        return self._pages(session_id, after, min(record.audit_seq, after + limit))
+
+    async def _pages(self, session_id: str, after: int, last: int) -> AsyncIterator[str]:
+        while after < last:
+            lines = await self.store.audit(session_id, after, min(PAGE, last - after))
+            if not lines:  # purged meanwhile: what was sent must not look whole
+                raise SessionOver("the log was purged")
+            after += len(lines)
+            yield "\n".join(lines) + "\n"
 
     async def describe(self, caller: Caller) -> SessionState:
         """The session's state."""
@@ -111,6 +127,7 @@ class Sessions:
             "defense": read_settings(record.defense, self.defenses),
             "suspicion": suspicion_in(record.state),
             "next_seed_commitment": commitment(record.seed),
+            "receipt": self.keys.receipt(record),
         }
         return SessionState.model_validate(shown)
 
@@ -165,6 +182,8 @@ class Sessions:
         if detector is None:
             detail = f"the session's detector {record.detector} is not served now"
             raise Refused(Kind.DETECTOR_UNAVAILABLE, detail)
+        if not self.settings.allow_other_weights and has_changed(record, detector.info):
+            raise Refused(Kind.DETECTOR_UNAVAILABLE, f"{OTHER_WEIGHTS} {record.detector}")
         if record.defense["kind"] not in self.defenses:
             detail = f"the session's defence {record.defense['kind']} is not served now"
             raise Refused(Kind.DEFENSE_UNAVAILABLE, detail)
@@ -178,10 +197,32 @@ class Sessions:
             Session(detector, record.teammates, defense, {"state": record.state}),
             detector,
             record.teammates,
-            Gathering(record.teammates, settings.max_pending_frames, self.backlog, closed),
+            Gathering(
+                record.teammates,
+                settings.max_pending_frames,
+                self.backlog.share(record.key_id, record.session_id),
+                closed,
+            ),
             Motion(settings.max_speed_mps, record.frame_period_ms / 1e3, settings.max_range_m),
             record.latency_budget_ms / 1e3,
+            record.key_id,
         )
+
+    async def _noting_other_weights(self, record: SessionRecord) -> SessionRecord:
+        """The session, after a start with other weights of its detector's name with these, if that is allowed; it goes
+        on record either way, once in the life of a process.
+        """
+        detector = self.engine.detectors.get(record.detector)
+        if record.session_id in self._live or detector is None or not has_changed(record, detector.info):
+            return record
+        event = detector_changed(detector.info, accepted=self.settings.allow_other_weights)
+        logger.warning("other weights", session_id=record.session_id, detector=record.detector, accepted=event.accepted)
+        if event.accepted:
+            return await self.store.change_detector(record, event)
+        if record.session_id not in self._standing:
+            self._standing.add(record.session_id)
+            await self.store.log(record.session_id, event)
+        return record
 
     def _in_use(self, session_id: str) -> bool:
         """Whether a frame is in hand, or somebody asked for something lately that left no trace in the store."""

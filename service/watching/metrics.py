@@ -19,7 +19,9 @@ class Metrics:
         self.sessions = Gauge("robosac_sessions", "Open sessions", registry=self.registry)
         self._frames = Counter("robosac_frames_total", "Answered frames", ["source"], registry=self.registry)
         self._degraded = Counter("robosac_degraded_frames_total", "Frames cut short", ["by"], registry=self.registry)
-        self._late = Counter("robosac_late_frames_total", "Frames answered after their budget", registry=self.registry)
+        self._late = Counter(
+            "robosac_late_frames_total", "Frames answered, or given up, after their budget", registry=self.registry
+        )
         self._hypotheses = Counter("robosac_hypotheses_total", "Tested hypotheses", ["verdict"], registry=self.registry)
         self._rejected = Counter(
             "robosac_rejected_teammates_total", "Teammates left out of an answer", ["reason"], registry=self.registry
@@ -37,13 +39,17 @@ class Metrics:
         if answer.degraded_by is not None:
             self._degraded.labels(answer.degraded_by).inc()
         if not answer.deadline_met:
-            self._late.inc()
+            self.late()
         for hypothesis in answer.hypotheses:
             self._hypotheses.labels(hypothesis.verdict.value).inc()
         for rejected in answer.rejected.values():
             self._rejected.labels(rejected.reason.value).inc()
         for stage, milliseconds in timings_ms.items():
             self._stages.labels(stage).observe(milliseconds / 1e3)
+
+    def late(self) -> None:
+        """Count a frame that had no answer in time."""
+        self._late.inc()
 
     def refused(self, reason: str) -> None:
         """Count a refused message."""

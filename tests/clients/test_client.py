@@ -77,7 +77,7 @@ async def test_a_vehicle_sends_its_token_and_asks_for_msgpack(ego_message):
 
     def answer(request):
         seen.append(request)
-        return httpx.Response(202, json={})
+        return httpx.Response(202, content=wire.pack({}))
 
     async with gateway(answer) as client:
         await client.vehicle("s1", "car-2", "token").send(3, ego_message)

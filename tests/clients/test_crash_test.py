@@ -13,6 +13,7 @@ from clients.crash_test import sqlite
 from clients.crash_test.__main__ import main
 from clients.crash_test.driven import Driven
 from robosac.audit import commitment, digest, seal
+from robosac.audit.packing import state_digest
 
 SEEDS = ["ab" * 32, "cd" * 32]
 ANSWER = {
@@ -61,7 +62,7 @@ def test_a_good_log_is_followed(driven):
     lines = log(0, 1)
     assert complaints(driven, lines) == []
     assert (driven.seq, driven.head, driven.answered, driven.last_frame) == (3, digest(lines[-1]), 2, 1)
-    assert (driven.acknowledged, driven.state) == ({}, {"n": 1})
+    assert (driven.acknowledged, driven.state_digest) == ({}, state_digest({"n": 1}))
 
 
 @pytest.mark.parametrize(

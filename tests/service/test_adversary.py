@@ -47,7 +47,7 @@ async def test_a_stolen_token_does_not_let_another_vehicle_speak(served, session
 async def test_a_stolen_token_is_not_enough_where_the_owner_signs(served, messages):
     owner, thief = Ed25519PrivateKey.generate(), Ed25519PrivateKey.generate()
     session = await served.open(defense=NONE, public_keys={"rsu": show_public_key(owner)})
-    signature = sign(thief, session.session_id, wire.content_digest(0, "rsu", messages["rsu"]))
+    signature = sign(thief, session.session_id, "rsu", 0, wire.content_digest(0, "rsu", messages["rsu"]))
     body = wire.pack_message(0, "rsu", messages["rsu"], signature)
     problem(await served.post(session, "messages", body, session.teammate_tokens["rsu"]), 401, "bad-signature")
     assert await refusals(served, session) == [("rsu", "unauthenticated")]

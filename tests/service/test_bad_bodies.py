@@ -3,6 +3,7 @@ import numpy as np
 import pytest
 
 from robosac import wire
+from robosac.audit import verify
 from robosac.detectors import Message
 from tests.service.conftest import problem, serve
 
@@ -202,11 +203,22 @@ async def test_a_teammate_cannot_break_the_frame_that_carries_its_part(served, g
     for index, spoiler in enumerate(spoilers):
         frame = msgpack.unpackb(good_frame(index))
         frame["teammates"]["car-3"] = spoiler
-        frame["teammates"][7] = None
+        frame["teammates"]["7"] = None
         response = await served.post(session, "frames", msgpack.packb(frame))
         assert response.status_code == 200, response.text
         reasons = {e["vehicle_id"]: e["reason"] for e in response.json()["rejected"]}
         assert (reasons["car-3"], reasons["7"]) == ("malformed", "unauthenticated")
+
+
+async def test_only_strings_are_names(served, good_frame):
+    session = await served.open()
+    frame = msgpack.unpackb(good_frame(0))
+    for name in (5, None, b"rsu", 2.5, True):
+        frame["teammates"] = {"5": None, name: None}
+        fields = problem(await served.post(session, "frames", msgpack.packb(frame)), 422, "wrong-type")
+        assert (fields["field"], "must be a string" in fields["detail"]) == ("teammates", True)
+    lines = [line.encode() for line in await served.ego(session).audit_lines()]
+    assert verify(lines) == []
 
 
 async def test_a_message_may_be_no_larger_than_its_detector_needs(served, messages):

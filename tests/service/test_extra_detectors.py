@@ -1,3 +1,4 @@
+import json
 import sys
 import types
 
@@ -6,13 +7,14 @@ import pytest
 from clients.simulation import Fleet
 from robosac import attacks, detectors
 from robosac.attacks import GaussianNoise
+from robosac.audit import replay, verify
 from robosac.detectors import EmbeddedDetector
 from robosac.detectors.embedded import ADVERSARIAL_WEIGHTS
 from robosac.detectors.v2xsim import write_weights
 from robosac.scenes import IntersectionScene
 from service.settings import Settings
 from tests.robosac.detectors.v2xsim.recipe import made_up, published_keys
-from tests.service.conftest import serve
+from tests.service.conftest import problem, serve
 
 
 @pytest.fixture(scope="module")
@@ -72,3 +74,30 @@ def test_what_a_reference_makes_is_checked(load, attribute, complaint, monkeypat
     monkeypatch.setitem(sys.modules, "own", module)
     with pytest.raises(ValueError, match=complaint):
         load(f"own:{attribute}")
+
+
+async def test_other_weights_of_the_same_name_are_recorded_and_have_to_be_allowed(tmp_path, good_frame):
+    database = f"sqlite:///{tmp_path}/robosac.db"
+    own = {"database_url": database, "extra_detectors": (str(ADVERSARIAL_WEIGHTS),)}
+    async with serve(database_url=database) as served:
+        session = await served.open(defense={"kind": "sample_consensus"})
+        await served.ego(session).post_frame_body(good_frame(0))
+    async with serve(**own) as served:
+        for _ in range(2):
+            refused = await served.post(session, "frames", good_frame(1))
+            fields = problem(refused, 503, "detector-unavailable")
+            assert "ROBOSAC_ALLOW_OTHER_WEIGHTS" in fields["detail"]
+        assert [record["event"] for record in await served.ego(session).audit()][2:] == ["detector_changed"]
+    async with serve(**own, allow_other_weights=True, keep_frames=9) as served:
+        ego = served.ego(session)
+        await ego.post_frame_body(good_frame(1))
+        lines, body = [line.encode() for line in await ego.audit_lines()], await ego.kept_messages(1)
+    async with serve(**own) as served:
+        await served.ego(session).post_frame_body(good_frame(2))  # these are the session's by now
+    records = [json.loads(line) for line in lines]
+    assert [record.get("accepted") for record in records if record["event"] == "detector_changed"] == [False, True]
+    assert "state" in records[-1]
+    assert verify(lines) == []
+    decision = replay.find(lines, 1)
+    assert decision.session.weights_digest == EmbeddedDetector(ADVERSARIAL_WEIGHTS).info.weights_digest
+    assert replay.replay(decision, body, EmbeddedDetector(ADVERSARIAL_WEIGHTS)) == []

@@ -6,11 +6,13 @@ import msgpack
 import numpy as np
 import pytest
 
+from robosac.audit import expanded
 from robosac.boxes import pose_matrix
 from robosac.defenses import SampleConsensus
 from robosac.detectors import Message
 from robosac.fusion import fuse
-from service.sessions.gathering import Backlog, Gathering, Received
+from service.sessions.gathering import Gathering, Received
+from service.sessions.room import Room
 from tests.service.conftest import EGO, TEAM, problem, serve
 
 ACCEPT_JSON = {"Accept": "application/json"}
@@ -119,7 +121,7 @@ async def test_a_frame_sent_again_is_a_replay_and_an_older_one_is_stale(served, 
     assert refused == ["replayed", "stale"]
 
 
-async def test_the_budget_counts_from_the_last_byte_not_from_the_fusion(served, good_frame):
+async def test_the_budget_counts_from_the_arrival_not_from_the_fusion(served, good_frame):
     session = await served.open(latency_budget_ms=150, gather_ms=0)
     live = served.gateway.sessions._live[session.session_id]
     async with live.lock:
@@ -147,7 +149,7 @@ class Counted:
 
 
 async def test_waiting_for_teammates_costs_nothing(messages):
-    gathering = Gathering(TEAM, 4, Backlog(2**30))
+    gathering = Gathering(TEAM, 4, Room(2**30).share("", "session"))
     counted = Counted(gathering.collect(0, time.perf_counter() + 60))
 
     async def wait():
@@ -238,6 +240,14 @@ async def test_the_audit_log_is_json_lines_from_any_point(served, ego_message, a
     assert [record["event"] for record in records] == ["session_opened"] + ["frame_answered"] * 3
     assert records[0]["weights_digest"] == session.detector["weights_digest"]
     for record in records[1:]:
-        assert {"accepted", "rejected", "hypotheses", "seed", "timings_ms", "deadline_met"} <= set(record)
-    assert await ego.audit(after=2) == records[2:]
+        assert {"accepted", "rejected", "hypotheses", "seed", "timings_us", "state_digest"} <= set(record)
+    assert ["state" in record for record in records] == [True, True, False, False]
+    assert await ego.audit(after=2) == [expanded(record) for record in records[2:]]
+    (last,) = await ego.audit(after=3)
+    assert {"timings_ms", "deadline_met", "boxes", "trusted"} <= set(last)
+    limited = await served.http.get(
+        f"/v1/sessions/{session.session_id}/audit?after=1&limit=2",
+        headers={"Authorization": f"Bearer {session.ego_token}"},
+    )
+    assert limited.text.splitlines() == response.text.splitlines()[1:3]
     assert await ego.audit(after=99) == []

@@ -98,7 +98,12 @@ async def test_vehicles_with_keys_must_sign(served, messages):
         problem(await served.post(session, "messages", unsigned, token), 401, "bad-signature")["field"] == "signature"
     )
     digest = wire.content_digest(0, "rsu", messages["rsu"])
-    forged = [sign(keys[EGO], session.session_id, digest), sign(keys["rsu"], "0" * 32, digest), bytes(64)]
+    named = (session.session_id, "rsu", 0, digest)
+    forged = [
+        sign(keys[EGO], *named),
+        *(sign(keys["rsu"], *named[:i], other, *named[i + 1 :]) for i, other in enumerate(("0" * 32, EGO, 1))),
+        bytes(64),
+    ]
     for signature in forged:
         body = wire.pack_message(0, "rsu", messages["rsu"], signature)
         problem(await served.post(session, "messages", body, token), 401, "bad-signature")
@@ -110,7 +115,7 @@ async def test_vehicles_with_keys_must_sign(served, messages):
     (answered,) = await events(ego, "frame_answered")
     assert set(answered["messages"]) == {EGO, "rsu"}
     assert all(set(proof) == {"digest", "signature"} for proof in answered["messages"].values())
-    assert [r["reason"] for r in await events(ego, "message_refused")] == ["unauthenticated"] * 5
+    assert [r["reason"] for r in await events(ego, "message_refused")] == ["unauthenticated"] * 7
 
 
 async def test_the_ego_cannot_put_words_into_the_mouth_of_a_teammate_that_signs(served, messages, benign):
@@ -120,12 +125,20 @@ async def test_the_ego_cannot_put_words_into_the_mouth_of_a_teammate_that_signs(
     invented = await ego.post_frame(0, messages[EGO], benign)
     assert invented.rejected["rsu"].reason == "unauthenticated"
     assert invented.rejected["rsu"].field == "teammates.rsu.signature"
-    signature = sign(key, session.session_id, wire.content_digest(1, "rsu", benign["rsu"]))
+    signature = sign(key, session.session_id, "rsu", 1, wire.content_digest(1, "rsu", benign["rsu"]))
     assert (await ego.post_frame(1, messages[EGO], benign, {"rsu": signature})).accepted == TEAM
 
 
+GOOD_KEY = show_public_key(Ed25519PrivateKey.generate())
+
+
 @pytest.mark.parametrize(
-    ("keys", "field"), [({"rsu": "AAAA"}, "public_keys.rsu"), ({"car-9": "A" * 43 + "="}, "public_keys")]
+    ("keys", "field"),
+    [
+        ({"rsu": "AAAA"}, "public_keys.rsu"),
+        ({"car-9": GOOD_KEY}, "public_keys"),
+        ({"rsu": "A" * 43 + "="}, "public_keys.rsu"),
+    ],
 )
 async def test_bad_keys_are_refused(served, keys, field):
     body = {"ego_id": EGO, "teammates": ["rsu"], "public_keys": keys}

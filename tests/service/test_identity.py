@@ -19,6 +19,7 @@ RULES = {
     "GET /readyz": ANYBODY,
     "GET /metrics": ANYBODY,
     "GET /v1/detectors": ANYBODY,
+    "GET /v1/keys": ANYBODY,
     "POST /v1/sessions": KEY_HOLDER,
     "POST /v1/sessions/{sid}/token": ANY_VEHICLE,
     "POST /v1/sessions/{sid}/messages": ANY_VEHICLE,
@@ -90,7 +91,9 @@ async def test_a_teammate_sends_as_itself_and_sees_no_more_than_a_receipt(served
         body = wire.pack_message(0, speaker, messages[speaker])
         problem(await served.post(session, "messages", body, token), 403, "wrong-vehicle")
     own = await served.post(session, "messages", wire.pack_message(0, "car-2", messages["car-2"]), token)
-    assert (own.status_code, own.json()) == (202, {"frame": 0, "vehicle_id": "car-2", "status": "accepted"})
+    told = own.json()
+    assert set(told.pop("receipt")) == {"session", "seq", "head", "key_id", "signature"}
+    assert (own.status_code, told) == (202, {"frame": 0, "vehicle_id": "car-2", "status": "accepted"})
     assert (await served.ego(session).state())["frames_answered"] == 0
 
 

@@ -11,44 +11,34 @@ from tests.service.conftest import EGO, problem, serve
 
 def test_frames_are_admitted_as_long_as_they_can_be_answered_in_time():
     admission = Admission()
-    for number in range(200):
-        admission.learn(number, number + 0.010, 0.001)
+    for _ in range(200):
+        admission.learn("any", 0.010, 0.002, 0.001)
     taken = []
 
     def take_on_until_refused():
         for number in range(100):
-            block = admission.frame(f"session {number}", 0.2)
+            block = admission.frame("", f"session {number}", 0.2)
             block.__enter__()
             taken.append(block)
 
     with pytest.raises(Refused) as refused:
         take_on_until_refused()
-    assert 9 <= len(taken) <= 10  # 0.5 x 200 ms / 10 ms
+    assert 9 <= len(taken) <= 10  # 0.5 x (200 - 10 - 2) ms / 10 ms, and itself
     assert refused.value.kind is Kind.OVERLOADED
     assert refused.value.retry_after_s >= 1
-    with admission.frame("more time", 20.0):
+    with admission.frame("", "more time", 20.0):
         pass
     taken.pop().__exit__(None, None, None)
-    with admission.frame("again", 0.2):
+    with admission.frame("", "again", 0.2):
         pass
-
-
-def test_frames_that_overlap_cost_what_each_adds():
-    """Each takes 40 ms from its arrival to its end, but one ends every 10 ms."""
-    admission = Admission()
-    for number in range(400):
-        admission.learn(0.01 * number, 0.01 * number + 0.04, 0.0)
-    with ExitStack() as taken:
-        for number in range(9):
-            taken.enter_context(admission.frame(f"session {number}", 0.2))
 
 
 def test_a_frame_that_cannot_be_in_time_anyway_is_admitted_if_nothing_else_is_in_hand():
     admission = Admission()
-    for number in range(200):
-        admission.learn(2.0 * number, 2.0 * number + 1.0, 0.001)
-    with admission.frame("slow", 0.1), pytest.raises(Refused):
-        admission.check("other", 0.1)
+    for _ in range(200):
+        admission.learn("any", 1.0, 0.002, 0.001)
+    with admission.frame("", "slow", 0.1), pytest.raises(Refused):
+        admission.check("", "other", 0.1)
 
 
 async def test_no_ego_takes_the_share_of_the_others(served, good_frame, messages, benign):
@@ -66,14 +56,14 @@ async def test_no_ego_takes_the_share_of_the_others(served, good_frame, messages
 async def test_beyond_capacity_a_frame_is_refused_before_it_is_read(served, good_frame):
     session = await served.open(latency_budget_ms=200.0, gather_ms=0)
     admission = served.gateway.admission
-    for number in range(200):
-        admission.learn(number - 1000, number - 1000 + 0.1, 0.0)
+    for _ in range(200):
+        admission.learn("any", 0.1, 0.0, 0.0)
 
     async def unread():
         pytest.fail("the body was read")
         yield b""
 
-    with admission.frame("another", 10.0), admission.frame("a third", 10.0):
+    with admission.frame("", "another", 10.0), admission.frame("", "a third", 10.0):
         refused = await served.post(session, "frames", unread(), token="not even looked at")
         assert refused.headers["retry-after"]
         problem(refused, 503, "overloaded")
@@ -132,3 +122,48 @@ async def test_opening_sessions_costs_little_and_ends_at_the_limit():
             await served.client.open_session(f"car-{number}", ["rsu"])
         body = {"ego_id": "one-more", "teammates": ["rsu"]}
         problem(await served.http.post("/v1/sessions", json=body), 503, "too-many-sessions")
+
+
+def test_a_costly_session_adds_no_more_to_a_frame_than_its_own_cost():
+    admission = Admission()
+    for _ in range(20):
+        admission.learn("long", 10.0, 0.002, 0.001)
+        admission.learn("short", 0.05, 0.002, 0.001)
+    with admission.frame("key", "long", 60.0):
+        admission.check("key", "short", 0.12)
+        with pytest.raises(Refused):
+            admission.check("key", "short", 0.1)
+
+
+def test_many_sessions_of_a_key_add_no_more_to_a_frame_of_another_than_one_of_them():
+    admission = Admission()
+    for _ in range(200):
+        admission.learn("any", 0.05, 0.002, 0.001)
+    with ExitStack() as taken:
+        for number in range(40):
+            taken.enter_context(admission.frame("many", f"session {number}", 20.0))
+        admission.check("one", "its session", 0.12)
+        with pytest.raises(Refused):
+            admission.check("many", "one more", 0.2)
+
+
+def test_a_frame_that_waits_for_its_teammates_costs_the_others_nothing():
+    admission = Admission()
+    with ExitStack() as taken:
+        for number in range(100):
+            taken.enter_context(admission.waiting(f"session {number}"))
+        admission.check("", "another", 0.05)
+    for _ in range(SESSION_FRAMES):
+        taken.enter_context(admission.waiting("greedy"))
+    with pytest.raises(Refused):
+        admission.check("", "greedy", 20.0)
+
+
+def test_one_stall_teaches_nothing():
+    admission = Admission()
+    for number in range(20):
+        stalled = number == 15
+        admission.learn("any", *((0.9, 5.0, 5.0) if stalled else (0.01, 0.002, 0.001)))
+    with admission.frame("", "one", 0.2):
+        admission.check("", "any", 0.1)
+    assert admission.deadline(100.0, 0.2)._end == pytest.approx(99.999)

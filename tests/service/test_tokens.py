@@ -72,7 +72,7 @@ async def test_no_forged_token_has_any_effect(good_frame):
                 problem(response, 401, "unauthenticated")
         after = await served.ego(session).state()
         changed = {name for name in before if before[name] != after[name]}
-        assert changed == {"audit_seq", "audit_head"}
+        assert changed == {"audit_seq", "audit_head", "receipt"}
         assert after["audit_seq"] == before["audit_seq"] + 16
 
 

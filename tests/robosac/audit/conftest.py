@@ -1,3 +1,4 @@
+import json
 from collections.abc import Iterable, Mapping
 from typing import Any
 
@@ -6,7 +7,7 @@ import pytest
 from cryptography.hazmat.primitives.asymmetric.ed25519 import Ed25519PrivateKey
 
 from robosac.answers import Distrust, Reason, Source, Verdict
-from robosac.audit import GENESIS, commitment, digest, seal
+from robosac.audit import GENESIS, commitment, digest, expanded, seal
 from robosac.audit.events import (
     Equivocation,
     FrameAnswered,
@@ -32,13 +33,18 @@ def seal_all(events: Iterable[Mapping[str, Any]], session: str = SESSION) -> lis
     return [line.encode() + b"\n" for line in lines]
 
 
+def unpacked(line: bytes | str) -> dict[str, Any]:
+    """A record at length, so that a test can change it and `seal_all` write it as format 1 did."""
+    return {name: value for name, value in expanded(json.loads(line)).items() if name != "format"}
+
+
 def head(lines: list[bytes]) -> str:
     return digest(lines[-1].decode().removesuffix("\n"))
 
 
-def proof(name: str, frame: int) -> Proof:
-    content = digest(f"{name} in {frame}")
-    return Proof(digest=content, signature=sign(KEY, SESSION, content) if name == "rsu" else None)
+def proof(name: str, frame: int, what: str = "") -> Proof:
+    content = digest(f"{name} in {frame}{what}")
+    return Proof(digest=content, signature=sign(KEY, SESSION, name, frame, content) if name == "rsu" else None)
 
 
 def answered(frame: int, seed: str, *outcomes: Outcome, trusted: tuple[str, ...] = (), source=Source.CONSENSUS):
@@ -108,7 +114,7 @@ def events(detector) -> list[dict[str, Any]]:
         answered(0, f"{0:064x}", against, found, trusted=("rsu", "car-3")),
         answered(1, f"{1:064x}", source=Source.TRUSTED, trusted=("rsu", "car-3")),
         refusal.as_json(),
-        Equivocation(vehicle_id="rsu", frame=1, first=first, second=proof("rsu", 99)).as_json(),
+        Equivocation(vehicle_id="rsu", frame=1, first=first, second=proof("rsu", 1, ", otherwise")).as_json(),
         change.as_json(),
         answered(5, f"{2:064x}", against, found, trusted=("rsu", "car-3")),
         SessionEnded(why="closed").as_json(),

@@ -11,6 +11,7 @@ from tests.robosac.audit.conftest import proof
 def others(events):
     """One event of each kind that the log of the fixture lacks."""
     return [
+        kinds.DetectorChanged(detector="d", weights_digest="ab", accepted=False).as_json(),
         kinds.AccessRefused(vehicle_id=None, detail="a bearer token is needed").as_json(),
         kinds.TokenRenewed(vehicle_id="rsu", expires_at="2026-01-01T00:00:00Z").as_json(),
     ]

@@ -58,10 +58,11 @@ def test_a_rejected_vehicle_is_reported_with_its_evidence(lines, events):
 
 def test_an_equivocation_is_reported_with_both_signatures(lines):
     made = misbehaviour.report(lines, "rsu", NOW)
+    both = (proof("rsu", 1), proof("rsu", 1, ", otherwise"))
     assert observations(made) == [("message", "equivocation", 2, 1)]
     (stream,) = made["report"]["content"]["v2xPduEvidence"]
-    assert [pdu["digest"] for pdu in stream["v2xPdus"]] == [proof("rsu", f).digest for f in (1, 99)]
-    assert [pdu["signature"] for pdu in stream["v2xPdus"]] == [proof("rsu", f).as_json()["signature"] for f in (1, 99)]
+    assert [pdu["digest"] for pdu in stream["v2xPdus"]] == [each.digest for each in both]
+    assert [pdu["signature"] for pdu in stream["v2xPdus"]] == [each.as_json()["signature"] for each in both]
     assert stream["certificate"]["vehicleId"] == "rsu"
     assert read_public_key(stream["certificate"]["ed25519PublicKey"]) == KEY.public_key()
 
@@ -80,7 +81,7 @@ async def test_two_signed_messages_of_the_gateway_prove_an_equivocation(messages
     key = read_public_key(stream["certificate"]["ed25519PublicKey"])
     for pdu, message in zip(stream["v2xPdus"], (messages["rsu"], other), strict=True):
         assert pdu["digest"] == content_digest(3, "rsu", message)
-        assert is_valid(key, session.session_id, pdu["digest"], base64.b64decode(pdu["signature"]))
+        assert is_valid(key, session.session_id, "rsu", 3, pdu["digest"], base64.b64decode(pdu["signature"]))
 
 
 def test_a_dissensus_with_the_previous_answer_is_a_conflict_with_other_stations(events):

@@ -1,14 +1,13 @@
 """On whose word boxes stand, from a defence over the wire into the log, and made again from it."""
 
 import asyncio
-import json
 
 import pytest
 
 from robosac.answers import Standing
 from robosac.audit import replay, verify
 from robosac.defenses import Kinds, shipped
-from tests.robosac.audit.conftest import seal_all
+from tests.robosac.audit.conftest import seal_all, unpacked
 from tests.robosac.judging import Judging
 from tests.service.conftest import EGO, TEAM, serve
 
@@ -44,22 +43,25 @@ def test_an_answer_says_on_whose_word_each_box_stands(got):
 def test_the_log_keeps_it_and_a_replay_compares_it(got, detector):
     answers, lines, body, head = got
     assert verify(lines, head) == []
-    logged = json.loads(lines[2])
+    logged = unpacked(lines[2])
     assert logged["support"] == answers[1].as_json()["support"]
-    assert logged["contradicted"] == answers[1].as_json()["contradicted"]
+    told = answers[1].as_json()["contradicted"]
+    for kept, one in zip(logged["contradicted"], told, strict=True):
+        assert kept["box"] == pytest.approx(one["box"], abs=0.0051)
+        assert {**kept, "box": one["box"]} == one
     assert replay.replay(replay.find(lines, 1), body, detector, KINDS) == []
 
 
 def changed(lines, index=2, **fields):
     """The log of a gateway that lied about a record, and chained it properly; what is None is not in it."""
-    records = [json.loads(line) for line in lines]
+    records = [unpacked(line) for line in lines]
     records[index] = {name: value for name, value in {**records[index], **fields}.items() if value is not ...}
     return seal_all(records, records[0]["session_id"])
 
 
 def test_what_a_gateway_lies_about_it_comes_out_otherwise(got, detector):
     _, lines, body, _ = got
-    logged = json.loads(lines[2])
+    logged = unpacked(lines[2])
     first, *rest = logged["support"]
     out, *others = logged["contradicted"]
     moved = {**out, "box": [out["box"][0] + 1e-5, *out["box"][1:]]}
@@ -76,8 +78,9 @@ def test_what_a_gateway_lies_about_it_comes_out_otherwise(got, detector):
     for fields, what in lies:
         again = replay.find(changed(lines, **fields), 1)
         assert {difference.what for difference in replay.replay(again, body, detector, KINDS)} == {what}, fields
-    near = {**out, "box": [out["box"][0] + 1e-7, *out["box"][1:]]}
-    again = replay.find(changed(lines, contradicted=[near, *others]), 1)
+    exact = got[0][1].as_json()["contradicted"]  # as format 1 kept it
+    near = {**exact[0], "box": [exact[0]["box"][0] + 1e-7, *exact[0]["box"][1:]]}
+    again = replay.find(changed(lines, contradicted=[near, *exact[1:]]), 1)
     assert replay.replay(again, body, detector, KINDS) == []
 
 
@@ -93,7 +96,7 @@ def test_a_log_of_an_older_version_is_not_asked_for_it(got, detector):
 @pytest.mark.parametrize("role", ["witnesses", "deniers"])
 def test_the_word_of_somebody_without_a_message_is_found(got, field, role):
     lines = got[1]
-    first, *rest = json.loads(lines[2])[field]
+    first, *rest = unpacked(lines[2])[field]
     findings = verify(changed(lines, **{field: [{**first, role: ["stranger"]}, *rest]}))
     assert [(finding.line, finding.fault.value) for finding in findings] == [(3, "contradiction")]
     assert "on the word of stranger" in findings[0].detail

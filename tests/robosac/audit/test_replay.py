@@ -4,11 +4,7 @@ import asyncio
 import dataclasses
 import itertools
 import json
-import math
-import sys
-import time
 from pathlib import Path
-from types import ModuleType, SimpleNamespace
 
 import numpy as np
 import pytest
@@ -19,7 +15,7 @@ from robosac import wire
 from robosac.audit import replay, verify
 from robosac.cli import app
 from robosac.detectors import Message
-from tests.robosac.audit.conftest import seal_all
+from tests.robosac.audit.conftest import seal_all, unpacked
 from tests.service.conftest import serve
 
 BUDGET_MS = 1000
@@ -92,51 +88,11 @@ async def test_group_testing_comes_out_the_same_with_who_is_missing_and_who_is_n
     answers = [replay.find(got.lines, number).answer for number, *_ in frames]
     assert answers[3].rejected["car-4"].reason == "missing"
     assert "named" in [answer.rejected["car-2"].distrust for answer in answers[2:]]
-    lie = {**answers[2].state, "suspicion": {**answers[2].state["suspicion"], "car-2": 0.5}}
-    index = next(i for i, line in enumerate(got.lines) if json.loads(line).get("frame") == 2)
+    assert [answer.state is None for answer in answers] == [False, *[True] * 5]  # the others have its digest
+    after = json.loads(wire.unpack(got.bodies[2])["states"]["after"])
+    lie = {**after, "suspicion": {**after["suspicion"], "car-2": 0.5}}
+    index = next(i for i, line in enumerate(got.lines) if unpacked(line).get("frame") == 2)
     assert "state" in told(got, detector, frame=2, index=index, state=lie)
-
-
-class Tiring:
-    """The shipped detector; after so many passes the next one takes longer than the frame has."""
-
-    def __init__(self, detector):
-        self.detector, self.info = detector, dataclasses.replace(detector.info, name="tiring")
-        self.passes_left = math.inf  # until the gateway has warmed up
-
-    def __getattr__(self, name):
-        return getattr(self.detector, name)
-
-    def prepare(self, ego, teammates):
-        prepared = self.detector.prepare(ego, teammates)
-        return SimpleNamespace(detect=lambda subset=(): self.detect(prepared, subset))
-
-    def detect(self, prepared, subset):
-        if self.passes_left == 0:
-            time.sleep(BUDGET_MS / 1e3)
-        self.passes_left -= 1
-        return prepared.detect(subset)
-
-
-@pytest.mark.parametrize("after", [0, 2])
-async def test_a_decision_cut_short_comes_out_the_same(after, detector, ego_message, attacked, monkeypatch):
-    """The pass of the ego, or the one after so many hypotheses, takes all the time."""
-    module = ModuleType("tired")
-    module.detector = Tiring(detector)
-    module.build = lambda: module.detector
-    monkeypatch.setitem(sys.modules, "tired", module)
-
-    def tire():
-        module.detector.passes_left = after
-
-    options = {"detector": "tiring", "latency_budget_ms": BUDGET_MS, "gather_ms": 0}
-    defense = {"kind": "a2cp", "consensus_threshold": 1.0}
-    frames = [(0, ego_message, attacked)]
-    got = await drive(frames, serving={"extra_detectors": "tired:build"}, ready=tire, defense=defense, **options)
-    answer = replay.find(got.lines, 0).answer
-    assert (answer.out_of_time, len(answer.hypotheses)) == (True, after)
-    assert got.differences(0, detector) == []
-    assert "hypotheses" in told(got, detector, out_of_time=False)
 
 
 @pytest.fixture(scope="module")
@@ -147,7 +103,7 @@ def got(detector, ego_message, attacked):
 
 def changed(got, index=-1, **fields):
     """The log of a gateway that lied about a record, and chained it properly."""
-    records = [json.loads(line) for line in got.lines]
+    records = [unpacked(line) for line in got.lines]
     records[index].update(fields)
     return seal_all(records, records[0]["session_id"])
 
@@ -157,13 +113,15 @@ def told(got, detector, frame=0, **fields):
 
 
 def test_what_a_gateway_lies_about_comes_out_otherwise(got, detector):
-    logged = json.loads(got.lines[-1])
+    logged = unpacked(got.lines[-1])
     boxes = [[x + 1e-5, *rest] for x, *rest in logged["boxes"]]
     (first, *rest) = logged["hypotheses"]
     lies = [
         ({"seed": "0" * 63 + "1"}, {"hypotheses"}),
         ({"boxes": boxes}, {"boxes"}),
+        ({"boxes": [[round(x + 0.01, 2), *rest] for x, *rest in logged["boxes"]]}, {"boxes"}),
         ({"boxes": boxes[1:]}, {"boxes"}),
+        ({"state_digest": "0" * 64}, {"state"}),
         ({"source": "ego_only"}, {"source"}),
         ({"accepted": ["rsu"]}, {"accepted"}),
         ({"fault": "MemoryError: "}, {"fault"}),
@@ -175,8 +133,22 @@ def test_what_a_gateway_lies_about_comes_out_otherwise(got, detector):
     ]
     for fields, expected in lies:
         assert told(got, detector, 2, **fields) >= expected, fields
-    within = [[x + 1e-7, *rest] for x, *rest in logged["boxes"]]
-    assert told(got, detector, 2, boxes=within) == set()
+    assert told(got, detector, 2) == set()
+
+
+def test_what_was_remembered_has_to_be_what_the_log_has_the_digest_of(got, detector):
+    decision, body = replay.find(got.lines, 2), wire.unpack(got.bodies[2])
+    assert decision.state is None
+    without = wire.pack({name: part for name, part in body.items() if name != "states"})
+    for text in (b'{"trusted": ["rsu"]}', b"[1]", b"[", b"\xff"):
+        forged = wire.pack({**body, "states": {**body["states"], "before": text}})
+        for kept in (without, forged):
+            with pytest.raises(replay.ReplayError, match="only the digest"):
+                replay.replay(decision, kept, detector)
+        forged = wire.pack({**body, "states": {**body["states"], "after": text}})
+        assert replay.replay(decision, forged, detector) == []  # by the digest
+    kept = json.loads(body["states"]["before"])
+    assert replay.replay(dataclasses.replace(decision, state=kept), without, detector) == []
 
 
 def test_other_inputs_are_told_and_nothing_is_recomputed(got, detector, ego_message, benign):

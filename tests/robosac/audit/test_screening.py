@@ -1,7 +1,6 @@
 """Refused messages in the log of a gateway, and made again from it."""
 
 import asyncio
-import json
 
 import numpy as np
 import pytest
@@ -10,7 +9,7 @@ from robosac.answers import Reason
 from robosac.audit import replay, verify
 from robosac.detectors import Message
 from robosac.screening import MEMORY
-from tests.robosac.audit.conftest import seal_all
+from tests.robosac.audit.conftest import seal_all, unpacked
 from tests.service.conftest import serve
 
 
@@ -60,9 +59,9 @@ def test_the_log_says_it_and_a_replay_tests_them_again(got, detector):
     assert verify(lines) == []
     for frame, body in enumerate(bodies):
         assert replay.replay(replay.find(lines, frame), body, detector) == []
-    last = json.loads(lines[frame_lines(lines)[1]])
+    last = unpacked(lines[frame_lines(lines)[1]])
     lied = [why if why["vehicle_id"] != "car-3" else {**why, "reason": "late"} for why in last["rejected"]]
-    records = [json.loads(line) for line in lines]
+    records = [unpacked(line) for line in lines]
     records[frame_lines(lines)[1]]["rejected"] = lied
     forged = seal_all(records, records[0]["session_id"])
     assert {each.what for each in replay.replay(replay.find(forged, 1), bodies[1], detector)} == {"rejected"}
@@ -74,7 +73,7 @@ def test_the_log_says_it_and_a_replay_tests_them_again(got, detector):
 def test_a_log_of_an_older_version_is_replayed_without_the_tests(got, detector):
     """In such a log nobody is refused so, and the state holds nothing of messages."""
     answers, lines, bodies = got
-    records = [json.loads(line) for line in lines]
+    records = [unpacked(line) for line in lines]
     for record in records:
         record.get("state", {}).pop(MEMORY, None)
         record.pop("alike", None)

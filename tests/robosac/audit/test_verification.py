@@ -121,8 +121,8 @@ def test_a_seed_that_was_not_committed_to_is_told(events):
 
 
 def test_frames_must_increase(events):
-    assert faults(change(events, 2, frame=0)) == [(3, Fault.FRAME_ORDER)]
-    assert faults(change(events, 6, frame=1)) == [(7, Fault.FRAME_ORDER)]
+    assert faults(change(events, 2, frame=0)) == [(3, Fault.FRAME_ORDER), (3, Fault.BAD_SIGNATURE)]
+    assert faults(change(events, 6, frame=1)) == [(7, Fault.FRAME_ORDER), (7, Fault.BAD_SIGNATURE)]
 
 
 HYPOTHESIS = {"teammates": ["rsu", "car-3"], "jaccard_index": 0.75, "verdict": "consensus"}
@@ -167,7 +167,8 @@ def test_fusing_without_a_message_is_told(events):
 
 
 def test_what_a_team_change_says_of_the_trusted_counts(events):
-    forgotten = [*events[:5], events[5], {**events[2], "seed": events[6]["seed"], "frame": 6}]
+    signed = {name: proof(name, 6).as_json() for name in events[2]["messages"]}
+    forgotten = [*events[:6], {**events[2], "seed": events[6]["seed"], "frame": 6, "messages": signed}]
     assert [finding.detail.split(": ")[1] for finding in verify(seal_all(forgotten))] == [
         "car-3 accepted as trusted, but not on the trust list before",
         "car-3 on the trust list without a consensus",
@@ -204,6 +205,7 @@ def test_independent_findings_are_all_told(events):
         (5, Fault.CONTRADICTION),
         (5, Fault.BAD_SIGNATURE),
         (7, Fault.FRAME_ORDER),
+        (7, Fault.BAD_SIGNATURE),
     ]
 
 
@@ -239,5 +241,5 @@ def test_records_that_lack_something_are_told(events, index, name, value):
 
 
 def test_a_finding_says_where_and_what(events):
-    (finding,) = verify(change(events, 2, frame=0))
+    finding, _ = verify(change(events, 2, frame=0))
     assert str(finding) == "line 3 (seq 3): frame-order: frame 0 after frame 0"

@@ -13,9 +13,11 @@ from pathlib import Path
 from types import SimpleNamespace
 
 import asyncpg
+import numpy as np
 import pytest
 
 from robosac.audit import GENESIS, digest
+from robosac.audit.events import FrameAnswered
 from service.keeping.record import SessionRecord
 from service.keeping.store import Store
 
@@ -132,8 +134,12 @@ def note(**fields: object) -> Event:
     return Event(**{"event": "note", **fields})
 
 
-def a_decision(frame: int = 1, **state: object) -> Event:
-    return Event(event="frame_answered", frame=frame, state=state)
+def a_decision(frame: int = 1, **state: object) -> FrameAnswered:
+    return FrameAnswered(
+        frame=frame, boxes=np.zeros((0, 6)), source="ego_only", accepted=(), rejected={}, hypotheses=(),
+        sampling_steps=0, attacker_ratio=None, deadline_met=True, degraded_by=None, timings_ms={}, seed="00",
+        ego_pose=np.eye(4), messages={}, out_of_time=False, state=state, next_seed_commitment="",
+    )  # fmt: skip
 
 
 A_TOKEN = Event(event="token_renewed", vehicle_id="a")

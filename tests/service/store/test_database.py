@@ -19,6 +19,7 @@ from alembic.util import CommandError
 from sqlalchemy import text
 
 from clients.errors import SessionNotFound
+from robosac import wire
 from service.errors import StoreUnavailable
 from service.keeping import migrations
 from service.keeping.database import _keep_a_journal, connect
@@ -212,7 +213,9 @@ async def test_a_gateway_serves_from_each_database(shared_url, good_frame):
         for frame in (0, 1):
             assert (await served.post(session, "frames", good_frame(frame))).json()["source"] == "consensus"
         problem(await served.post(session, "frames", good_frame(1)), 409, "stale-frame")
-        assert await ego.kept_messages(1) == good_frame(1)
+        kept = wire.unpack(await ego.kept_messages(1))
+        assert {"after", "before"} == kept.pop("states").keys()
+        assert kept == wire.unpack(good_frame(1))
         with pytest.raises(SessionNotFound, match="messages-not-kept"):
             await ego.kept_messages(0)
         await ego.dismiss("rsu")

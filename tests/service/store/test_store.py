@@ -1,5 +1,6 @@
 """What every store must do, on SQLite and PostgreSQL."""
 
+import asyncio
 import dataclasses
 import json
 import time
@@ -8,8 +9,9 @@ import pytest
 import rfc8785
 from sqlalchemy import text
 
-from service.errors import FrameDecided, SessionChanged, SessionOver
-from service.keeping.store import Store
+from service.errors import AuditFull, FrameDecided, SessionChanged, SessionOver
+from service.keeping.record import SessionRecord
+from service.keeping.store import PAGE, Store
 from tests.service.store.conftest import (
     A_TEAM,
     A_TOKEN,
@@ -70,8 +72,8 @@ async def test_of_decisions_at_once_one_is_kept(store):
     sid = await added(store)
     calls = [store.decide(a_session(), a_decision(frame), f"{frame:064x}") for frame in (7, 7, 7, 8, 9)]
     outcomes = await all_of(*calls)
-    assert sum(outcome is None for outcome in outcomes) == 1
-    assert {type(outcome) for outcome in outcomes if outcome} <= {FrameDecided, SessionChanged}
+    assert sum(isinstance(outcome, SessionRecord) for outcome in outcomes) == 1
+    assert {type(outcome) for outcome in outcomes} <= {SessionRecord, FrameDecided, SessionChanged}
     assert (await store.get(sid)).frames_answered == 1
     assert len(await check_chain(store, sid)) == 2
 
@@ -161,8 +163,9 @@ async def test_old_messages_are_forgotten(store):
     sid, other = await added(store), await added(store, 1)
     for number in range(2):
         for frame in range(4):
-            await store.decide(a_session(number, revision=frame), a_decision(frame), "00" * 32, bytes([frame]))
-    await store.forget_messages(sid, 2)
+            record = a_session(number, revision=frame)
+            kept = 0 if number else 2
+            await store.decide(record, a_decision(frame), "00" * 32, bytes([frame]), keep_frames=kept)
     assert [await store.messages(sid, frame) for frame in range(4)] == [None, None, b"\x02", b"\x03"]
     assert await store.messages(other, 0) == b"\x00"
 
@@ -209,7 +212,7 @@ async def test_two_stores_on_one_database_never_fork_a_chain_or_decide_twice(sha
         outcomes = await all_of(*(store.log(sid, note()) for _ in range(15) for store in (one, two)))
         assert set(outcomes) == {None}
         calls = [store.decide(a_session(), a_decision(), "00" * 32) for store in (one, two)]
-        assert sum(outcome is None for outcome in await all_of(*calls)) == 1
+        assert sum(isinstance(outcome, SessionRecord) for outcome in await all_of(*calls)) == 1
         assert len(await check_chain(one, sid)) == len(await check_chain(two, sid)) == 32
 
 
@@ -240,3 +243,37 @@ async def test_the_database_is_right_even_where_it_lost_what_was_written(store):
     await store._database.write(lambda connection: connection.execute(undone))
     assert (await store.get(sid)).revision == 0
     assert store.seen(sid).revision == 0
+
+
+async def test_a_log_is_read_in_pages_and_purged_in_short_transactions(store):
+    sid, other = await added(store), await added(store, 1)
+    await all_of(*(store.log(sid, note(n=n)) for n in range(2 * PAGE)))
+    pages, after = [], 0
+    while page := await store.audit(sid, after):
+        pages.append(page)
+        after += len(page)
+    assert [len(page) for page in pages] == [PAGE, PAGE, 1]
+    await store.end(sid, THE_END)
+    purging = asyncio.create_task(store.purge(time.time() + 1))
+    while not purging.done():
+        record = await store.get(sid)
+        assert record is None or record.purging or len(await store.audit(sid, 0)) == PAGE
+    await purging
+    assert (await store.get(sid), await store.audit(sid, 0)) == (None, [])
+    assert len(await store.audit(other, 0)) == 1
+
+
+async def test_a_full_log_takes_only_the_end(url):
+    store = Store(url, most_records=3)
+    await store.start()
+    sid = await added(store)
+    await decided(store, sid, 1)
+    await store.log(sid, note())
+    for refused in (store.log(sid, note()), decided(store, sid, 2)):
+        with pytest.raises(AuditFull, match="ROBOSAC_AUDIT_MAX_RECORDS"):
+            await refused
+    assert (await store.get(sid)).last_frame == 1
+    await store.end(sid, THE_END)
+    lines = await check_chain(store, sid)
+    assert [json.loads(line)["event"] for line in lines][-1] == "session_ended"
+    await store.close()

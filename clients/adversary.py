@@ -1,0 +1,237 @@
+"""What somebody with a valid key can do to an honest ego: ``robosac adversary``.
+
+For each attack a fresh gateway is started on loopback, with one API key for the honest ego and another for the
+attacker. The ego posts frames at a fixed rate, at first alone, and then beside the attack, which runs in a process of
+its own. Whether a frame was in time is told by the ego's own clock.
+"""
+
+from __future__ import annotations
+
+import asyncio
+import multiprocessing
+import sys
+import tempfile
+import time
+from collections import Counter
+from collections.abc import Sequence
+from concurrent.futures import ProcessPoolExecutor
+from dataclasses import dataclass, field
+from pathlib import Path
+from secrets import token_urlsafe
+from typing import Annotated, Any
+
+import torch
+import typer
+from rich.console import Console
+from rich.progress import track
+
+from clients import trial
+from clients.client import GatewayClient, VehicleClient
+from clients.errors import GatewayError
+from clients.hostile import LOCKED, Attack, Target, run_attack, strange_frame
+from clients.load_test import WARM_UP_FRAMES, Bodies, new_ego, prepare
+from clients.local_gateway import GatewayProcess
+
+HONEST_HZ = 5.0
+CLOCK_MS = 5.0
+"""What the ego's clock sees more than the gateway's, on one machine: the way there and back."""
+RECOVERED_WITHIN = 2
+"""Frames after a fault of the store by which an answer has to be tested and in time again."""
+
+
+@dataclass(frozen=True)
+class Plan:
+    """How long each part takes, and the honest ego's budget."""
+
+    seconds: float
+    budget_ms: float
+
+
+@dataclass
+class Seen:
+    """What an honest ego saw of its frames."""
+
+    budget_ms: float
+    frames: int = 0
+    in_budget: int = 0
+    """Answered within the budget, by its own clock."""
+    tested: int = 0
+    """Answered within the budget, and not cut short."""
+    belied: int = 0
+    """Answers that call themselves in time and came too late."""
+    refused: Counter[str] = field(default_factory=Counter)
+    outcomes: list[tuple[float, bool]] = field(default_factory=list, repr=False)
+    """Of each frame when it was due, and whether it was tested in time."""
+
+    async def post(self, ego: VehicleClient, body: bytes) -> None:
+        """Post a frame and note what comes of it."""
+        began, good = time.perf_counter(), False
+        self.frames += 1
+        try:
+            answer = await ego.post_frame_body(body)
+        except GatewayError as error:
+            self.refused[f"{type(error).__name__}: {str(error)[:60]}"] += 1
+        else:
+            took_ms = (time.perf_counter() - began) * 1e3
+            in_budget = took_ms <= self.budget_ms
+            good = in_budget and answer.degraded_by is None
+            self.in_budget += in_budget
+            self.tested += good
+            self.belied += answer.deadline_met and took_ms > self.budget_ms + CLOCK_MS
+        self.outcomes.append((began, good))
+
+    def share(self, number: int) -> float:
+        """Of its frames."""
+        return number / max(self.frames, 1)
+
+    def recovered_after(self, moment: float) -> int | None:
+        """Frames from a moment (`time.perf_counter`) on until one was tested in time; None if none was."""
+        after = [good for began, good in sorted(self.outcomes) if began >= moment]
+        return after.index(True) if True in after else None
+
+
+@dataclass
+class Result:
+    """What came of one attack."""
+
+    attack: Attack
+    before: Seen
+    during: Seen
+    attacker: Counter[str]
+    """What the attacker was answered, by status."""
+    memory_mib: float
+    """Most that the gateway held."""
+    recovered_after: int | None = None
+    """Of an attack that ends before its part does: frames until one was tested in time."""
+
+    @property
+    def held(self) -> bool:
+        """Whether no answer was belied, and the ego was served again after a fault of the store."""
+        recovered = self.attack is not Attack.DATABASE or (
+            self.recovered_after is not None and self.recovered_after <= RECOVERED_WITHIN
+        )
+        return not self.before.belied + self.during.belied and recovered
+
+
+async def _drive(ego: VehicleClient, bodies: Bodies, first: int, seen: Seen, seconds: float) -> int:
+    """Post frames at the honest rate, whatever becomes of them; the number of the next frame."""
+    started, posts = time.perf_counter(), []
+    for k in range(max(1, int(seconds * HONEST_HZ))):
+        await asyncio.sleep(max(0.0, started + k / HONEST_HZ - time.perf_counter()))
+        posts.append(asyncio.create_task(seen.post(ego, bodies.numbered(first + k))))
+    await asyncio.gather(*posts)
+    return first + len(posts)
+
+
+async def play(attack: Attack, plan: Plan, bodies: Bodies, strange: bytes, pool: ProcessPoolExecutor) -> Result:
+    """One attack on a gateway of its own."""
+    honest_key, key = token_urlsafe(32), token_urlsafe(32)
+    with tempfile.TemporaryDirectory(prefix="robosac-") as name:
+        folder = Path(name)
+        process = GatewayProcess(folder / "gateway.log", f"sqlite:///{folder}/robosac.db", f"{honest_key},{key}")
+        try:
+            await process.ready()
+            async with GatewayClient(process.url, honest_key) as gateway:
+                ego = await new_ego(gateway, plan.budget_ms)
+                for frame in range(WARM_UP_FRAMES):
+                    await ego.post_frame_body(bodies.numbered(frame))
+                before, during = Seen(plan.budget_ms), Seen(plan.budget_ms)
+                frame = await _drive(ego, bodies, WARM_UP_FRAMES, before, plan.seconds)
+                target = Target(process.url, key, str(folder / "robosac.db"), strange, bodies.numbered(0))
+                loop = asyncio.get_running_loop()
+                attacking = loop.run_in_executor(pool, run_attack, attack, target, plan.seconds)
+                ends = time.perf_counter() + LOCKED * plan.seconds
+                await _drive(ego, bodies, frame, during, plan.seconds)
+                result = Result(attack, before, during, await attacking, process.peak_memory_mib())
+                if attack is Attack.DATABASE:
+                    result.recovered_after = during.recovered_after(ends)
+                return result
+        finally:
+            await process.stop()
+
+
+async def play_all(attacks: Sequence[Attack], plan: Plan, bodies: Bodies, console: Console) -> list[Result]:
+    """One attack after another."""
+    strange = strange_frame(bodies.numbered(0))
+    with ProcessPoolExecutor(1, multiprocessing.get_context("spawn")) as pool:
+        await asyncio.get_running_loop().run_in_executor(pool, time.time)  # it takes seconds to start
+        return [
+            await play(attack, plan, bodies, strange, pool)
+            for attack in track(attacks, "attacks", console=console, transient=True)
+        ]
+
+
+def show(console: Console, results: Sequence[Result], plan: Plan) -> None:
+    """Print what came of it."""
+    columns = [
+        "attack",
+        "in budget: before",
+        "during",
+        "tested: before",
+        "during",
+        "belied",
+        "refused: ego",
+        "attacker",
+    ]
+    title = f"One honest ego at {HONEST_HZ:g} Hz, budget {plan.budget_ms:g} ms, by its own clock"
+    table = trial.a_table(title, [*columns, "attacker was answered", "recovered after", "MiB"])
+    for result in results:
+        before, during = result.before, result.during
+        table.add_row(
+            result.attack.value,
+            *(f"{seen.share(seen.in_budget):.0%}" for seen in (before, during)),
+            *(f"{seen.share(seen.tested):.0%}" for seen in (before, during)),
+            str(before.belied + during.belied),
+            str(during.refused.total()),
+            ", ".join(f"{what}: {n}" for what, n in sorted(result.attacker.items())) or "-",
+            "-" if result.recovered_after is None else f"{result.recovered_after} frames",
+            f"{result.memory_mib:.0f}",
+        )
+    console.print(table)
+
+
+def main(
+    out: trial.Out = None,
+    only: Annotated[list[Attack] | None, typer.Option(help="Attacks to play; by default all.")] = None,
+    seconds: trial.Seconds = 4.0,
+    budget_ms: trial.Budget = 200.0,
+    at_least: Annotated[
+        float, typer.Option(min=0.0, max=1.0, help="Share of frames to be tested in time during an attack.")
+    ] = 0.0,
+) -> None:
+    """Attack gateways of one's own with a valid key, and measure what an honest ego beside notices.
+
+    Exits with 1 if an answer called itself in time and was not, if the ego was not served again after a fault of the
+    database, or if fewer frames than asked for were tested in time during another attack.
+    """
+    torch.set_num_threads(1)
+    console = Console()
+    trial.make_folder(out, "--out")
+    plan = Plan(seconds, budget_ms)
+    bodies = prepare(True, 3, console)
+    results = trial.run(play_all(only or list(Attack), plan, bodies, console), console, "The adversary")
+    show(console, results, plan)
+    trial.write([_as_dict(result) for result in results], out, "adversary.json", console)
+    enough = [r.during.share(r.during.tested) >= at_least for r in results if r.attack is not Attack.DATABASE]
+    if not all(enough) or not all(result.held for result in results):
+        sys.exit(1)
+
+
+def _as_dict(result: Result) -> dict[str, Any]:
+    """Plain values for JSON."""
+    parts = {
+        name: {
+            "frames": seen.frames,
+            "in_budget": seen.in_budget,
+            "tested": seen.tested,
+            "belied": seen.belied,
+            "refused": dict(seen.refused),
+        }
+        for name, seen in (("before", result.before), ("during", result.during))
+    }
+    others = {name: getattr(result, name) for name in ("memory_mib", "recovered_after", "held")}
+    return {"attack": result.attack.value, **parts, "attacker": dict(result.attacker), **others}
+
+
+if __name__ == "__main__":
+    typer.run(main)

@@ -1,0 +1,203 @@
+"""One vehicle's side of the API."""
+
+from __future__ import annotations
+
+import json
+from collections.abc import AsyncIterator, Mapping, Sequence
+from dataclasses import dataclass
+from typing import Any, TypeVar
+
+import httpx
+from cryptography.hazmat.primitives.asymmetric.ed25519 import Ed25519PrivateKey
+from pydantic import TypeAdapter, ValidationError
+
+from clients.errors import ProtocolError
+from clients.receipts import ReceiptBook
+from robosac import wire
+from robosac.answers import FrameAnswer, LogReceipt, Typed
+from robosac.detectors import Message
+from robosac.signatures import sign
+
+MSGPACK = "application/vnd.msgpack"
+AUDIT_PAGE = 1000
+"""Audit records that are asked for at a time."""
+T = TypeVar("T")
+
+
+class _Accepted(Typed):
+    receipt: LogReceipt | None = None
+
+
+@dataclass(frozen=True)
+class _ChangedTeam:
+    teammate_tokens: dict[str, str]
+
+
+@dataclass(frozen=True)
+class RenewedToken:
+    """A vehicle's fresh token, and when it expires (RFC 3339, UTC)."""
+
+    token: str
+    expires_at: str
+
+
+class VehicleClient:
+    """One vehicle in a session, speaking with its own token.
+
+    Made by `GatewayClient.vehicle`. A teammate can only `send` and `renew`; the ego may call everything.
+    """
+
+    def __init__(
+        self,
+        request: Any,
+        session_id: str,
+        vehicle_id: str,
+        token: str,
+        key: Ed25519PrivateKey | None = None,
+        receipts: ReceiptBook | None = None,
+    ) -> None:
+        self._key = key
+        self._receipts = receipts
+        self.session_id = session_id
+        self.vehicle_id = vehicle_id
+        self._request = request
+        self._path = f"/v1/sessions/{session_id}"
+        self.token = token
+
+    @property
+    def bearer(self) -> dict[str, str]:
+        """The header that says who speaks."""
+        return bearer(self.token)
+
+    async def renew(self) -> RenewedToken:
+        """Take a fresh token and speak with it from now on; the one before is worth nothing any more."""
+        response = await self._request("POST", f"{self._path}/token", headers=self.bearer)
+        renewed = told(response, RenewedToken)
+        self.token = renewed.token
+        return renewed
+
+    def signature(self, frame: int, message: Message) -> bytes | None:
+        """The vehicle's signature over its message; None if it has no key."""
+        if self._key is None:
+            return None
+        digest = wire.content_digest(frame, self.vehicle_id, message)
+        return sign(self._key, self.session_id, self.vehicle_id, frame, digest)
+
+    async def send(self, frame: int, message: Message) -> None:
+        """As a teammate: post the own message for a frame."""
+        await self.send_body(wire.pack_message(frame, self.vehicle_id, message, self.signature(frame, message)))
+
+    async def send_body(self, body: bytes) -> None:
+        """As `send`, with a body that is packed already."""
+        content = (await self._post("messages", body)).content
+        try:
+            receipt = _Accepted.model_validate(wire.unpack(content, trusted=True)).receipt
+        except (wire.WireError, ValidationError) as error:
+            raise ProtocolError(f"not a receipt: {error}") from error
+        await self._keep(receipt)
+
+    async def ask(self, frame: int, message: Message) -> FrameAnswer:
+        """As the ego: post the own message and get the frame's answer, once the teammates' messages are in."""
+        body = wire.pack_message(frame, self.vehicle_id, message, self.signature(frame, message))
+        return await self._answered("messages", body)
+
+    async def post_frame(
+        self,
+        frame: int,
+        ego: Message,
+        teammates: Mapping[str, Message],
+        signatures: Mapping[str, bytes] | None = None,
+    ) -> FrameAnswer:
+        """As the ego: post a whole frame, with the signatures that the teammates gave."""
+        body = wire.pack_frame(frame, ego, teammates, self.signature(frame, ego), signatures)
+        return await self.post_frame_body(body)
+
+    async def post_frame_body(self, body: bytes) -> FrameAnswer:
+        """As `post_frame`, with a body that is packed already."""
+        return await self._answered("frames", body)
+
+    async def state(self) -> Mapping[str, Any]:
+        """As the ego: the session's state."""
+        return told(await self._request("GET", self._path, headers=self.bearer), dict[str, Any])
+
+    async def audit(self, after: int = 0) -> list[Mapping[str, Any]]:
+        """As the ego: audit records with a number above ``after``, unpacked (`robosac.audit.expanded`)."""
+        from robosac.audit import expanded  # noqa: PLC0415 (which needs scipy)
+
+        try:
+            return [expanded(json.loads(line)) for line in await self.audit_lines(after)]
+        except ValueError as error:
+            raise ProtocolError(f"not JSON Lines: {error}") from error
+
+    async def audit_lines(self, after: int = 0) -> list[str]:
+        """As `audit`, the lines as they are chained."""
+        return [line async for line in self.stream_audit(after)]
+
+    async def stream_audit(self, after: int = 0) -> AsyncIterator[str]:
+        """As `audit_lines`, line by line: of a long log no more than a page is in memory."""
+        while True:
+            asked = {"after": after, "limit": AUDIT_PAGE}
+            response = await self._request("GET", f"{self._path}/audit", params=asked, headers=self.bearer)
+            lines = response.text.split("\n")[:-1]  # and not where Unicode would also break a line
+            for line in lines:
+                yield line
+            after += len(lines)
+            if len(lines) < AUDIT_PAGE:
+                return
+
+    async def kept_messages(self, frame: int) -> bytes:
+        """As the ego: the messages of a decided frame as a whole frame, where the gateway keeps them."""
+        path = f"{self._path}/frames/{frame}/messages"
+        content: bytes = (await self._request("GET", path, headers=self.bearer)).content
+        return content
+
+    async def enrol(self, teammates: Sequence[str], public_keys: Mapping[str, str] | None = None) -> Mapping[str, str]:
+        """As the ego: let teammates join; their tokens."""
+        body = {"teammates": list(teammates), "public_keys": dict(public_keys or {})}
+        response = await self._request("POST", f"{self._path}/teammates", json=body, headers=self.bearer)
+        return told(response, _ChangedTeam).teammate_tokens
+
+    async def dismiss(self, teammate: str) -> None:
+        """As the ego: let a teammate leave."""
+        await self._request("DELETE", f"{self._path}/teammates/{teammate}", headers=self.bearer)
+
+    async def close(self) -> str:
+        """As the ego: end the session; the head of its audit log, to verify it against later."""
+        response = await self._request("DELETE", self._path, headers=self.bearer)
+        return str(response.headers.get("audit-head", ""))
+
+    async def _answered(self, what: str, body: bytes) -> FrameAnswer:
+        answer = _answer(await self._post(what, body))
+        await self._keep(answer.receipt)
+        return answer
+
+    async def _keep(self, receipt: LogReceipt | None) -> None:
+        if self._receipts is not None:
+            await self._receipts.take(receipt, self.session_id)
+
+    async def _post(self, what: str, body: bytes) -> httpx.Response:
+        headers = {**self.bearer, "Content-Type": MSGPACK, "Accept": MSGPACK}
+        response: httpx.Response = await self._request("POST", f"{self._path}/{what}", content=body, headers=headers)
+        return response
+
+
+def bearer(credential: str) -> dict[str, str]:
+    """The header that carries a key or a token."""
+    return {"Authorization": f"Bearer {credential}"}
+
+
+def _answer(response: httpx.Response) -> FrameAnswer:
+    try:
+        return FrameAnswer.model_validate(wire.unpack(response.content, trusted=True))
+    except (wire.WireError, ValidationError) as error:
+        raise ProtocolError(f"not a frame result: {error}") from error
+
+
+def told(response: httpx.Response, kind: type[T]) -> T:
+    """Read a response's JSON as a type; a `ProtocolError` if it is something else."""
+    try:
+        return TypeAdapter(kind).validate_json(response.content)
+    except ValidationError as error:
+        first = error.errors(include_url=False, include_input=False)[0]
+        where = ".".join(map(str, first["loc"]))
+        raise ProtocolError(f"not what {response.request.url.path} answers: {where}: {first['msg']}") from None

@@ -1,0 +1,59 @@
+"""One transaction's work: a session changes, and its log grows by a line."""
+
+from __future__ import annotations
+
+from collections.abc import Callable, Mapping
+from dataclasses import replace
+from typing import Any
+
+from sqlalchemy import Connection, insert
+
+from robosac.audit import Unsealed, digest
+from service.errors import SessionChanged, SessionOver
+from service.keeping.record import SessionRecord
+from service.keeping.rows import CHANGE, GET_TO_CHANGE, columns, read_row
+from service.keeping.tables import audit_lines
+
+Change = Callable[[SessionRecord], Mapping[str, Any]]
+"""Of a session as it is, the fields that change."""
+
+
+def append(
+    connection: Connection,
+    session_id: str,
+    said: Unsealed,
+    change: Change,
+    check_room: Callable[[SessionRecord], None],
+) -> SessionRecord:
+    """Change a session and append to its log; what it is then.
+
+    Raises
+    ------
+    SessionOver
+        If there is no such session, or it has ended.
+    """
+    row = connection.execute(GET_TO_CHANGE, {"this": session_id}).first()
+    if row is None or row.ended_at is not None:
+        raise SessionOver
+    record = read_row(row)
+    changes = change(record)
+    if "ended_at" not in changes:  # a full log can still be ended
+        check_room(record)
+    line = said.seal(session_id, record.audit_seq + 1, record.audit_head)
+    after = replace(
+        record,
+        **changes,
+        audit_seq=record.audit_seq + 1,
+        audit_head=digest(line),
+        revision=record.revision + bool(changes),
+    )
+    changed = columns(after, *changes, "audit_seq", "audit_head", "revision")
+    connection.execute(CHANGE.values(changed), {"this": session_id})
+    connection.execute(insert(audit_lines), {"session_id": session_id, "seq": after.audit_seq, "line": line})
+    return after
+
+
+def check_revision(now: SessionRecord, worked_out_from: SessionRecord) -> None:
+    """Raise SessionChanged if a session is not of the revision that a change was worked out from."""
+    if now.revision != worked_out_from.revision:
+        raise SessionChanged

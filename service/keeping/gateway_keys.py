@@ -1,0 +1,88 @@
+"""The gateway's own keys, with which it signs what it promises about its logs."""
+
+from __future__ import annotations
+
+import base64
+import binascii
+import contextlib
+import os
+import stat
+from collections.abc import Sequence
+from pathlib import Path
+
+from cryptography.hazmat.primitives.asymmetric.ed25519 import Ed25519PrivateKey
+
+from robosac.answers import LogReceipt
+from robosac.signatures import key_id, show_public_key, sign_head
+from service.keeping.record import SessionRecord
+from service.keeping.store import Store
+
+
+class GatewayKeys:
+    """Ed25519 keys: the first signs, all are published, so that what an older one signed can still be checked.
+
+    Parameters
+    ----------
+    file : Path, optional
+        One key a line, base64 of its 32 bytes, the signing one first; made with one key if it is not there. By default
+        the store keeps a key, made when a gateway first starts on it: all gateways on one store have the same.
+    """
+
+    def __init__(self, file: Path | None = None) -> None:
+        self._file = file
+        self._keys: Sequence[Ed25519PrivateKey] = ()
+        self._id = ""
+
+    async def start(self, store: Store) -> None:
+        """Read the keys, or make one.
+
+        Raises
+        ------
+        ValueError
+            If the file holds something else, or others may read it.
+        """
+        text = await store.secret("gateway-signing", _new) if self._file is None else _read(self._file)
+        self._keys = [_key(line) for line in text.splitlines() if line.strip()]
+        if not self._keys:
+            raise ValueError(f"ROBOSAC_GATEWAY_KEY_FILE: {self._file} holds no key")
+        self._id = key_id(self._keys[0].public_key())
+
+    def published(self) -> list[tuple[str, str, bool]]:
+        """Id and public key (base64) of each, and whether it signs."""
+        return [(key_id(key.public_key()), show_public_key(key), n == 0) for n, key in enumerate(self._keys)]
+
+    def receipt(self, record: SessionRecord) -> LogReceipt:
+        """The promise that a session's log begins as it is now."""
+        signature = sign_head(self._keys[0], record.session_id, record.audit_seq, record.audit_head)
+        return LogReceipt(
+            session=record.session_id,
+            seq=record.audit_seq,
+            head=record.audit_head,
+            key_id=self._id,
+            signature=base64.b64encode(signature).decode(),
+        )
+
+
+def _new() -> str:
+    return base64.b64encode(Ed25519PrivateKey.generate().private_bytes_raw()).decode()
+
+
+def _read(file: Path) -> str:
+    """The text of a file of keys, which is made if it is not there; nobody else may read it."""
+    try:
+        with contextlib.suppress(FileExistsError):
+            descriptor = os.open(file, os.O_CREAT | os.O_EXCL | os.O_WRONLY, 0o600)
+            with os.fdopen(descriptor, "w") as made:
+                made.write(_new() + "\n")
+        if stat.S_IMODE(file.stat().st_mode) & 0o077:
+            raise ValueError(f"ROBOSAC_GATEWAY_KEY_FILE: others may read {file}; take that right away (chmod 600)")
+        return file.read_text()
+    except (OSError, UnicodeError) as error:
+        raise ValueError(f"ROBOSAC_GATEWAY_KEY_FILE: {file} cannot be read: {type(error).__name__}") from error
+
+
+def _key(line: str) -> Ed25519PrivateKey:
+    try:
+        return Ed25519PrivateKey.from_private_bytes(base64.b64decode(line.strip(), validate=True))
+    except (binascii.Error, ValueError) as error:
+        raise ValueError("ROBOSAC_GATEWAY_KEY_FILE: a line is no Ed25519 key, 32 bytes in base64") from error

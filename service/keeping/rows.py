@@ -1,0 +1,35 @@
+"""Sessions as rows of the database, and back."""
+
+from __future__ import annotations
+
+import json
+import time
+from dataclasses import fields
+from typing import Any
+
+from sqlalchemy import Row, bindparam, select, update
+
+from service.keeping.record import SessionRecord
+from service.keeping.tables import sessions
+
+_JSON = frozenset({"teammates", "defense", "token_ids", "public_keys", "state"})
+FIELDS = tuple(field.name for field in fields(SessionRecord))
+THIS = sessions.c.session_id == bindparam("this")
+OPEN = sessions.c.ended_at.is_(None)
+ENDED = sessions.c.ended_at.is_not(None)
+GET = select(*(sessions.c[name] for name in FIELDS)).where(THIS)
+GET_TO_CHANGE = GET.with_for_update()  # SQLite, which knows no such clause, has locked everything by then
+CHANGE = update(sessions).where(THIS)
+
+
+def read_row(row: Row[Any]) -> SessionRecord:
+    """The session of a row of `FIELDS`."""
+    values = {name: json.loads(value) if name in _JSON else value for name, value in row._mapping.items()}
+    return SessionRecord(**{**values, "teammates": tuple(values["teammates"])})
+
+
+def columns(record: SessionRecord, *names: str) -> dict[str, Any]:
+    """Columns of these fields, as touched now."""
+    values = {name: getattr(record, name) for name in names}
+    written = {name: json.dumps(value) if name in _JSON else value for name, value in values.items()}
+    return {**written, "touched_at": time.time()}

@@ -1,0 +1,38 @@
+"""What operators ask the gateway: whether it lives, is ready, and what it counts."""
+
+from __future__ import annotations
+
+import asyncio
+
+from fastapi import APIRouter, Response
+
+from service.errors import Kind, Refused
+from service.routes import GatewayDep
+
+STORE_PATIENCE_S = 1.0
+"""How long readiness waits for the database."""
+operations = APIRouter()
+
+
+@operations.get("/healthz")
+async def healthz() -> dict[str, str]:
+    """Whether the process lives."""
+    return {"status": "alive"}
+
+
+@operations.get("/readyz")
+async def readyz(gateway: GatewayDep) -> dict[str, str]:
+    """Whether the gateway is warm and able to serve, and its database takes changes."""
+    gateway.engine.check_ready()
+    try:
+        async with asyncio.timeout(STORE_PATIENCE_S):
+            await gateway.store.ping()
+    except TimeoutError:
+        raise Refused(Kind.NOT_READY, f"the database did not answer within {STORE_PATIENCE_S:g} s") from None
+    return {"status": "ready"}
+
+
+@operations.get("/metrics", response_class=Response)
+async def metrics(gateway: GatewayDep) -> Response:
+    """Counters and timings for Prometheus."""
+    return Response(gateway.metrics.render(), media_type="text/plain; version=0.0.4; charset=utf-8")

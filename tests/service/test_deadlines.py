@@ -1,0 +1,158 @@
+"""What a frame says of its time is true, and a store that stalls costs no more than the frames that it stalls."""
+
+import asyncio
+import sqlite3
+import time
+
+import pytest
+
+from clients.errors import GatewayUnavailable
+from robosac import wire
+from service.deciding.keeping import GRACE_S
+from tests.service.conftest import EGO, TEAM, problem, serve
+
+BUDGET_MS = 400
+SLOWER_S = 0.5
+"""What a busy machine may take longer than promised."""
+
+
+@pytest.fixture
+def path(tmp_path):
+    return tmp_path / "robosac.db"
+
+
+@pytest.fixture
+async def on_disk(path):
+    async with serve(database_url=f"sqlite:///{path}") as served:
+        yield served
+
+
+async def late_frames(served):
+    text = (await served.http.get("/metrics")).text
+    return float(next(line.split()[1] for line in text.splitlines() if line.startswith("robosac_late_frames_total ")))
+
+
+class Locked:
+    """Another connection that holds the database's write lock for a block."""
+
+    def __init__(self, path):
+        self.connection = sqlite3.connect(path, isolation_level=None)
+
+    def __enter__(self):
+        self.connection.execute("BEGIN IMMEDIATE")
+        return self
+
+    def __exit__(self, *_):
+        self.connection.execute("ROLLBACK")
+        self.connection.close()
+
+
+async def test_a_locked_database_costs_the_frames_that_it_stalls_their_answers_and_no_more(on_disk, path, good_frame):
+    session = await on_disk.open(latency_budget_ms=BUDGET_MS, gather_ms=0)
+    assert (await on_disk.post(session, "frames", good_frame(0))).status_code == 200
+    took, late_before = [], await late_frames(on_disk)
+    with Locked(path):
+        end = time.perf_counter() + 3.0
+        while time.perf_counter() < end:
+            began = time.perf_counter()
+            refused = await on_disk.post(session, "frames", good_frame(1))
+            took.append(time.perf_counter() - began)
+            problem(refused, 503, "store-too-slow")
+            assert "nothing of it is kept" in refused.json()["detail"]
+    assert max(took) < BUDGET_MS / 1e3 + GRACE_S + SLOWER_S
+    assert await late_frames(on_disk) - late_before == len(took) >= 3
+    answers = [(await on_disk.post(session, "frames", good_frame(frame))) for frame in (1, 2)]
+    assert answers[-1].status_code == 200
+    assert answers[-1].json()["source"] == "consensus"
+    records = [r for r in await on_disk.ego(session).audit() if r["event"] == "frame_answered"]
+    kept = [1] if answers[0].status_code == 200 else []
+    assert [record["frame"] for record in records] == [0, *kept, 2]
+    state = await on_disk.ego(session).state()
+    assert (state["last_frame"], state["frames_answered"]) == (2, len(records))
+
+
+async def test_a_frame_asked_for_again_after_a_failed_store_finds_its_messages(on_disk, path, messages):
+    session = await on_disk.open(latency_budget_ms=300, gather_ms=200)
+    for name in TEAM:
+        await on_disk.teammate(session, name).send(0, messages[name])
+    with Locked(path), pytest.raises(GatewayUnavailable):
+        await on_disk.ego(session).ask(0, messages[EGO])
+    waiting = on_disk.gateway.sessions.backlog.nbytes
+    await asyncio.sleep(0.2)
+    answer = await on_disk.ego(session).ask(0, messages[EGO])
+    assert set(answer.accepted) == set(TEAM)
+    assert waiting > 0
+    assert on_disk.gateway.sessions.backlog.nbytes == 0
+
+
+async def test_what_comes_while_a_decision_is_made_is_late_even_if_that_is_not_kept(hooked, messages):
+    session = await hooked.open(gather_ms=20)
+    loop, late = asyncio.get_running_loop(), []
+
+    def meanwhile(*_):
+        body = wire.pack_message(0, "rsu", messages["rsu"])
+        posting = hooked.post(session, "messages", body, session.teammate_tokens["rsu"])
+        late.append(asyncio.run_coroutine_threadsafe(posting, loop).result())
+
+    hooked.detector.before_prepare = meanwhile
+    await hooked.teammate(session, "car-2").send(0, messages["car-2"])
+    assert (await hooked.ego(session).ask(0, messages[EGO])).accepted == ("car-2",)
+    problem(late[0], 409, "stale-frame")
+    hooked.detector.before_prepare = None
+    assert (await hooked.ego(session).ask(1, messages[EGO])).rejected["rsu"].reason == "late"
+
+
+async def test_a_decision_past_the_point_of_return_is_found_out_about_before_the_next(on_disk, good_frame):
+    """The database begins to commit in time, and takes long over it."""
+    session = await on_disk.open(latency_budget_ms=1000, gather_ms=0)
+    assert (await on_disk.post(session, "frames", good_frame(0))).status_code == 200
+    database = on_disk.gateway.store._database
+    before = asyncio.create_task(database.write(lambda _: time.sleep(0.3)))
+    await asyncio.sleep(0.05)
+    posting = asyncio.create_task(on_disk.post(session, "frames", good_frame(1)))
+    while not any(work.__qualname__.startswith("Store._append") for work, _ in database._waiting):
+        await asyncio.sleep(0.005)
+    with_it = asyncio.create_task(database.write(lambda _: time.sleep(1.6)))
+    refused = await posting
+    problem(refused, 503, "store-too-slow")
+    assert "still writing" in refused.json()["detail"]
+    problem(await on_disk.post(session, "frames", good_frame(1)), 409, "stale-frame")
+    await asyncio.gather(before, with_it)
+    assert (await on_disk.post(session, "frames", good_frame(2))).json()["source"] == "consensus"
+    answered = [r["frame"] for r in await on_disk.ego(session).audit() if r["event"] == "frame_answered"]
+    assert answered == [0, 1, 2]
+
+
+@pytest.mark.parametrize("stalled", ["store", "engine"])
+async def test_one_stall_does_not_cost_the_next_frames_their_tests(stalled, hooked, good_frame):
+    session = await hooked.open(latency_budget_ms=1000, gather_ms=0)
+    for frame in range(3):
+        await hooked.post(session, "frames", good_frame(frame))
+    if stalled == "store":
+        stall = asyncio.create_task(hooked.gateway.store._database.write(lambda _: time.sleep(0.9)))
+        await asyncio.sleep(0.01)
+    else:
+        hooked.detector.before_prepare = lambda *_: time.sleep(1.1)
+        stall = None
+    slow = await hooked.post(session, "frames", good_frame(3))
+    hooked.detector.before_prepare = None
+    assert slow.status_code == 503 or slow.json()["timings_ms"]["total"] > 600
+    for frame in range(4, 10):
+        result = (await hooked.post(session, "frames", good_frame(frame))).json()
+        assert (result["source"], result["degraded_by"], result["deadline_met"]) == ("consensus", None, True), frame
+    if stall is not None:
+        await stall
+
+
+async def test_an_answer_that_waited_for_the_store_until_it_was_late_says_so(on_disk, good_frame):
+    session = await on_disk.open(latency_budget_ms=300, gather_ms=0)
+    await on_disk.post(session, "frames", good_frame(0))
+    late_before = await late_frames(on_disk)
+    stall = asyncio.create_task(on_disk.gateway.store._database.write(lambda _: time.sleep(0.4)))
+    await asyncio.sleep(0.01)
+    result = (await on_disk.post(session, "frames", good_frame(1))).json()
+    await stall
+    assert (result["frame"], result["deadline_met"]) == (1, False)
+    assert result["timings_ms"]["total"] > 300
+    assert result["timings_ms"]["store"] > 200
+    assert await late_frames(on_disk) - late_before == 1

@@ -1,0 +1,133 @@
+"""The gateway's promises about its logs: signed with its own key, checked and kept by clients."""
+
+import base64
+import json
+
+import httpx
+import pytest
+
+from clients.client import GatewayClient
+from clients.errors import ProtocolError
+from robosac import wire
+from robosac.audit import Receipts, verify
+from robosac.audit.receipts import by_id, check_receipt
+from service.keeping.gateway_keys import GatewayKeys
+from tests.service.conftest import EGO, TEAM, problem, serve
+
+ANOTHER = base64.b64encode(bytes(range(32))).decode()
+
+
+async def test_every_answer_promises_the_log_that_it_is_in(messages, tmp_path):
+    async with serve() as served:
+        (key,) = (await served.http.get("/v1/keys")).json()["keys"]
+        assert (key["signs"], len(base64.b64decode(key["public_key"]))) == (True, 32)
+        transport, file = served.client._http._transport, tmp_path / "receipts.jsonl"
+        pinned = GatewayClient("http://gateway", transport=transport, gateway_keys=[key["public_key"]], receipts=file)
+        session = await pinned.open_session(EGO, TEAM, gather_ms=50, latency_budget_ms=20_000)
+        ego = pinned.vehicle(session.session_id, EGO, session.ego_token)
+        unit = pinned.vehicle(session.session_id, "rsu", session.teammate_tokens["rsu"])
+        for frame in range(2):
+            await unit.send(frame, messages["rsu"])
+            answer = await ego.ask(frame, messages[EGO])
+        lines = [line.encode() for line in await ego.audit_lines()]
+        state = await ego.state()
+        assert "receipt" not in await last(ego)
+    assert (answer.receipt.seq, answer.receipt.head) == (3, state["audit_head"])
+    assert pinned.receipts.latest(session.session_id) == answer.receipt
+    assert (state["receipt"]["seq"], state["receipt"]["head"]) == (3, state["audit_head"])
+    kept = Receipts.read(file.read_bytes().splitlines(), by_id([key["public_key"]]))
+    assert (kept.doubts, sorted(kept.of(session.session_id))) == ([], [1, 2, 3])
+    assert verify(lines, receipts=kept) == []
+    assert [finding.fault for finding in verify(lines[:2], receipts=kept)] == ["broken-promise"]
+
+
+async def last(ego):
+    return (await ego.audit())[-1]
+
+
+async def test_a_client_refuses_what_another_key_signed(good_frame):
+    async with serve() as served, serve() as other:
+        (wrong,) = await other.client.public_keys()
+        transport = served.client._http._transport
+        pinned = GatewayClient("http://gateway", transport=transport, gateway_keys=[wrong])
+        with pytest.raises(ProtocolError, match="not known"):
+            await pinned.open_session(EGO, TEAM)
+
+
+async def test_a_client_refuses_a_changed_or_missing_receipt(good_frame):
+    async with serve() as served:
+        session = await served.open()
+        (key,) = await served.client.public_keys()
+        whole = (await served.post(session, "frames", good_frame(0))).json()
+
+        def client(**changes):
+            told = {**whole, "receipt": None if None in changes.values() else {**whole["receipt"], **changes}}
+            transport = httpx.MockTransport(lambda _: httpx.Response(200, content=wire.pack(told)))
+            pinned = GatewayClient("http://gateway", transport=transport, gateway_keys=[key])
+            return pinned.vehicle(session.session_id, EGO, "token")
+
+        assert (await client().post_frame_body(b"")).receipt.seq == 2
+        for changes, why in (({"seq": 3}, "not the gateway's"), ({"seq": None}, "no receipt"),
+                             ({"head": "0" * 64}, "not the gateway's"), ({"signature": "?"}, "base64")):  # fmt: skip
+            with pytest.raises(ProtocolError, match=why):
+                await client(**changes).post_frame_body(b"")
+
+
+async def test_keys_are_rotated_with_overlap(tmp_path, good_frame):
+    file, url = tmp_path / "gateway.key", f"sqlite:///{tmp_path}/robosac.db"
+    async with serve(database_url=url, gateway_key_file=file) as served:
+        session = await served.open()
+        old = (await served.ego(session).post_frame_body(good_frame(0))).receipt
+    assert file.stat().st_mode & 0o777 == 0o600
+    file.write_text(ANOTHER + "\n" + file.read_text())
+    async with serve(database_url=url, gateway_key_file=file) as served:
+        keys = by_id(await served.client.public_keys())
+        new = (await served.ego(session).post_frame_body(good_frame(1))).receipt
+        for receipt in (old, new):
+            check_receipt(receipt, keys)
+        published = (await served.http.get("/v1/keys")).json()["keys"]
+    assert [(key["key_id"], key["signs"]) for key in published] == [(new.key_id, True), (old.key_id, False)]
+
+
+async def test_the_key_outlives_the_process(tmp_path):
+    ids = []
+    for _ in range(2):
+        async with serve(database_url=f"sqlite:///{tmp_path}/robosac.db") as served:
+            ids += await served.client.public_keys()
+    assert ids[0] == ids[1]
+
+
+@pytest.mark.parametrize(("text", "mode", "why"), [("", 0o600, "no key"), ("AAAA", 0o600, "no Ed25519"),
+                                                  (ANOTHER, 0o640, "others may read")])  # fmt: skip
+async def test_a_bad_key_file_is_refused(tmp_path, text, mode, why):
+    file = tmp_path / "gateway.key"
+    file.write_text(text)
+    file.chmod(mode)
+    with pytest.raises(ValueError, match=why):
+        await GatewayKeys(file).start(None)
+
+
+async def test_answers_with_tokens_are_not_stored(served):
+    body = {"ego_id": EGO, "teammates": list(TEAM)}
+    opened = await served.http.post("/v1/sessions", json=body)
+    path = f"/v1/sessions/{opened.json()['session_id']}"
+    bearer = {"Authorization": f"Bearer {opened.json()['ego_token']}"}
+    joined = await served.http.post(f"{path}/teammates", json={"teammates": ["late"]}, headers=bearer)
+    renewed = await served.http.post(f"{path}/token", headers=bearer)
+    for response in (opened, joined, renewed):
+        assert (response.status_code, response.headers["cache-control"]) == (201, "no-store")
+
+
+async def test_a_full_log_refuses_frames_before_they_are_computed(hooked, good_frame):
+    hooked.gateway.store._most_records = 2
+    session = await hooked.open()
+    await hooked.ego(session).post_frame_body(good_frame(0))
+    computed = []
+    type(hooked.detector).before_prepare = staticmethod(lambda *_: computed.append(1))
+    try:
+        fields = problem(await hooked.post(session, "frames", good_frame(1)), 507, "audit-full")
+    finally:
+        type(hooked.detector).before_prepare = None
+    assert ("ROBOSAC_AUDIT_MAX_RECORDS" in fields["detail"], computed) == (True, [])
+    assert json.loads((await hooked.ego(session).audit_lines())[-1])["frame"] == 0
+    await hooked.ego(session).close()
