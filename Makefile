@@ -23,7 +23,8 @@ serve: $(VENV)/.installed
 	$(BIN)/robosac serve --host $(HOST) --port $(PORT)
 
 test: $(VENV)/.installed-dev
-	$(BIN)/pytest
+	$(BIN)/pytest -n 2 --dist loadfile --ignore tests/service --ignore tests/clients --ignore tests/test_docs.py
+	$(BIN)/pytest tests/service tests/clients tests/test_docs.py
 
 fuzz: $(VENV)/.installed-dev
 	ROBOSAC_FUZZ_CASES=4000 $(BIN)/pytest tests/fuzz

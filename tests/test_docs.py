@@ -94,7 +94,8 @@ def test_the_examples_of_the_pages_can_be_evaluated():
         assert result.exit_code == 0, result.output
 
 
-async def test_the_programs_of_the_readme_run(tmp_path, capsys):
+async def test_the_programs_of_the_readme_run(tmp_path, capsys, monkeypatch):
+    monkeypatch.setenv("ROBOSAC_LATENCY_BUDGET_MS", "5000")  # the machine of the tests may be busy
     client, library = re.findall(r"```python\n(.*?)```", (ROOT / "README.md").read_text(), re.DOTALL)
     async with local_gateway(tmp_path / "gateway.log") as url:
         await asyncio.to_thread(exec, client.replace("http://127.0.0.1:8000", url), {"__name__": "client"})
