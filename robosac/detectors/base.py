@@ -8,9 +8,9 @@ costs one fusion and one decoder pass (`PreparedFrame.detect`).
 from __future__ import annotations
 
 from collections.abc import Collection, Mapping
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from pathlib import Path
-from typing import TYPE_CHECKING, Any, Literal, Protocol, runtime_checkable
+from typing import TYPE_CHECKING, Any, Literal, Protocol, Self, runtime_checkable
 
 import numpy as np
 
@@ -22,6 +22,8 @@ if TYPE_CHECKING:
     from robosac.testimony import Testimony
 
 Role = Literal["ego", "teammate"]
+Precision = Literal["float32", "bfloat16"]
+"""The numbers in which a decoder computes."""
 
 
 @dataclass(frozen=True)
@@ -58,6 +60,14 @@ class DetectorInfo:
     """The file of the network that reads single messages (`robosac.detectors.witness`), beside the weights too."""
     mirrored: bool = False
     """Whether columns of the maps in messages run along minus x."""
+    precision: Precision = "float32"
+    """The numbers in which fused maps are decoded. The name ends with ``@PRECISION``, unless that is float32."""
+
+
+def in_precision(info: DetectorInfo, precision: Precision) -> DetectorInfo:
+    """The face of the same detector in another precision."""
+    plain = info.name.removesuffix(f"@{info.precision}")
+    return replace(info, name=plain if precision == "float32" else f"{plain}@{precision}", precision=precision)
 
 
 def calibration_beside(weights: Path) -> Path | None:
@@ -161,6 +171,14 @@ class Testifying(Protocol):
 
     def testify(self, ego: Message, teammates: Mapping[str, Message]) -> Testimony | None:
         """What each message says by itself, the ego's under `robosac.defenses.EGO`; None if that is not known."""
+
+
+@runtime_checkable
+class Precise(Protocol):
+    """What can decode in more than one precision."""
+
+    def in_precision(self, precision: Precision) -> Self:
+        """The same detector in another precision; it shares the weights."""
 
 
 class Encoder(Preparer, Protocol):

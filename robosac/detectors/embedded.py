@@ -4,14 +4,23 @@ from __future__ import annotations
 
 import hashlib
 from collections.abc import Mapping
+from copy import copy, deepcopy
 from pathlib import Path
-from typing import Any, ClassVar
+from typing import Any, ClassVar, Self
 
 import numpy as np
 import torch
 
 from robosac.boxes import FloatArray
-from robosac.detectors.base import DetectorInfo, Message, TensorSpec, calibration_beside, witness_beside
+from robosac.detectors.base import (
+    DetectorInfo,
+    Message,
+    Precision,
+    TensorSpec,
+    calibration_beside,
+    in_precision,
+    witness_beside,
+)
 from robosac.detectors.decoding import cell_centres, decode_boxes
 from robosac.detectors.map_fusion import FEATURES, Decode, Heads, MapFusionDetector, Maps
 from robosac.detectors.network import CHANNELS, MAP, MeanFusionNetwork, fold_batchnorm
@@ -71,6 +80,7 @@ class EmbeddedDetector(MapFusionDetector):
         network.load_state_dict({name: tensor.float() for name, tensor in tensors.items()})
         fold_batchnorm(network.eval().requires_grad_(False))
         self._network = network.to(memory_format=torch.channels_last)  # type: ignore[call-overload]
+        self._dtype, self._decode = torch.float32, self._network.decode
         self.recipe = recipe
         self._gain = _number(recipe, "feature_gain", np.inf)
         self._score_threshold = _number(recipe, "score_threshold", 1.0)
@@ -85,6 +95,14 @@ class EmbeddedDetector(MapFusionDetector):
             calibration=calibration_beside(weights) if weights else None,
             witness=witness_beside(weights) if weights else None,
         )
+
+    def in_precision(self, precision: Precision) -> Self:
+        """As `robosac.detectors.base.Precise.in_precision`; messages stay as they are."""
+        other = copy(self)
+        other._dtype = getattr(torch, precision)
+        other._decode = deepcopy(self._network).to(other._dtype).decode
+        other.info = in_precision(self.info, precision)
+        return other
 
     def encode(self, points: FloatArray, pose: FloatArray) -> Message:
         """As `robosac.detectors.base.Encoder.encode`; the z of the pose is the sensor's height above ground, metres."""
@@ -101,8 +119,9 @@ class EmbeddedDetector(MapFusionDetector):
         """Logits (64, 64) and codes (6, 64, 64) of the maps' mean."""
 
         def decode(maps: Maps) -> Heads:
-            logits, codes = self._network.decode((sum(maps[1:], maps[0]) / len(maps))[None])
-            return logits[0], codes[0]
+            fused = sum(maps[1:], maps[0]) / len(maps)
+            logits, codes = self._decode(fused[None].to(self._dtype))
+            return logits[0].float(), codes[0].float()
 
         return decode
 

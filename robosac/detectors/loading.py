@@ -7,8 +7,9 @@ that ``opens`` weights files lists the detectors that they are for, and is then 
 from __future__ import annotations
 
 from pathlib import Path
+from typing import cast, get_args
 
-from robosac.detectors.base import Detector, Preparer
+from robosac.detectors.base import Detector, Precise, Precision, Preparer
 from robosac.detectors.embedded import EmbeddedDetector
 from robosac.detectors.weights_file import WeightsError, read_weights
 from robosac.plugins import Kind, classes
@@ -32,15 +33,22 @@ def load(detector: str = DEFAULT_DETECTOR) -> Detector:
     ----------
     detector : str
         A name of `available`, the path of a weights file, an entry point of the group ``robosac.detectors``, or
-        ``module:callable``, where the callable takes no arguments and returns a detector.
+        ``module:callable``, where the callable takes no arguments and returns a detector. After it ``@bfloat16`` may
+        stand, or another precision in which the detector can decode.
 
     Raises
     ------
     WeightsError
         If the weights cannot be used.
     ValueError
-        If there is no such detector, or it lacks what a gateway needs.
+        If there is no such detector, it lacks what a gateway needs, or it cannot decode in that precision.
     """
+    plain, _, precision = detector.rpartition("@")
+    if precision in get_args(Precision) and not Path(detector).exists():
+        loaded = load(plain)
+        if not isinstance(loaded, Precise):
+            raise ValueError(f"{plain} cannot decode in {precision}: it has no method in_precision")
+        return loaded.in_precision(cast(Precision, precision))
     if detector not in DETECTORS.shipped and Path(detector).exists():
         return _open_weights(Path(detector))
     return DETECTORS.make(detector)

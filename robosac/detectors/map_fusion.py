@@ -25,6 +25,8 @@ Heads = tuple[torch.Tensor, torch.Tensor]
 """The class logit of each place where there might be a vehicle, and the codes of all boxes."""
 Decode = Callable[[Maps], Heads]
 """From maps to fuse, the ego's first and all in its frame."""
+Finder = Callable[[Maps], FloatArray]
+"""From such maps to boxes."""
 
 
 class MapFusionDetector(ABC):
@@ -40,6 +42,11 @@ class MapFusionDetector(ABC):
     @abstractmethod
     def decoder(self, ego: Message, own: torch.Tensor) -> Decode:
         """Do once what all fusions of a frame share. ``own`` (C, H, W) is the ego's map."""
+
+    def finder(self, ego: Message, own: torch.Tensor) -> Finder:
+        """As `decoder`, but to the boxes of `robosac.detectors.base.PreparedFrame.detect`, and without gradients."""
+        decode = self.decoder(ego, own)
+        return lambda maps: self.boxes(*decode(maps))
 
     @abstractmethod
     def boxes(self, logits: torch.Tensor, codes: torch.Tensor) -> FloatArray:
@@ -64,7 +71,7 @@ class MapFusionDetector(ABC):
         with torch.inference_mode():
             maps = self.unscaled(_sent([ego, *teammates.values()]))
             warped = warp(maps[1:], self.matrices(ego, teammates.values())) if teammates else ()
-            return PreparedMaps(self, self.decoder(ego, maps[0]), maps[0], dict(zip(teammates, warped, strict=True)))
+            return PreparedMaps(self.finder(ego, maps[0]), maps[0], dict(zip(teammates, warped, strict=True)))
 
     def attack_surface(self, ego: Message, teammates: Mapping[str, Message]) -> MapSurface:
         """Show a frame to an attacker."""
@@ -85,15 +92,14 @@ def _sent(messages: Sequence[Message]) -> torch.Tensor:
 class PreparedMaps:
     """A frame to be decoded for many subsets; see `robosac.detectors.base.PreparedFrame`."""
 
-    detector: MapFusionDetector
-    decode: Decode
+    find: Finder
     own: torch.Tensor
     warped: Mapping[str, torch.Tensor]
 
     def detect(self, teammates: Collection[str] = ()) -> FloatArray:
         """Boxes (n, 6) of the ego fused with these teammates; with none, of the ego alone."""
         with torch.inference_mode():
-            return self.detector.boxes(*self.decode([self.own, *(self.warped[name] for name in teammates)]))
+            return self.find([self.own, *(self.warped[name] for name in teammates)])
 
 
 class MapSurface:

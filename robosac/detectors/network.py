@@ -62,13 +62,30 @@ class MeanFusionNetwork(nn.Module):
 
 
 def fold_batchnorm(module: nn.Module) -> nn.Module:
-    """Merge every convolution with the batch norm that follows it directly; for inference only, in place."""
+    """Merge every convolution with the batch norm that follows it; for inference only, in place.
+
+    Between the two may be a pixel shuffle by n. It makes each of its channels of n^2 that follow each other.
+    """
     for child in module.children():
         fold_batchnorm(child)
     if isinstance(module, nn.Sequential):
         for i in range(len(module) - 1):
-            conv, norm = module[i], module[i + 1]
+            conv, following, at, times = module[i], module[i + 1], i + 1, 1
+            if isinstance(following, nn.PixelShuffle):
+                at, times = i + 2, following.upscale_factor**2
+            norm = module[at] if at < len(module) else None
             if isinstance(conv, nn.Conv2d) and isinstance(norm, nn.BatchNorm2d):
-                module[i] = torch.nn.utils.fuse_conv_bn_eval(conv.eval(), norm.eval())
-                module[i + 1] = nn.Identity()
+                module[i] = torch.nn.utils.fuse_conv_bn_eval(conv.eval(), _repeated(norm.eval(), times))
+                module[at] = nn.Identity()
     return module
+
+
+def _repeated(norm: nn.BatchNorm2d, times: int) -> nn.BatchNorm2d:
+    """A batch norm with every channel so many times in a row."""
+    if times == 1:
+        return norm
+    wider = nn.BatchNorm2d(norm.num_features * times, norm.eps).eval()
+    wider.load_state_dict(
+        {name: value.repeat_interleave(times) if value.dim() else value for name, value in norm.state_dict().items()}
+    )
+    return wider

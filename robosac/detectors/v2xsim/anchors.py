@@ -12,6 +12,7 @@ from __future__ import annotations
 
 import math
 from functools import lru_cache
+from typing import Protocol
 
 import numpy as np
 import torch
@@ -122,8 +123,15 @@ def _all_anchors() -> torch.Tensor:
     return torch.from_numpy(anchor_boxes(np.arange(GRID * GRID * ANCHORS))).float()
 
 
+class Indexed(Protocol):
+    """What has codes by anchor: a tensor (A, 6), or what computes them once they are asked for."""
+
+    def __getitem__(self, anchors: torch.Tensor, /) -> torch.Tensor:
+        """The codes (n, 6), float32, of anchors (n,)."""
+
+
 def detections(
-    logits: torch.Tensor, codes: torch.Tensor, score_threshold: float = SCORE_THRESHOLD
+    logits: torch.Tensor, codes: Indexed, score_threshold: float = SCORE_THRESHOLD
 ) -> tuple[FloatArray, IntArray]:
     """Boxes of one ego.
 
@@ -135,7 +143,8 @@ def detections(
     ----------
     logits : (A,) float32 tensor
         Difference of the logits of vehicle and background.
-    codes : (A, 6) float32 tensor
+    codes : (A, 6) float32 tensor, or `Indexed`
+        Only those of candidates are looked at.
     score_threshold : float
         Strictly between 0 and 1.
 

@@ -9,16 +9,26 @@ from __future__ import annotations
 
 import hashlib
 from collections.abc import Callable, Mapping
+from copy import copy
 from pathlib import Path
-from typing import Any, ClassVar
+from typing import Any, ClassVar, Self
 
 import numpy as np
 import torch
 
 from robosac.boxes import FloatArray
-from robosac.detectors.base import DetectorInfo, Message, TensorSpec, calibration_beside, witness_beside
-from robosac.detectors.map_fusion import FEATURES, Decode, Heads, MapFusionDetector, Maps
+from robosac.detectors.base import (
+    DetectorInfo,
+    Message,
+    Precision,
+    TensorSpec,
+    calibration_beside,
+    in_precision,
+    witness_beside,
+)
+from robosac.detectors.map_fusion import FEATURES, Decode, Finder, Heads, MapFusionDetector, Maps
 from robosac.detectors.v2xsim.anchors import SCORE_THRESHOLD, detections, geometry
+from robosac.detectors.v2xsim.fast import FastDecoder
 from robosac.detectors.v2xsim.network import CHANNELS, MAP, V2XSimNetwork, select_published
 from robosac.detectors.v2xsim.voxels import AREA_M, PACKED_SHAPE, BoolArray, occupancy, pack, unpack
 from robosac.detectors.weights_file import WeightsError, read_weights, save_weights
@@ -96,6 +106,7 @@ class V2XSimDetector(MapFusionDetector):
             self._network = V2XSimNetwork(select_published(tensors))
         except WeightsError as error:
             raise WeightsError(f"{weights}: {error}") from error
+        self._fast = FastDecoder(self._network)
         self._fusion = FUSIONS[fusion]
         self._score_threshold = float(self.recipe.get("score_threshold", SCORE_THRESHOLD))
         features = TensorSpec("float32", (CHANNELS, MAP, MAP))
@@ -114,6 +125,13 @@ class V2XSimDetector(MapFusionDetector):
             mirrored=self.mirrored,
         )
 
+    def in_precision(self, precision: Precision) -> Self:
+        """As `robosac.detectors.base.Precise.in_precision`; messages stay float32."""
+        other = copy(self)
+        other._fast = FastDecoder(self._network, precision)
+        other.info = in_precision(self.info, precision)
+        return other
+
     def encode(self, points: FloatArray, pose: FloatArray) -> Message:
         """As `robosac.detectors.base.Encoder.encode`; returns from 3 m below to 2 m above the sensor count."""
         return self.encode_grid(occupancy(points), pose)
@@ -126,13 +144,23 @@ class V2XSimDetector(MapFusionDetector):
 
     def decoder(self, ego: Message, own: torch.Tensor) -> Decode:
         """Logits (393216,) and codes (393216, 6) of all anchors; the decoder's part that is the ego's own, once."""
-        context = self._network.context(_as_maps(unpack(ego.tensors[_GRID])), own[None])
+        context = self._network.context(_grid(ego), own[None])
 
         def decode(maps: Maps) -> Heads:
             logits, codes = self._network.decode(self._fusion(torch.stack(list(maps)), dim=0)[None], context)
             return logits[:, 1] - logits[:, 0], codes
 
         return decode
+
+    def finder(self, ego: Message, own: torch.Tensor) -> Finder:
+        """Boxes by the fast decoder, in this detector's precision."""
+        context = self._fast.context(_grid(ego), own[None])
+
+        def find(maps: Maps) -> FloatArray:
+            logits, codes = self._fast.decode(self._fusion(torch.stack(list(maps)), dim=0)[None], context)
+            return detections(logits, codes, self._score_threshold)[0]
+
+        return find
 
     def boxes(self, logits: torch.Tensor, codes: torch.Tensor) -> FloatArray:
         """As `detections` makes them."""
@@ -141,6 +169,11 @@ class V2XSimDetector(MapFusionDetector):
     def places(self, codes: torch.Tensor) -> torch.Tensor:
         """Boxes (393216, 6) of all anchors."""
         return geometry(codes)
+
+
+def _grid(ego: Message) -> torch.Tensor:
+    """The ego's occupancy, as the network takes it."""
+    return _as_maps(unpack(ego.tensors[_GRID]))
 
 
 def _as_maps(grid: BoolArray) -> torch.Tensor:

@@ -129,7 +129,7 @@ def select_published(state: Mapping[str, object]) -> dict[str, torch.Tensor]:
 
 
 @dataclass(frozen=True)
-class _Conv:
+class Conv:
     """A convolution, batch norm folded in."""
 
     weight: torch.Tensor
@@ -137,39 +137,45 @@ class _Conv:
     stride: int = 1
 
     @classmethod
-    def folded(cls, layer: _Layer, tensors: Mapping[str, torch.Tensor]) -> _Conv:
+    def folded(cls, layer: _Layer, tensors: Mapping[str, torch.Tensor]) -> Conv:
         weight, bias = tensors[f"{layer.conv}.weight"].double(), tensors[f"{layer.conv}.bias"].double()
         weight = weight.reshape(*weight.shape[:2], *layer.kernel[-2:])  # a 1 x 1 x 1 convolution acts on one layer
         if layer.norm is not None:
             scale, shift, mean, variance = (tensors[f"{layer.norm}.{part}"].double() for part in _NORM)
             factor = scale / torch.sqrt(variance + _EPS)
             weight, bias = weight * factor[:, None, None, None], (bias - mean) * factor + shift
-        return cls(_channels_last(weight.float()), bias.float(), layer.stride)
+        return cls(channels_last(weight.float()), bias.float(), layer.stride)
 
     def __call__(self, maps: torch.Tensor) -> torch.Tensor:
         padding = self.weight.shape[-1] // 2
         return functional.conv2d(maps, self.weight, self.bias, stride=self.stride, padding=padding)
 
-    def split(self, channels: int) -> tuple[_Conv, _Conv]:
+    def to(self, dtype: torch.dtype) -> Conv:
+        """The same in other numbers."""
+        return Conv(channels_last(self.weight.to(dtype)), self.bias.to(dtype), self.stride)
+
+    def split(self, channels: int) -> tuple[Conv, Conv]:
         """The parts that act on the first ``channels`` and on the others; their sum is the whole."""
         first, rest = self.weight[:, :channels], self.weight[:, channels:]
-        return _Conv(_channels_last(first), torch.zeros_like(self.bias)), _Conv(_channels_last(rest), self.bias)
+        return Conv(channels_last(first), torch.zeros_like(self.bias)), Conv(channels_last(rest), self.bias)
 
 
 @dataclass(frozen=True)
-class _Join:
+class Join:
     """One step up of the decoder: the map from below, doubled, beside a skip connection; two convolutions."""
 
-    below: _Conv
-    skip: _Conv
-    second: _Conv
+    below: Conv
+    skip: Conv
+    second: Conv
 
     def __call__(self, below_term: torch.Tensor, skip_term: torch.Tensor) -> torch.Tensor:
         return self.second((below_term + skip_term).relu_()).relu_()
 
 
 class V2XSimNetwork:
-    """The network; float32, weights fixed.
+    """The network, plainly computed and differentiable; float32, weights fixed.
+
+    `robosac.detectors.v2xsim.fast` computes the same in less time, for inference.
 
     Parameters
     ----------
@@ -178,29 +184,29 @@ class V2XSimNetwork:
     """
 
     def __init__(self, tensors: Mapping[str, torch.Tensor]) -> None:
-        def chain(layers: tuple[_Layer, ...]) -> tuple[_Conv, ...]:
-            return tuple(_Conv.folded(layer, tensors) for layer in layers)
+        def chain(layers: tuple[_Layer, ...]) -> tuple[Conv, ...]:
+            return tuple(Conv.folded(layer, tensors) for layer in layers)
 
-        self._encoder = tuple(chain(level) for level in _ENCODER)
-        self._deepest = chain(_DEEPEST)
-        self._joins = []
+        self.encoder = tuple(chain(level) for level in _ENCODER)
+        self.deepest_level = chain(_DEEPEST)
+        self.joins = []
         for layers, below in zip(_DECODER, _BELOW, strict=True):
             first, second = chain(layers)
-            self._joins.append(_Join(*first.split(below), second))
-        self._classes = chain(_CLASSES)
-        self._codes = chain(_CODES)
+            self.joins.append(Join(*first.split(below), second))
+        self.classes = chain(_CLASSES)
+        self.codes = chain(_CODES)
 
     def levels(self, grids: torch.Tensor, count: int = 4) -> tuple[torch.Tensor, ...]:
         """Occupancy (n, 13, 256, 256), float -> the first of the levels x, x1, x2, x3; x3 is the message."""
-        maps, levels = _channels_last(grids), []
-        for level in self._encoder[:count]:
+        maps, levels = channels_last(grids), []
+        for level in self.encoder[:count]:
             maps = _through(level, maps)
             levels.append(maps)
         return tuple(levels)
 
     def deepest(self, features: torch.Tensor) -> torch.Tensor:
         """x3 (n, 256, 32, 32) -> x4 (n, 512, 16, 16)."""
-        return _through(self._deepest, features)
+        return _through(self.deepest_level, features)
 
     def context(self, grid: torch.Tensor, features: torch.Tensor) -> tuple[torch.Tensor, ...]:
         """What of the decoder no hypothesis changes: terms of first convolutions, before their ReLU.
@@ -216,8 +222,8 @@ class V2XSimNetwork:
             The terms of x4, x2, x1 and x.
         """
         x, x1, x2 = self.levels(grid, 3)
-        first, *others = self._joins
-        deepest = first.below(_doubled(self.deepest(_channels_last(features))))
+        first, *others = self.joins
+        deepest = first.below(_doubled(self.deepest(channels_last(features))))
         return deepest, *(join.skip(level) for join, level in zip(others, (x2, x1, x), strict=True))
 
     def decode(self, fused: torch.Tensor, context: tuple[torch.Tensor, ...]) -> tuple[torch.Tensor, torch.Tensor]:
@@ -237,17 +243,17 @@ class V2XSimNetwork:
         codes : (393216, 6) tensor
             See `robosac.detectors.v2xsim.anchors`.
         """
-        first, *others = self._joins
+        first, *others = self.joins
         deepest, *skips = context
-        maps = first(deepest, first.skip(_channels_last(fused)))
+        maps = first(deepest, first.skip(channels_last(fused)))
         for join, skip_term in zip(others, skips, strict=True):
             maps = join(join.below(_doubled(maps)), skip_term)
-        logits = self._classes[1](self._classes[0](maps).relu_())
-        codes = self._codes[1](self._codes[0](maps).relu_())
+        logits = self.classes[1](self.classes[0](maps).relu_())
+        codes = self.codes[1](self.codes[0](maps).relu_())
         return _by_anchor(logits, 2), _by_anchor(codes, CODE)
 
 
-def _through(convs: tuple[_Conv, ...], maps: torch.Tensor) -> torch.Tensor:
+def _through(convs: tuple[Conv, ...], maps: torch.Tensor) -> torch.Tensor:
     for conv in convs:
         maps = conv(maps).relu_()
     return maps
@@ -261,5 +267,6 @@ def _doubled(maps: torch.Tensor) -> torch.Tensor:
     return functional.interpolate(maps, scale_factor=2, mode="nearest")
 
 
-def _channels_last(maps: torch.Tensor) -> torch.Tensor:
+def channels_last(maps: torch.Tensor) -> torch.Tensor:
+    """The same numbers in the order that convolutions are fastest on."""
     return maps.contiguous(memory_format=torch.channels_last)

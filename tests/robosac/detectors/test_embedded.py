@@ -9,8 +9,9 @@ from safetensors.torch import load_file, save_file
 
 from robosac.boxes import pairwise_iou, pose_matrix
 from robosac.detectors import EmbeddedDetector, Message, WeightsError, available, load
+from robosac.detectors.base import in_precision
 from robosac.detectors.embedded import SHIPPED_WEIGHTS
-from robosac.detectors.network import MeanFusionNetwork
+from robosac.detectors.network import CHANNELS, MAP, MeanFusionNetwork, fold_batchnorm
 from robosac.detectors.weights_file import read_weights
 from robosac.scenes.splits import TRAINING_SEEDS, VALIDATION_SEEDS
 
@@ -47,6 +48,29 @@ def test_a_message_is_what_the_detector_declares(detector, benign, ego_message):
         for name, spec in detector.info.tensors[role].items():
             assert message.tensors[name].shape == spec.shape
             assert message.tensors[name].dtype.name == spec.dtype
+
+
+def test_a_folded_network_computes_the_same(rng):
+    tensors, _ = read_weights(SHIPPED_WEIGHTS)
+    plain, folded = MeanFusionNetwork().eval(), MeanFusionNetwork().eval()
+    for network in (plain, folded):
+        network.load_state_dict({name: tensor.float() for name, tensor in tensors.items()})
+    fold_batchnorm(folded)
+    assert not any(isinstance(module, torch.nn.BatchNorm2d) for module in folded.modules())
+    maps = torch.from_numpy(rng.random((1, CHANNELS, MAP, MAP))).float()
+    with torch.inference_mode():
+        torch.testing.assert_close(folded.decode(maps), plain.decode(maps), atol=1e-5, rtol=1e-4)
+
+
+def test_in_bfloat16_it_sees_the_same(detector, ego_message, benign):
+    narrow = load("intersection-mean@bfloat16")
+    assert narrow.info == in_precision(detector.info, "bfloat16")
+    wide_boxes, boxes = (at.prepare(ego_message, benign).detect(list(benign)) for at in (detector, narrow))
+    sure = wide_boxes[wide_boxes[:, 5] >= 0.3]
+    assert len(sure) > 5
+    overlap = pairwise_iou(sure, boxes)
+    assert (overlap.max(axis=1) > 0.8).all()
+    assert 0 < np.abs(boxes[overlap.argmax(axis=1), 5] - sure[:, 5]).max() < 0.05
 
 
 def found(boxes, truth):
