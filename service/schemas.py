@@ -174,6 +174,7 @@ class DetectorEntry(_Shown):
     area_m: tuple[float, float, float, float] = Field(description="xmin, ymin, xmax, ymax; ego frame, metres")
     cell_m: float
     weights_digest: str = Field(description="SHA-256 of the weights file")
+    precision: str = Field(description="numbers in which fused maps are decoded")
     consensus_score: float = Field(description="boxes from this score on take part in the consensus test")
     calibration: CalibrationEntry | None
 

@@ -21,6 +21,7 @@ from robosac.calibrated import calibration_digest, calibration_of
 from robosac.deadline import Recorded
 from robosac.defenses import Defense, Kinds, Outcome, State, build, read_settings
 from robosac.detectors import Message, Preparer
+from robosac.detectors.base import split_precision
 from robosac.faults import in_short
 from robosac.fusion import FusionResult
 from robosac.screening import MEMORY, Bounds, Screening
@@ -81,6 +82,9 @@ def replay(decision: LoggedDecision, body: bytes, detector: Preparer, kinds: Kin
     if detector.info.weights_digest != decision.session.weights_digest:
         detail = f"the weights' digest is {detector.info.weights_digest}, logged {decision.session.weights_digest}"
         return [Difference("detector", detail)]
+    _, precision = split_precision(decision.session.detector)
+    if detector.info.precision != precision:
+        return [Difference("detector", f"the precision is {detector.info.precision}, logged {precision}")]
     calibration = calibration_digest(detector.info)
     try:
         settings = read_settings(decision.session.defense, kinds)

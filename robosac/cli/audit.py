@@ -15,6 +15,7 @@ from robosac import detectors, wire
 from robosac.audit import Receipts, digest, misbehaviour, verification
 from robosac.audit.receipts import by_id
 from robosac.cli.blame import blaming
+from robosac.detectors.base import split_precision
 
 app = typer.Typer(no_args_is_help=True, add_completion=False, help=__doc__)
 
@@ -143,7 +144,7 @@ def _read_receipts(file: Path, keys: list[str]) -> Receipts:
 
 def _load(wanted: str | None, logged: str) -> detectors.Detector:
     """The detector that the user wants, or one that ships: what a log names may be anything."""
-    if wanted is None and logged not in detectors.available():
+    if wanted is None and split_precision(logged)[0] not in detectors.available():
         raise typer.BadParameter(f"the log's detector, {logged!r}, does not ship; give it", param_hint="--detector")
     with blaming("--detector", ValueError, OSError):
         return detectors.load(wanted or logged)

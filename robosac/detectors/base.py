@@ -10,7 +10,7 @@ from __future__ import annotations
 from collections.abc import Collection, Mapping
 from dataclasses import dataclass, replace
 from pathlib import Path
-from typing import TYPE_CHECKING, Any, Literal, Protocol, Self, runtime_checkable
+from typing import TYPE_CHECKING, Any, Literal, Protocol, Self, cast, get_args, runtime_checkable
 
 import numpy as np
 
@@ -64,9 +64,15 @@ class DetectorInfo:
     """The numbers in which fused maps are decoded. The name ends with ``@PRECISION``, unless that is float32."""
 
 
+def split_precision(name: str) -> tuple[str, Precision]:
+    """``NAME@PRECISION`` as the name and the precision, float32 where none is named."""
+    plain, _, last = name.rpartition("@")
+    return (plain, cast(Precision, last)) if last in get_args(Precision) else (name, "float32")
+
+
 def in_precision(info: DetectorInfo, precision: Precision) -> DetectorInfo:
     """The face of the same detector in another precision."""
-    plain = info.name.removesuffix(f"@{info.precision}")
+    plain, _ = split_precision(info.name)
     return replace(info, name=plain if precision == "float32" else f"{plain}@{precision}", precision=precision)
 
 

@@ -7,9 +7,8 @@ that ``opens`` weights files lists the detectors that they are for, and is then 
 from __future__ import annotations
 
 from pathlib import Path
-from typing import cast, get_args
 
-from robosac.detectors.base import Detector, Precise, Precision, Preparer
+from robosac.detectors.base import Detector, Precise, Preparer, split_precision
 from robosac.detectors.embedded import EmbeddedDetector
 from robosac.detectors.weights_file import WeightsError, read_weights
 from robosac.plugins import Kind, classes
@@ -43,12 +42,12 @@ def load(detector: str = DEFAULT_DETECTOR) -> Detector:
     ValueError
         If there is no such detector, it lacks what a gateway needs, or it cannot decode in that precision.
     """
-    plain, _, precision = detector.rpartition("@")
-    if precision in get_args(Precision) and not Path(detector).exists():
+    plain, precision = split_precision(detector)
+    if plain != detector and not Path(detector).exists():
         loaded = load(plain)
         if not isinstance(loaded, Precise):
             raise ValueError(f"{plain} cannot decode in {precision}: it has no method in_precision")
-        return loaded.in_precision(cast(Precision, precision))
+        return loaded.in_precision(precision)
     if detector not in DETECTORS.shipped and Path(detector).exists():
         return _open_weights(Path(detector))
     return DETECTORS.make(detector)

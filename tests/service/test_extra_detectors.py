@@ -101,3 +101,18 @@ async def test_other_weights_of_the_same_name_are_recorded_and_have_to_be_allowe
     decision = replay.find(lines, 1)
     assert decision.session.weights_digest == EmbeddedDetector(ADVERSARIAL_WEIGHTS).info.weights_digest
     assert replay.replay(decision, body, EmbeddedDetector(ADVERSARIAL_WEIGHTS)) == []
+
+
+async def test_a_precision_is_served_logged_and_needed_for_replay(good_frame):
+    name = "intersection-mean@bfloat16"
+    async with serve(extra_detectors=name, keep_frames=9) as served:
+        listed = {entry["name"]: entry["precision"] for entry in await served.client.detectors()}
+        assert listed == {"intersection-mean": "float32", name: "bfloat16"}
+        ego = served.ego(await served.open(detector=name, defense={"kind": "sample_consensus"}))
+        await ego.post_frame_body(good_frame(0))
+        lines, body = [line.encode() for line in await ego.audit_lines()], await ego.kept_messages(0)
+    decision = replay.find(lines, 0)
+    assert decision.session.detector == name
+    assert replay.replay(decision, body, detectors.load(name)) == []
+    (difference,) = replay.replay(decision, body, detectors.load())
+    assert difference.what == "detector"
