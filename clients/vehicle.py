@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import json
-from collections.abc import AsyncIterator, Mapping, Sequence
+from collections.abc import AsyncIterator, Generator, Mapping, Sequence
 from dataclasses import dataclass
 from typing import Any, TypeVar
 
@@ -16,6 +16,7 @@ from clients.receipts import ReceiptBook
 from robosac import wire
 from robosac.answers import FrameAnswer, LogReceipt, Typed
 from robosac.detectors import Message
+from robosac.possession import HEADER, make_proof
 from robosac.signatures import sign
 
 MSGPACK = "application/vnd.msgpack"
@@ -39,6 +40,18 @@ class RenewedToken:
 
     token: str
     expires_at: str
+
+
+class _Proving(httpx.Auth):
+    """Proves with a request that the vehicle has its key."""
+
+    def __init__(self, key: Ed25519PrivateKey, token: str) -> None:
+        self._key = key
+        self._token = token
+
+    def auth_flow(self, request: httpx.Request) -> Generator[httpx.Request, httpx.Response, None]:
+        request.headers[HEADER] = make_proof(self._key, request.method, str(request.url), self._token)
+        yield request
 
 
 class VehicleClient:
@@ -69,9 +82,15 @@ class VehicleClient:
         """The header that says who speaks."""
         return bearer(self.token)
 
+    @property
+    def _proven(self) -> dict[str, Any]:
+        """Options of a request that a stolen token must not be enough for."""
+        proving = None if self._key is None else _Proving(self._key, self.token)
+        return {"headers": self.bearer, "auth": proving}
+
     async def renew(self) -> RenewedToken:
         """Take a fresh token and speak with it from now on; the one before is worth nothing any more."""
-        response = await self._request("POST", f"{self._path}/token", headers=self.bearer)
+        response = await self._request("POST", f"{self._path}/token", **self._proven)
         renewed = told(response, RenewedToken)
         self.token = renewed.token
         return renewed
@@ -154,16 +173,16 @@ class VehicleClient:
     async def enrol(self, teammates: Sequence[str], public_keys: Mapping[str, str] | None = None) -> Mapping[str, str]:
         """As the ego: let teammates join; their tokens."""
         body = {"teammates": list(teammates), "public_keys": dict(public_keys or {})}
-        response = await self._request("POST", f"{self._path}/teammates", json=body, headers=self.bearer)
+        response = await self._request("POST", f"{self._path}/teammates", json=body, **self._proven)
         return told(response, _ChangedTeam).teammate_tokens
 
     async def dismiss(self, teammate: str) -> None:
         """As the ego: let a teammate leave."""
-        await self._request("DELETE", f"{self._path}/teammates/{teammate}", headers=self.bearer)
+        await self._request("DELETE", f"{self._path}/teammates/{teammate}", **self._proven)
 
     async def close(self) -> str:
         """As the ego: end the session; the head of its audit log, to verify it against later."""
-        response = await self._request("DELETE", self._path, headers=self.bearer)
+        response = await self._request("DELETE", self._path, **self._proven)
         return str(response.headers.get("audit-head", ""))
 
     async def _answered(self, what: str, body: bytes) -> FrameAnswer:

@@ -34,6 +34,7 @@ from service.operations import operations  # noqa: E402
 from service.routes import v1  # noqa: E402
 from service.sessions.identity import ApiKeys, Tokens  # noqa: E402
 from service.sessions.opening import Opening  # noqa: E402
+from service.sessions.possession import Possession  # noqa: E402
 from service.sessions.room import Room  # noqa: E402
 from service.sessions.sessions import Sessions  # noqa: E402
 from service.sessions.teams import Teams  # noqa: E402
@@ -124,6 +125,7 @@ def _built(
         opening=Opening(settings, store, engine, metrics, tokens, sessions),
         sessions=sessions,
         teams=Teams(settings, sessions, store, tokens),
+        possession=Possession(store, sessions.journal, tokens.clock, settings.public_url),
         frames=Frames(sessions, deciding, metrics, admission, settings.max_frame_jump),
         bodies=Room(settings.max_inflight_bytes, of_key, "ROBOSAC_MAX_INFLIGHT_BYTES"),
         api_keys=api_keys,

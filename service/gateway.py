@@ -11,6 +11,7 @@ from service.keeping.gateway_keys import GatewayKeys
 from service.keeping.store import Store
 from service.sessions.identity import ApiKeys
 from service.sessions.opening import Opening
+from service.sessions.possession import Possession
 from service.sessions.room import Room
 from service.sessions.sessions import Sessions
 from service.sessions.teams import Teams
@@ -30,6 +31,7 @@ class Gateway:
     opening: Opening
     sessions: Sessions
     teams: Teams
+    possession: Possession
     frames: Frames
     bodies: Room
     api_keys: ApiKeys

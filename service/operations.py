@@ -6,8 +6,8 @@ import asyncio
 
 from fastapi import APIRouter, Response
 
+from service.callers import GatewayDep
 from service.errors import Kind, Refused
-from service.routes import GatewayDep
 
 STORE_PATIENCE_S = 1.0
 """How long readiness waits for the database."""

@@ -17,6 +17,7 @@ from fastapi.responses import JSONResponse
 from starlette.exceptions import HTTPException
 
 from robosac.defenses import shipped
+from robosac.possession import ALGORITHM
 from robosac.wire import WireError
 from service.errors import Kind, Refused
 
@@ -25,6 +26,7 @@ logger = structlog.stdlib.get_logger(__name__)
 MEDIA_TYPE = "application/problem+json"
 TYPE_PREFIX = "urn:robosac:problem:"
 _CHALLENGE = {"WWW-Authenticate": "Bearer"}
+_PROOF = {"WWW-Authenticate": f'DPoP algs="{ALGORITHM}", error="invalid_dpop_proof"'}  # RFC 9449, section 7.1
 _CLOSE = {"Connection": "close"}  # as the rest of the body may still come, or never
 ANSWERS: Mapping[Kind, tuple[int, Mapping[str, str]]] = {
     Kind.MALFORMED_JSON: (400, {}),
@@ -32,6 +34,7 @@ ANSWERS: Mapping[Kind, tuple[int, Mapping[str, str]]] = {
     Kind.UNAUTHENTICATED: (401, _CHALLENGE),
     Kind.TOKEN_EXPIRED: (401, _CHALLENGE),
     Kind.BAD_SIGNATURE: (401, {}),
+    Kind.BAD_PROOF: (401, _PROOF),
     Kind.NOT_ENROLLED: (403, {}),
     Kind.LOOPBACK_ONLY: (403, _CLOSE),
     Kind.EGO_ONLY: (403, {}),
@@ -57,6 +60,7 @@ ANSWERS: Mapping[Kind, tuple[int, Mapping[str, str]]] = {
     Kind.UNKNOWN_DETECTOR: (422, {}),
     Kind.TOO_MANY_TEAMMATES: (422, {}),
     Kind.TOO_MANY_RENEWALS: (429, {"Retry-After": "1"}),
+    Kind.TOO_MANY_PROOFS: (429, {"Retry-After": "60"}),
     Kind.INTERNAL_ERROR: (500, {}),
     Kind.NOT_READY: (503, {"Retry-After": "5"}),
     Kind.TOO_MANY_SESSIONS: (503, {"Retry-After": "30"}),

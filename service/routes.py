@@ -7,7 +7,6 @@ from typing import Annotated, Any
 
 from fastapi import APIRouter, Depends, Header, Path, Query, Request, Response
 from fastapi.responses import StreamingResponse
-from fastapi.security import HTTPAuthorizationCredentials, HTTPBearer
 from pydantic import BaseModel
 
 from robosac import wire
@@ -15,6 +14,7 @@ from robosac.answers import FrameAnswer
 from service.arriving.arrival import arrival_of
 from service.arriving.bodies import JSON_BYTES, MSGPACK, MSGPACK_TYPES, check_type, described, read_json
 from service.arriving.limits import expected_bytes, read_bounded
+from service.callers import Ego, GatewayDep, KeyId, ProvenEgo, ProvenVehicle, Token, Vehicle
 from service.deciding.asked import Answered
 from service.errors import Kind, Refused
 from service.gateway import Gateway
@@ -36,44 +36,6 @@ from service.sessions.live import Caller
 from service.sessions.room import Share
 
 v1 = APIRouter(prefix="/v1", responses=documented(422, 503))
-_bearer = HTTPBearer(auto_error=False, scheme_name="Token", description="A vehicle's token.")
-_api_key = HTTPBearer(auto_error=False, scheme_name="ApiKey", description="An API key, where the gateway has any.")
-
-
-def _gateway(request: Request) -> Gateway:
-    gateway: Gateway = request.app.state.gateway
-    return gateway
-
-
-GatewayDep = Annotated[Gateway, Depends(_gateway)]
-
-
-def _token(credentials: Annotated[HTTPAuthorizationCredentials | None, Depends(_bearer)]) -> str | None:
-    return credentials.credentials if credentials else None
-
-
-Token = Annotated[str | None, Depends(_token)]
-
-
-async def _opener(
-    gateway: GatewayDep, credentials: Annotated[HTTPAuthorizationCredentials | None, Depends(_api_key)]
-) -> str:
-    return gateway.api_keys.check(credentials.credentials if credentials else None)
-
-
-async def _vehicle(sid: str, gateway: GatewayDep, token: Token) -> Caller:
-    return await gateway.sessions.authenticate(sid, token)
-
-
-async def _ego(sid: str, gateway: GatewayDep, token: Token) -> Caller:
-    return await gateway.sessions.authenticate_ego(sid, token)
-
-
-Vehicle = Annotated[Caller, Depends(_vehicle)]
-Ego = Annotated[Caller, Depends(_ego)]
-
-
-KeyId = Annotated[str, Depends(_opener)]
 
 
 async def _session_request(request: Request, gateway: GatewayDep, key_id: KeyId) -> SessionRequest:
@@ -81,7 +43,7 @@ async def _session_request(request: Request, gateway: GatewayDep, key_id: KeyId)
         return await read_json(request, SessionRequest, gateway.sessions.defenses)
 
 
-async def _enrolment_request(request: Request, gateway: GatewayDep, caller: Ego) -> EnrolmentRequest:
+async def _enrolment_request(request: Request, gateway: GatewayDep, caller: ProvenEgo) -> EnrolmentRequest:
     with _room(gateway, caller).holding(expected_bytes(request, JSON_BYTES)):
         return await read_json(request, EnrolmentRequest)
 
@@ -94,6 +56,7 @@ _TENSOR_SCHEMA = {
 }
 _TENSOR_BODY: dict[str, Any] = {"requestBody": {"required": True, "content": {MSGPACK: {"schema": _TENSOR_SCHEMA}}}}
 _EGO_PROBLEMS = documented(401, 403, 404)
+_PROVEN_PROBLEMS = documented(401, 403, 404, 429)
 _NO_STORE = {"Cache-Control": "no-store"}
 """On answers with tokens (RFC 6749, section 5.1)."""
 _JSON_PROBLEMS = (400, 408, 413, 415)
@@ -140,14 +103,14 @@ async def get_session(caller: Ego, gateway: GatewayDep) -> SessionState:
     return await gateway.sessions.describe(caller)
 
 
-@v1.delete("/sessions/{sid}", status_code=204, responses=_EGO_PROBLEMS)
-async def delete_session(caller: Ego, gateway: GatewayDep, response: Response) -> None:
+@v1.delete("/sessions/{sid}", status_code=204, responses=_PROVEN_PROBLEMS)
+async def delete_session(caller: ProvenEgo, gateway: GatewayDep, response: Response) -> None:
     """End the session; its log can be read until it is purged. The header `Audit-Head` is its last record's hash."""
     response.headers["Audit-Head"] = await gateway.sessions.close(caller)
 
 
 @v1.post("/sessions/{sid}/token", status_code=201, responses=documented(401, 404, 429))
-async def renew_token(caller: Vehicle, gateway: GatewayDep, response: Response) -> RenewedToken:
+async def renew_token(caller: ProvenVehicle, gateway: GatewayDep, response: Response) -> RenewedToken:
     """A fresh token for the vehicle that asks; the one it asks with is worth nothing any more."""
     response.headers.update(_NO_STORE)
     return await gateway.teams.renew(caller)
@@ -157,11 +120,11 @@ async def renew_token(caller: Vehicle, gateway: GatewayDep, response: Response) 
     "/sessions/{sid}/teammates",
     status_code=201,
     openapi_extra=described(EnrolmentRequest),
-    responses={**_EGO_PROBLEMS, **documented(*_JSON_PROBLEMS, 409)},
+    responses={**_PROVEN_PROBLEMS, **documented(*_JSON_PROBLEMS, 409)},
 )
 async def enrol_teammates(
     request: Annotated[EnrolmentRequest, Depends(_enrolment_request)],
-    caller: Ego,
+    caller: ProvenEgo,
     gateway: GatewayDep,
     response: Response,
 ) -> ChangedTeam:
@@ -170,8 +133,8 @@ async def enrol_teammates(
     return await gateway.teams.enrol(caller, request.teammates, request.public_keys)
 
 
-@v1.delete("/sessions/{sid}/teammates/{vehicle_id}", status_code=204, responses=_EGO_PROBLEMS)
-async def dismiss_teammate(vehicle_id: str, caller: Ego, gateway: GatewayDep) -> None:
+@v1.delete("/sessions/{sid}/teammates/{vehicle_id}", status_code=204, responses=_PROVEN_PROBLEMS)
+async def dismiss_teammate(vehicle_id: str, caller: ProvenEgo, gateway: GatewayDep) -> None:
     """Let a teammate leave from the next frame on; its token is worth nothing any more."""
     await gateway.teams.dismiss(caller, vehicle_id)
 

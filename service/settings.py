@@ -9,6 +9,7 @@ from pydantic import Field, SecretStr, field_validator
 from pydantic_settings import BaseSettings, NoDecode, SettingsConfigDict
 
 from robosac.detectors import DEFAULT_DETECTOR
+from robosac.possession import read_origin
 from service.keeping.database import read_url
 
 
@@ -38,6 +39,10 @@ class Settings(BaseSettings):
         None, description="File of the gateway's own keys, one a line: the first signs; else the store keeps one."
     )
     token_ttl_s: float = Field(86_400.0, ge=1, description="How long a vehicle's token lives.")
+    public_url: str | None = Field(
+        None,
+        description="Address by which clients reach the gateway, as proofs must name it; by default any host does.",
+    )
     latency_budget_ms: float = Field(
         200.0, gt=0, le=60_000, description="Budget of sessions that name none: from a frame's head to its answer."
     )
@@ -92,6 +97,13 @@ class Settings(BaseSettings):
     @classmethod
     def _check_url(cls, value: str) -> str:
         read_url(value)
+        return value
+
+    @field_validator("public_url")
+    @classmethod
+    def _check_public_url(cls, value: str | None) -> str | None:
+        if value is not None:
+            read_origin(value)
         return value
 
     @field_validator("extra_detectors", "extra_defenses", "api_keys", "token_secrets", mode="before")

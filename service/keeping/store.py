@@ -6,12 +6,12 @@ from collections.abc import Callable, Mapping
 from dataclasses import replace
 from typing import Any
 
-from sqlalchemy import Connection, Delete, Select, Update, func, insert, select, text
+from sqlalchemy import Connection, Delete, Select, Update, func, insert, select
 
 from robosac.audit import FULL_EVERY, Unsealed, digest
 from robosac.audit.events import DetectorChanged, Event, FrameAnswered, SessionEnded, TeamChanged, TokenRenewed
 from service.errors import AuditFull, FrameDecided, SessionChanged
-from service.keeping import migrations
+from service.keeping import migrations, once
 from service.keeping.appending import Change, append, check_revision
 from service.keeping.database import connect
 from service.keeping.patience import Patience
@@ -20,7 +20,7 @@ from service.keeping.record import SessionRecord
 from service.keeping.rows import ENDED, FIELDS, GET, OPEN, columns, read_row
 from service.keeping.sealing import Sealing, unsealed
 from service.keeping.seen import Seen
-from service.keeping.tables import audit_lines, kept_messages, secrets, sessions
+from service.keeping.tables import audit_lines, kept_messages, sessions
 
 PAGE, REMEMBERED = 128, 4096
 """Audit lines that are read at a time, and sessions that `Store.seen` knows."""
@@ -253,14 +253,12 @@ class Store:
 
     async def secret(self, name: str, make: Callable[[], str]) -> str:
         """A secret that outlives the process: what ``make`` gave when it was first asked for."""
+        return await self._database.write(lambda connection: once.secret(connection, name, make))
 
-        def work(connection: Connection) -> str:
-            keep = text("INSERT INTO secrets (name, value) VALUES (:name, :value) ON CONFLICT DO NOTHING")
-            connection.execute(keep, {"name": name, "value": make()})
-            value: str = connection.execute(select(secrets.c.value).where(secrets.c.name == name)).scalar_one()
-            return value
-
-        return await self._database.write(work)
+    async def use_proof(self, session_id: str, vehicle_id: str, proof_id: str, ends_at: float, now: float) -> bool:
+        """Whether a vehicle's proof is new; it is not from now on. It may be forgotten then (both Unix time)."""
+        proof = (session_id, vehicle_id, proof_id, ends_at, now)
+        return await self._database.write(lambda connection: once.use_proof(connection, *proof))
 
     async def close(self) -> None:
         """Let go of files and connections."""

@@ -64,3 +64,12 @@ secrets = Table(
     Column("name", Text, primary_key=True),
     Column("value", Text, nullable=False),
 )
+
+used_proofs = Table(
+    "used_proofs",
+    metadata,
+    _session_id(),
+    Column("vehicle_id", Text, primary_key=True),
+    Column("proof_id", Text, primary_key=True),
+    Column("ends_at", Double, nullable=False),  # Unix time from when on the proof would not count anyway
+)

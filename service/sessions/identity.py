@@ -128,7 +128,7 @@ class Tokens:
     def __init__(self, settings: Settings, clock: Callable[[], float] = time.time) -> None:
         self._secrets = tuple(secret.get_secret_value() for secret in settings.token_secrets)
         self._ttl_s = settings.token_ttl_s
-        self._clock = clock
+        self.clock = clock
         for number, secret in enumerate(self._secrets, 1):
             if len(secret) < SECRET_LENGTH:
                 raise ValueError(f"ROBOSAC_TOKEN_SECRETS: secret {number} has fewer than {SECRET_LENGTH} characters")
@@ -140,7 +140,7 @@ class Tokens:
 
     def issue(self, session_id: str, vehicle_id: str, *, is_ego: bool) -> Token:
         """A token of a vehicle for a session."""
-        now = int(self._clock())
+        now = int(self.clock())
         expires = now + int(self._ttl_s)
         token_id = secrets.token_hex(16)
         claims = {
@@ -171,9 +171,9 @@ class Tokens:
         is_latest = record.token_ids.get(vehicle) == claims["jti"]
         if not is_latest or claims["role"] != _role(vehicle == record.ego_id):
             raise TokenRefused(RENEWED, vehicle)
-        if claims["iat"] > self._clock() + LEEWAY_S:
+        if claims["iat"] > self.clock() + LEEWAY_S:
             raise TokenRefused("the token is from the future: the gateways' clocks are too far apart", vehicle)
-        if claims["exp"] <= self._clock() - LEEWAY_S:
+        if claims["exp"] <= self.clock() - LEEWAY_S:
             raise TokenRefused("the token has expired", vehicle, Kind.TOKEN_EXPIRED)
         return vehicle
 

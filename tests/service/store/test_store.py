@@ -9,7 +9,8 @@ import pytest
 import rfc8785
 from sqlalchemy import text
 
-from service.errors import AuditFull, FrameDecided, SessionChanged, SessionOver
+from service.errors import AuditFull, FrameDecided, Refused, SessionChanged, SessionOver
+from service.keeping.once import MOST_PROOFS
 from service.keeping.record import SessionRecord
 from service.keeping.store import PAGE, Store
 from tests.service.store.conftest import (
@@ -132,6 +133,23 @@ async def test_a_change_worked_out_from_an_older_session_is_refused(store):
     assert (kept.teammates, kept.token_ids, kept.public_keys) == (("a",), tokens, {})
     assert kept.state == {"trusted": []}
     assert len(await check_chain(store, sid)) == 4
+
+
+async def test_a_proof_is_new_once_for_its_vehicle_until_it_is_forgotten(store):
+    sid, other = await added(store), await added(store, 1)
+    outcomes = await all_of(*(store.use_proof(sid, "a", "p", 80.0, 0.0) for _ in range(5)))
+    assert sorted(outcomes) == [False] * 4 + [True]
+    assert await store.use_proof(sid, "b", "p", 80.0, 0.0)
+    assert await store.use_proof(other, "a", "p", 80.0, 0.0)
+    assert not await store.use_proof(sid, "a", "p", 80.0, 80.0)
+    assert await store.use_proof(sid, "a", "p", 200.0, 81.0)
+    for n in range(MOST_PROOFS - 1):
+        assert await store.use_proof(sid, "a", f"{n}", 200.0, 81.0)
+    with pytest.raises(Refused, match="256"):
+        await store.use_proof(sid, "a", "one more", 200.0, 81.0)
+    await store.end(sid, THE_END)
+    await store.purge(LATER)
+    assert await store.get(sid) is None
 
 
 async def test_one_token_is_renewed_and_the_others_stay(store):

@@ -1,0 +1,43 @@
+"""What is kept once: secrets, made when they are first asked for, and proofs, of which each counts once."""
+
+from __future__ import annotations
+
+from collections.abc import Callable
+
+from sqlalchemy import Connection, delete, func, select, text
+
+from service.errors import Kind, Refused
+from service.keeping.tables import secrets, used_proofs
+
+MOST_PROOFS = 256
+"""Proofs of one vehicle that are remembered at a time."""
+
+
+def secret(connection: Connection, name: str, make: Callable[[], str]) -> str:
+    """The secret of a name: what ``make`` gave when it was first asked for."""
+    keep = text("INSERT INTO secrets (name, value) VALUES (:name, :value) ON CONFLICT DO NOTHING")
+    connection.execute(keep, {"name": name, "value": make()})
+    value: str = connection.execute(select(secrets.c.value).where(secrets.c.name == name)).scalar_one()
+    return value
+
+
+def use_proof(
+    connection: Connection, session_id: str, vehicle_id: str, proof_id: str, ends_at: float, now: float
+) -> bool:
+    """Remember a vehicle's proof until it would not count anyway (Unix time); whether it is new.
+
+    Raises
+    ------
+    Refused
+        If as many of the vehicle's proofs are remembered as may be (``too-many-proofs``).
+    """
+    of_vehicle = (used_proofs.c.session_id == session_id, used_proofs.c.vehicle_id == vehicle_id)
+    connection.execute(delete(used_proofs).where(*of_vehicle, used_proofs.c.ends_at < now))
+    if connection.execute(select(func.count()).select_from(used_proofs).where(*of_vehicle)).scalar_one() >= MOST_PROOFS:
+        raise Refused(Kind.TOO_MANY_PROOFS, f"a vehicle may use {MOST_PROOFS} proofs in about a minute")
+    keep = text(
+        "INSERT INTO used_proofs (session_id, vehicle_id, proof_id, ends_at) "
+        "VALUES (:session_id, :vehicle_id, :proof_id, :ends_at) ON CONFLICT DO NOTHING"
+    )
+    row = {"session_id": session_id, "vehicle_id": vehicle_id, "proof_id": proof_id, "ends_at": ends_at}
+    return connection.execute(keep, row).rowcount == 1
