@@ -38,7 +38,7 @@ from service.sessions.possession import Possession  # noqa: E402
 from service.sessions.room import Room  # noqa: E402
 from service.sessions.sessions import Sessions  # noqa: E402
 from service.sessions.teams import Teams  # noqa: E402
-from service.settings import Settings  # noqa: E402
+from service.settings import Settings, SettingsError, settings_of_environment  # noqa: E402
 from service.watching.logs import logging_to_stderr  # noqa: E402
 from service.watching.metrics import Metrics  # noqa: E402
 from service.watching.stalls import LoopWatch  # noqa: E402
@@ -70,7 +70,7 @@ def create_app(
     clock : callable
         Unix time, seconds, by which tokens expire.
     """
-    settings = settings or Settings()
+    settings = settings or settings_of_environment()
     keys = ApiKeys.read(settings)
     tokens = Tokens(settings, clock)
     tracing = Tracing(provider_from_environment() if spans is None else spans)
@@ -163,5 +163,5 @@ async def _running(gateway: Gateway, settings: Settings, tokens: Tokens, tracing
 
 try:
     app = create_app()
-except MissingExtra as missing:
-    raise SystemExit(f"Error: {missing}") from missing
+except (MissingExtra, SettingsError) as wrong:
+    raise SystemExit(f"Error: {wrong}") from wrong

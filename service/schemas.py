@@ -24,7 +24,7 @@ from pydantic import (
 
 from robosac.answers import LogReceipt
 from robosac.calibrated import calibration_digest, calibration_of
-from robosac.defenses import DefenseSettings, Kinds, shipped
+from robosac.defenses import DefenseSettings, Kinds, check_numbers, shipped
 from robosac.defenses.group_testing import CalibrationError
 from robosac.detectors import DetectorInfo
 from robosac.signatures import read_public_key
@@ -35,6 +35,11 @@ VehicleId = Annotated[str, StringConstraints(pattern=r"^[A-Za-z0-9][A-Za-z0-9._:
 
 class _Request(BaseModel):
     model_config = ConfigDict(extra="forbid", frozen=True, allow_inf_nan=False)
+
+    @field_validator("*")
+    @classmethod
+    def _check_numbers(cls, value: object) -> object:
+        return check_numbers(value)
 
 
 def _as_served(value: object, of_shipped: ValidatorFunctionWrapHandler, about: ValidationInfo) -> object:

@@ -2,21 +2,38 @@
 
 from __future__ import annotations
 
+import difflib
+import os
+import re
 from pathlib import Path
 from typing import Annotated, Literal
 
-from pydantic import Field, SecretStr, field_validator
+from pydantic import Field, SecretStr, ValidationError, field_validator
 from pydantic_settings import BaseSettings, NoDecode, SettingsConfigDict
 
+from robosac.defenses import check_numbers
+from robosac.defenses.sampling import MAX_BUDGET
 from robosac.detectors import DEFAULT_DETECTOR
 from robosac.possession import read_origin
+from robosac.wire import MAX_FRAME
 from service.keeping.database import read_url
+
+PREFIX = "ROBOSAC_"
+OTHERS = ("ROBOSAC_API_KEY", "ROBOSAC_FUZZ_CASES")
+"""Variables of the clients and of the tests."""
+_OF_KUBERNETES = re.compile(r"ROBOSAC_(SERVICE_(HOST|PORT\w*)|PORT(_\d+_\w+)?)")
+"""What a pod is given where a service is called robosac."""
+_YEAR_S = 366 * 86_400.0
+
+
+class SettingsError(ValueError):
+    """The environment sets what cannot be; the message names the variables, and shows no values."""
 
 
 class Settings(BaseSettings):
     """What an operator can set."""
 
-    model_config = SettingsConfigDict(env_prefix="ROBOSAC_", frozen=True, hide_input_in_errors=True)
+    model_config = SettingsConfigDict(env_prefix=PREFIX, frozen=True, hide_input_in_errors=True, allow_inf_nan=False)
 
     detector: str = Field(DEFAULT_DETECTOR, description="Detector of sessions that name none.")
     extra_detectors: Annotated[tuple[str, ...], NoDecode] = Field(
@@ -38,7 +55,7 @@ class Settings(BaseSettings):
     gateway_key_file: Path | None = Field(
         None, description="File of the gateway's own keys, one a line: the first signs; else the store keeps one."
     )
-    token_ttl_s: float = Field(86_400.0, ge=1, description="How long a vehicle's token lives.")
+    token_ttl_s: float = Field(86_400.0, ge=1, le=10 * _YEAR_S, description="How long a vehicle's token lives.")
     public_url: str | None = Field(
         None,
         description="Address by which clients reach the gateway, as proofs must name it; by default any host does.",
@@ -53,45 +70,65 @@ class Settings(BaseSettings):
         description="Longest wait for teammates once the ego's message is in; by default at most half the budget.",
     )
     database_url: str = Field("sqlite:///robosac.db", repr=False, description="Where sessions and audit logs are kept.")
-    max_body_bytes: int = Field(32 * 2**20, ge=1024, description="Largest request body.")
-    body_timeout_s: float = Field(10.0, gt=0, description="Time that a body may take from first to last byte.")
-    max_inflight_bytes: int = Field(
-        2**29, ge=2**20, description="Bodies of all requests in hand; beyond, more are refused unread."
+    max_body_bytes: int = Field(32 * 2**20, ge=1024, le=2**40, description="Largest request body.")
+    body_timeout_s: float = Field(
+        10.0, gt=0, le=86_400, description="Time that a body may take from first to last byte."
     )
-    max_inflight_bytes_per_key: int = Field(2**28, ge=2**20, description="The same of the sessions of one API key.")
+    max_inflight_bytes: int = Field(
+        2**29, ge=2**20, le=2**50, description="Bodies of all requests in hand; beyond, more are refused unread."
+    )
+    max_inflight_bytes_per_key: int = Field(
+        2**28, ge=2**20, le=2**50, description="The same of the sessions of one API key."
+    )
     max_budget_ms: float = Field(60_000, gt=0, le=60_000, description="Longest latency budget of a session.")
     max_gather_ms: float = Field(60_000, ge=0, le=60_000, description="Longest wait for teammates of a session.")
-    max_hypotheses: int = Field(1000, ge=1, description="Hypotheses tested in a frame, whatever its budget.")
-    max_frame_jump: int = Field(
-        1_000_000, ge=1, description="By how much a frame's number may exceed the latest answered one."
+    max_hypotheses: int = Field(
+        1000, ge=1, le=MAX_BUDGET, description="Hypotheses tested in a frame, whatever its budget."
     )
-    max_sessions: int = Field(10_000, ge=1, description="Open sessions at a time.")
+    max_frame_jump: int = Field(
+        1_000_000, ge=1, le=MAX_FRAME, description="By how much a frame's number may exceed the latest answered one."
+    )
+    max_sessions: int = Field(10_000, ge=1, le=10**9, description="Open sessions at a time.")
     max_sessions_per_key: int = Field(
-        2000, ge=1, description="Open sessions of one API key at a time, where one is asked for."
+        2000, ge=1, le=10**9, description="Open sessions of one API key at a time, where one is asked for."
     )
     max_teammates: int = Field(63, ge=1, le=1024, description="Teammates of one session.")
     max_pending_frames: int = Field(
-        4, ge=1, description="Frames after the next for which a teammate's message is kept."
+        4, ge=1, le=10_000, description="Frames after the next for which a teammate's message is kept."
     )
     max_pending_bytes: int = Field(
-        2**30, ge=2**20, description="Tensors of all teammates' messages that wait; beyond, more are refused."
+        2**30, ge=2**20, le=2**50, description="Tensors of all teammates' messages that wait; beyond, more are refused."
     )
-    max_speed_mps: float = Field(70.0, gt=0, description="A vehicle that moved faster from frame to frame is refused.")
-    max_range_m: float = Field(300.0, gt=0, description="A teammate farther from the ego is left out.")
+    max_speed_mps: float = Field(
+        70.0, gt=0, le=1e6, description="A vehicle that moved faster from frame to frame is refused."
+    )
+    max_range_m: float = Field(300.0, gt=0, le=1e6, description="A teammate farther from the ego is left out.")
     keep_frames: int = Field(
         0, ge=0, le=10_000, description="Latest frames of a session whose messages are kept, to replay decisions."
     )
-    session_idle_s: float = Field(3600.0, gt=0, description="A session unused for longer is ended.")
-    audit_retention_s: float = Field(7 * 86400.0, gt=0, description="How long the log of an ended session can be read.")
+    session_idle_s: float = Field(3600.0, ge=0.01, le=10 * _YEAR_S, description="A session unused for longer is ended.")
+    audit_retention_s: float = Field(
+        7 * 86400.0, gt=0, le=100 * _YEAR_S, description="How long the log of an ended session can be read."
+    )
     audit_max_records: int = Field(
-        2_000_000, ge=1, description="Records of one session's log; beyond, its frames are refused. One has about 2 kB."
+        2_000_000,
+        ge=1,
+        le=10**12,
+        description="Records of one session's log; beyond, its frames are refused. One has about 2 kB.",
     )
     audit_full_every: int = Field(
         200, ge=1, le=100_000, description="Frames from one audit record with the whole state to the next."
     )
     log_level: Literal["debug", "info", "warning", "error"] = Field("info", description="Least of what is logged.")
     log_format: Literal["json", "console"] = Field("json", description="One JSON object a line, or for the eye.")
-    torch_threads: int = Field(1, ge=1, description="Threads of one detector pass; at this size one is fastest.")
+    torch_threads: int = Field(
+        1, ge=1, le=1024, description="Threads of one detector pass; at this size one is fastest."
+    )
+
+    @field_validator("*")
+    @classmethod
+    def _check_numbers(cls, value: object) -> object:
+        return check_numbers(value)
 
     @field_validator("database_url")
     @classmethod
@@ -110,3 +147,39 @@ class Settings(BaseSettings):
     @classmethod
     def _split(cls, value: object) -> object:
         return tuple(part.strip() for part in value.split(",") if part.strip()) if isinstance(value, str) else value
+
+
+def settings_of_environment() -> Settings:
+    """The settings that the environment holds.
+
+    Raises
+    ------
+    SettingsError
+        If a value cannot be, or there is no setting of a name that begins with ``ROBOSAC_``.
+    """
+    wrong = [_misspelt(name) for name in sorted(os.environ) if not _is_known(name)]
+    try:
+        settings = Settings()
+    except ValidationError as error:
+        wrong += [_told(".".join(map(str, one["loc"])), one["msg"]) for one in error.errors(include_input=False)]
+        raise SettingsError("; ".join(wrong)) from None
+    if wrong:
+        raise SettingsError("; ".join(wrong))
+    return settings
+
+
+def _is_known(name: str) -> bool:
+    name = name.upper()
+    ours = name.startswith(PREFIX) and name not in OTHERS and not _OF_KUBERNETES.fullmatch(name)
+    return not ours or name.removeprefix(PREFIX).lower() in Settings.model_fields
+
+
+def _misspelt(name: str) -> str:
+    known = [*(field.upper() for field in Settings.model_fields), *(other.removeprefix(PREFIX) for other in OTHERS)]
+    near = difflib.get_close_matches(name.upper().removeprefix(PREFIX), known, n=1)
+    return f"{name}: there is no such setting" + (f"; do you mean {PREFIX}{near[0]}?" if near else "")
+
+
+def _told(where: str, what: str) -> str:
+    field, _, part = where.partition(".")
+    return f"{PREFIX}{field.upper()}: {f'part {part}: ' if part else ''}{what.removeprefix('Value error, ')}"

@@ -50,7 +50,11 @@ def _of_hypotheses(answer: FrameAnswered, threshold: float | None) -> Iterator[s
     if answer.sampling_steps != len(answer.hypotheses):
         yield f"{answer.sampling_steps} sampling steps, but {len(answer.hypotheses)} hypotheses"
     contradicted: set[str] = set().union(*(o.teammates for o in answer.hypotheses if o.verdict is Verdict.DISSENSUS))
-    blamed = {name for name, why in answer.rejected.items() if why.reason is Reason.DISSENSUS} - contradicted
+    blamed = {
+        name
+        for name, why in answer.rejected.items()
+        if why.reason is Reason.DISSENSUS and not hasattr(why, "p_value")  # which is judged by rank, not by threshold
+    } - contradicted
     if blamed:
         yield f"{_listed(blamed)} rejected for a dissensus, but in no hypothesis of that verdict"
     if threshold is None:

@@ -5,13 +5,37 @@ from __future__ import annotations
 import inspect
 from typing import TYPE_CHECKING, Any, ClassVar, Self, cast, get_args
 
-from pydantic import BaseModel, ConfigDict, Field
+from pydantic import BaseModel, ConfigDict, Field, field_validator
 
 from robosac.consensus import DEFAULT_THRESHOLD
 from robosac.defenses.protocol import Defense, Reference
 
 if TYPE_CHECKING:
     from robosac.defenses.group_testing import Calibration
+
+LEAST = 1e-9
+"""Smaller numbers mean 0 in metres, milliseconds and probabilities alike, but vanish in products and quotients."""
+LARGEST_INTEGER = 2**53 - 1
+"""JSON keeps larger integers only roughly (RFC 8785)."""
+
+
+def check_numbers(value: object) -> object:
+    """Refuse numbers that break arithmetic or a log though their bounds allow them; other values are given back.
+
+    Raises
+    ------
+    ValueError
+        If a number is nearer to 0 than `LEAST` without being 0, or an integer beyond `LARGEST_INTEGER`; or one in a
+        tuple or list is.
+    """
+    if isinstance(value, float) and 0 < abs(value) < LEAST:
+        raise ValueError(f"is too near to 0: give 0 or at least {LEAST:g}")
+    if isinstance(value, int) and abs(value) > LARGEST_INTEGER:
+        raise ValueError(f"must be at most {LARGEST_INTEGER}")
+    if isinstance(value, tuple | list):
+        for part in value:
+            check_numbers(part)
+    return value
 
 
 def _say_in_short(schema: dict[str, Any], model: type[DefenseSettings]) -> None:
@@ -35,6 +59,11 @@ class DefenseSettings(BaseModel):
     budgets: ClassVar[tuple[str, ...]] = ()
     """Settings that say how many hypotheses a frame may take."""
     kind: str
+
+    @field_validator("*")
+    @classmethod
+    def _check_numbers(cls, value: object) -> object:
+        return check_numbers(value)
 
     @classmethod
     def name(cls) -> str:

@@ -11,7 +11,7 @@ from robosac.extras import MissingExtra
 from service.keeping.database import connect
 from service.keeping.migrations import lock
 from service.keeping.tables import metadata
-from service.settings import Settings
+from service.settings import SettingsError, settings_of_environment
 
 
 def _run(connection: Connection) -> None:
@@ -26,9 +26,9 @@ def _run_locked(connection: Connection) -> None:
 
 async def _by_hand() -> None:
     try:
-        database = connect(Settings().database_url)
-    except MissingExtra as missing:
-        raise SystemExit(f"Error: {missing}") from missing
+        database = connect(settings_of_environment().database_url)
+    except (MissingExtra, SettingsError) as wrong:
+        raise SystemExit(f"Error: {wrong}") from wrong
     try:
         await database.write(_run_locked)
     finally:
