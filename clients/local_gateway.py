@@ -42,6 +42,7 @@ class GatewayProcess:
         self.url = f"http://127.0.0.1:{port}"
         self._log = log
         command = [sys.executable, "-m", "uvicorn", "service.app:app", "--host", "127.0.0.1", "--port", str(port)]
+        command += ["--http", "service.arriving.connections:BoundedHTTP"]
         environment = {name: value for name, value in os.environ.items() if name not in KEY_SETTINGS}
         if api_key is not None:
             environment["ROBOSAC_API_KEYS"] = api_key

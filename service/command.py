@@ -7,6 +7,8 @@ from typing import Annotated
 import typer
 import uvicorn
 
+HTTP = "service.arriving.connections:BoundedHTTP"
+"""By its name, so that uvicorn imports it."""
 GRACE_S = 5
 """How long requests in hand may take after a SIGTERM; by their budgets they take less."""
 
@@ -17,4 +19,4 @@ def main(
 ) -> None:
     """Run the gateway, with the settings of the environment (ROBOSAC_...), until SIGTERM or Ctrl-C."""
     # as uvicorn's own command does, the working directory may hold modules of the user's own detectors
-    uvicorn.run("service.app:app", host=host, port=port, timeout_graceful_shutdown=GRACE_S, app_dir="")
+    uvicorn.run("service.app:app", host=host, port=port, http=HTTP, timeout_graceful_shutdown=GRACE_S, app_dir="")

@@ -1,11 +1,14 @@
 import os
 import re
 import signal
+import socket
 import subprocess
 import sys
 import time
 
 import httpx
+
+from service.arriving.connections import HEAD_BYTES
 
 
 def test_serve_runs_the_gateway_where_it_is_told_until_it_is_terminated(tmp_path):
@@ -18,11 +21,14 @@ def test_serve_runs_the_gateway_where_it_is_told_until_it_is_terminated(tmp_path
         end, found = time.monotonic() + 60, None
         while found is None:
             text = (tmp_path / "log").read_text()
-            found = re.search(r"http://127\.0\.0\.2:\d+", text)
+            found = re.search(r"http://(127\.0\.0\.2):(\d+)", text)
             assert process.poll() is None, text
             assert time.monotonic() < end, text
             time.sleep(0.1)
         assert httpx.get(f"{found[0]}/readyz", trust_env=False).json() == {"status": "ready"}
+        with socket.create_connection((found[1], int(found[2]))) as connection:
+            connection.sendall(b"GET /healthz HTTP/1.1\r\nlong: " + b"x" * HEAD_BYTES)
+            assert connection.recv(64).startswith(b"HTTP/1.1 431")
     finally:
         process.send_signal(signal.SIGTERM)
         assert process.wait(30) in (0, -signal.SIGTERM)

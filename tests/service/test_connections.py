@@ -1,0 +1,144 @@
+"""A real server with a tiny application: what a client may take its time with, and what not."""
+
+import asyncio
+import contextlib
+import socket
+import time
+
+import pytest
+import uvicorn
+
+from service.arriving.connections import HEAD_BYTES, BoundedHTTP
+
+GET = b"GET / HTTP/1.1\r\nHost: x\r\n\r\n"
+SLOW = b"GET /slow HTTP/1.1\r\nHost: x\r\n\r\n"
+TIMEOUT_S = 0.4
+
+
+class Hasty(BoundedHTTP):
+    head_timeout_s = TIMEOUT_S
+
+
+async def application(scope, receive, send):
+    if scope["type"] != "http":
+        return
+    if scope["path"] == "/slow":
+        await asyncio.sleep(2 * TIMEOUT_S)
+    if scope["method"] == "POST":
+        while (await receive()).get("more_body"):
+            pass
+    await send({"type": "http.response.start", "status": 200, "headers": [(b"content-length", b"2")]})
+    await send({"type": "http.response.body", "body": b"ok"})
+
+
+@pytest.fixture
+async def port():
+    with socket.socket() as listening:
+        listening.bind(("127.0.0.1", 0))
+        config = uvicorn.Config(application, http=Hasty, lifespan="off", log_level="error", timeout_keep_alive=60)
+        server = uvicorn.Server(config)
+        serving = asyncio.create_task(server.serve([listening]))
+        while not server.started:
+            await asyncio.sleep(0.005)
+        yield listening.getsockname()[1]
+        server.should_exit = True
+        await serving
+
+
+@contextlib.asynccontextmanager
+async def connected(port):
+    reader, writer = await asyncio.open_connection("127.0.0.1", port)
+    yield reader, writer
+    writer.close()
+
+
+async def drip(writer, piece):
+    with contextlib.suppress(ConnectionError):
+        while piece and not writer.is_closing():
+            writer.write(piece)
+            await writer.drain()
+            await asyncio.sleep(TIMEOUT_S / 8)
+
+
+@pytest.mark.parametrize(
+    ("first", "piece", "said"),
+    [
+        (b"", b"", b""),
+        (b"\r\n", b"\r\n", b""),
+        (b"G", b"", b"HTTP/1.1 408"),
+        (b"GET / HTTP/1.1\r\nHost: x\r\n", b"", b"HTTP/1.1 408"),
+        (b"GET / HTTP/1.1\r\n", b"a: b\r\n", b"HTTP/1.1 408"),
+        (b"GET / HTTP/1.1\r\nlong: ", b"x", b"HTTP/1.1 408"),
+        (GET, b"\r\n", b"HTTP/1.1 200"),
+        (GET + b"GET / HTTP/1.1\r\nnext: ", b"x", b"HTTP/1.1 200"),
+        (GET.replace(b"\r\n\r\n", b"\r\nContent-Length: 1000000\r\n\r\n"), b"x", b"HTTP/1.1 200"),
+    ],
+)
+async def test_whoever_takes_too_long_before_there_is_a_request_is_hung_up_on(port, first, piece, said):
+    async with connected(port) as (reader, writer):
+        began = time.monotonic()
+        dripping = asyncio.create_task(drip(writer, piece))
+        writer.write(first)
+        answer = b""
+        with contextlib.suppress(ConnectionError):
+            answer = await asyncio.wait_for(reader.read(-1), 30 * TIMEOUT_S)
+        assert time.monotonic() - began > TIMEOUT_S * 0.9
+        assert answer.startswith(said)
+        assert answer or not said
+        dripping.cancel()
+
+
+async def test_a_request_may_be_answered_slowly_and_others_follow(port):
+    async with connected(port) as (reader, writer):
+        for request in (GET, SLOW, GET, SLOW + GET, b"POST / HTTP/1.1\r\nHost: x\r\nContent-Length: 0\r\n\r\n\r\n"):
+            writer.write(request)
+            for _ in range(request.count(b"HTTP/1.1")):
+                assert b"200" in await reader.readuntil(b"\r\n\r\n")
+                assert await reader.readexactly(2) == b"ok"
+            await asyncio.sleep(TIMEOUT_S * 1.25)
+
+
+async def test_a_body_may_take_longer_than_a_head(port):
+    async with connected(port) as (reader, writer):
+        writer.write(b"POST / HTTP/1.1\r\nHost: x\r\nContent-Length: 10\r\n\r\n")
+        for _ in range(10):
+            await asyncio.sleep(TIMEOUT_S / 5)
+            writer.write(b"x")
+        assert b"200" in await reader.readuntil(b"\r\n\r\n")
+
+
+@pytest.mark.parametrize("before", [b"", GET])
+async def test_a_head_without_end_is_cut_off(port, before):
+    async with connected(port) as (reader, writer):
+        writer.write(before + b"GET / HTTP/1.1\r\nlong: ")
+        sent = 0
+        with contextlib.suppress(ConnectionError):
+            while sent < 64 * 2**20 and not reader.at_eof():
+                writer.write(b"x" * 65536)
+                await writer.drain()
+                sent += 65536
+                await asyncio.sleep(0)
+        assert sent < 16 * 2**20
+        answer = b""
+        with contextlib.suppress(ConnectionError):
+            answer = await reader.read(-1)
+        assert not answer or b"431" in answer or before
+
+
+async def test_the_bodies_before_it_do_not_count_for_a_head(port):
+    body = b"x" * (2 * HEAD_BYTES)
+    post = b"POST / HTTP/1.1\r\nHost: x\r\nContent-Length: %d\r\n\r\n" % len(body)
+    async with connected(port) as (reader, writer):
+        for _ in range(3):
+            writer.write(post + body + GET[:9])
+            assert b"200" in await reader.readuntil(b"\r\n\r\n")
+            await reader.readexactly(2)
+            writer.write(GET[9:])
+            assert b"200" in await reader.readuntil(b"\r\n\r\n")
+            await reader.readexactly(2)
+
+
+async def test_a_head_of_any_size_that_is_looked_at_is_whole(port):
+    async with connected(port) as (reader, writer):
+        writer.write(GET.replace(b"Host: x", b"Host: x\r\nlong: " + b"x" * (HEAD_BYTES - 100)))
+        assert b"200" in await reader.readuntil(b"\r\n\r\n")
