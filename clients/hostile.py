@@ -24,6 +24,7 @@ from robosac import wire
 IDLE_SESSIONS = 9
 SESSIONS = 10
 CONNECTIONS = 24
+HEADS = 240
 STRANGERS = 12
 LOCKED = 0.5
 """Part of the time for which the database is locked; the rest shows how the gateway recovers."""
@@ -42,6 +43,8 @@ class Attack(StrEnum):
     """Ten sessions of one key do so at once, one frame after the other."""
     BODIES = "body flood"
     """Bodies as large as allowed that are no messages, with a good token, some sent very slowly."""
+    HEADS = "heads without end"
+    """Heads of requests that never end, most of them sent very slowly."""
     DATABASE = "locked database"
     """Another process holds the database's write lock."""
 
@@ -94,6 +97,7 @@ async def _attack(attack: Attack, target: Target, seconds: float) -> Counter[str
             Attack.LONG: lambda: attacker.long(1),
             Attack.MANY: lambda: attacker.long(SESSIONS),
             Attack.BODIES: attacker.flood,
+            Attack.HEADS: attacker.heads,
         }[attack]
         try:
             async with asyncio.timeout(seconds):
@@ -131,6 +135,10 @@ class _Attacker:
         sid, token = await self._open(team)
         await asyncio.gather(*(self._flood(sid, token, slowly=k % 3 == 0) for k in range(CONNECTIONS)))
 
+    async def heads(self) -> None:
+        """Send heads that never end, each connection again and again; most of them slowly."""
+        await asyncio.gather(*(self._head(slowly=k % 12 > 0) for k in range(HEADS)))
+
     async def _long(self, session: tuple[str, str]) -> None:
         fields = msgpack.unpackb(self.target.strange)
         sid, token = session
@@ -160,6 +168,17 @@ class _Attacker:
                 self.answers[type(error).__name__] += 1
             await asyncio.sleep(REFUSED_WAIT_S)
 
+    async def _head(self, *, slowly: bool) -> None:
+        while True:
+            try:
+                async with connected(self.target.url) as (reader, writer):
+                    writer.write(b"GET /healthz HTTP/1.1\r\nlong: ")
+                    line = await _while_dripping(reader, writer, slowly=slowly)
+                    self.answers[line.split(b" ")[1].decode() if line else "hung up"] += 1
+            except OSError as error:
+                self.answers[type(error).__name__] += 1
+            await asyncio.sleep(REFUSED_WAIT_S)
+
     async def _open(self, team: list[str], **options: object) -> tuple[str, str]:
         body = {"ego_id": "ego", "teammates": team, **options}
         headers = {"Authorization": f"Bearer {self.target.key}"}
@@ -173,6 +192,20 @@ class _Attacker:
         response = await self.http.post(f"/v1/sessions/{sid}/{what}", content=body, headers=headers)
         self.answers[str(response.status_code)] += 1
         return response.status_code
+
+
+async def _while_dripping(reader: asyncio.StreamReader, writer: asyncio.StreamWriter, *, slowly: bool) -> bytes:
+    """The first line of what a server answers while it is sent more and more; empty if it hangs up."""
+    answer = asyncio.ensure_future(reader.readline())
+    try:
+        while not answer.done():
+            writer.write(b"x" if slowly else b"x" * 2**16)
+            await writer.drain()
+            await asyncio.wait([answer], timeout=REFUSED_WAIT_S)
+        return await answer
+    finally:
+        answer.cancel()
+        await asyncio.gather(answer, return_exceptions=True)
 
 
 def _lock(target: Target, seconds: float) -> Counter[str]:

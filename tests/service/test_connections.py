@@ -8,6 +8,7 @@ import time
 import pytest
 import uvicorn
 
+from clients.hostile import Attack, Target, run_attack
 from service.arriving.connections import HEAD_BYTES, BoundedHTTP
 
 GET = b"GET / HTTP/1.1\r\nHost: x\r\n\r\n"
@@ -136,6 +137,13 @@ async def test_the_bodies_before_it_do_not_count_for_a_head(port):
             writer.write(GET[9:])
             assert b"200" in await reader.readuntil(b"\r\n\r\n")
             await reader.readexactly(2)
+
+
+async def test_the_adversary_is_hung_up_on(port):
+    target = Target(f"http://127.0.0.1:{port}", "", "", b"", b"")
+    answers = await asyncio.to_thread(run_attack, Attack.HEADS, target, 3 * TIMEOUT_S)
+    assert answers["408"] > 0
+    assert answers.total() > answers["408"]
 
 
 async def test_a_head_of_any_size_that_is_looked_at_is_whole(port):
