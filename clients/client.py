@@ -155,7 +155,7 @@ class GatewayClient:
     def vehicle(
         self, session_id: str, vehicle_id: str, token: str, key: Ed25519PrivateKey | None = None
     ) -> VehicleClient:
-        """The client of one vehicle in a session, signing its messages where it has a key."""
+        """The client of one vehicle in a session. With a key it signs its messages, and proves that it has the key."""
         return VehicleClient(self._request, session_id, vehicle_id, token, key, self.receipts)
 
     async def _request(self, method: str, path: str, **options: Any) -> httpx.Response:
