@@ -1,6 +1,7 @@
 import asyncio
 import base64
 import itertools
+import json
 import time
 
 import httpx
@@ -8,6 +9,7 @@ import pytest
 from cryptography.hazmat.primitives.asymmetric.ed25519 import Ed25519PrivateKey
 
 from clients.errors import AccessDenied
+from robosac.audit import verify
 from robosac.possession import make_proof
 from robosac.signatures import show_public_key
 from service.settings import Settings
@@ -57,7 +59,9 @@ def refused(response, why):
 
 async def events(served, session, *kinds):
     ego = served.client.vehicle(session.session_id, EGO, session.ego_token, KEYS[EGO])
-    return [record for record in await ego.audit() if record["event"] in kinds]
+    lines = await ego.audit_lines()
+    assert verify([line.encode() for line in lines]) == []
+    return [record for record in map(json.loads, lines) if record["event"] in kinds]
 
 
 @pytest.mark.parametrize("name", CALLS)
