@@ -18,8 +18,9 @@ from fastapi import FastAPI  # noqa: E402
 
 from robosac.extras import MissingExtra  # noqa: E402
 from service import problems  # noqa: E402
+from service.alone import check_alone  # noqa: E402
 from service.arriving.arrival import Arrival  # noqa: E402
-from service.arriving.doors import Door, capacity_check, check_head, check_local  # noqa: E402
+from service.arriving.doors import Door, capacity_check, check_head, check_local, host_check  # noqa: E402
 from service.arriving.frames import Frames  # noqa: E402
 from service.arriving.limits import BodyLimit  # noqa: E402
 from service.deciding.admission import Admission  # noqa: E402
@@ -80,6 +81,7 @@ def create_app(
     @contextlib.asynccontextmanager
     async def lifespan(_: FastAPI) -> AsyncIterator[None]:
         with logging_to_stderr(settings, secrets):
+            check_alone()
             if not keys:
                 logger.warning("no API key is set (ROBOSAC_API_KEYS): only requests from this machine are served")
             async with _running(gateway, settings, tokens, tracing):
@@ -96,6 +98,8 @@ def create_app(
     problems.install(app)
     app.add_middleware(BodyLimit, limit=settings.max_body_bytes, timeout_s=settings.body_timeout_s)
     app.add_middleware(Door, check=capacity_check(gateway.admission, gateway.sessions.in_use))
+    if not keys or settings.allowed_hosts:
+        app.add_middleware(Door, check=host_check(settings.allowed_hosts))
     if not keys:
         app.add_middleware(Door, check=check_local)
     app.add_middleware(Traced, tracing=tracing)

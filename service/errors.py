@@ -18,6 +18,8 @@ class Kind(StrEnum):
     BAD_PROOF = "bad-proof"
     NOT_ENROLLED = "not-enrolled"
     LOOPBACK_ONLY = "loopback-only"
+    FOREIGN_HOST = "foreign-host"
+    FOREIGN_ORIGIN = "foreign-origin"
     EGO_ONLY = "ego-only"
     WRONG_VEHICLE = "wrong-vehicle"
     UNKNOWN_SESSION = "unknown-session"

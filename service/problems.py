@@ -37,6 +37,8 @@ ANSWERS: Mapping[Kind, tuple[int, Mapping[str, str]]] = {
     Kind.BAD_PROOF: (401, _PROOF),
     Kind.NOT_ENROLLED: (403, {}),
     Kind.LOOPBACK_ONLY: (403, _CLOSE),
+    Kind.FOREIGN_HOST: (421, _CLOSE),
+    Kind.FOREIGN_ORIGIN: (403, _CLOSE),
     Kind.EGO_ONLY: (403, {}),
     Kind.WRONG_VEHICLE: (403, {}),
     Kind.UNKNOWN_SESSION: (404, {}),

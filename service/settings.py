@@ -18,6 +18,7 @@ from robosac.possession import read_origin
 from robosac.wire import MAX_FRAME
 from service.keeping.database import read_url
 
+_HOST = re.compile(r"[A-Za-z0-9_.-]+|\[[0-9A-Fa-f:.]+\]")
 PREFIX = "ROBOSAC_"
 OTHERS = ("ROBOSAC_API_KEY", "ROBOSAC_FUZZ_CASES")
 """Variables of the clients and of the tests."""
@@ -49,6 +50,11 @@ class Settings(BaseSettings):
         (), description="Keys that open sessions, separated by commas; without any, only loopback is served."
     )
     api_keys_file: Path | None = Field(None, description="File of further such keys, one a line.")
+    allowed_hosts: Annotated[tuple[str, ...], NoDecode] = Field(
+        (),
+        description="Names by which the gateway is asked for, beside loopback's, separated by commas; "
+        "without any, and without an API key, only loopback's.",
+    )
     token_secrets: Annotated[tuple[SecretStr, ...], NoDecode] = Field(
         (), description="Secrets of tokens, separated by commas: the first signs, all verify; else the store keeps one."
     )
@@ -143,7 +149,15 @@ class Settings(BaseSettings):
             read_origin(value)
         return value
 
-    @field_validator("extra_detectors", "extra_defenses", "api_keys", "token_secrets", mode="before")
+    @field_validator("allowed_hosts")
+    @classmethod
+    def _check_hosts(cls, hosts: tuple[str, ...]) -> tuple[str, ...]:
+        for host in hosts:
+            if _HOST.fullmatch(host) is None:
+                raise ValueError("must be names or addresses, without scheme and port, an IPv6 address in brackets")
+        return tuple(host.lower() for host in hosts)
+
+    @field_validator("extra_detectors", "extra_defenses", "api_keys", "allowed_hosts", "token_secrets", mode="before")
     @classmethod
     def _split(cls, value: object) -> object:
         return tuple(part.strip() for part in value.split(",") if part.strip()) if isinstance(value, str) else value

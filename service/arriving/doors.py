@@ -4,7 +4,8 @@ from __future__ import annotations
 
 import ipaddress
 import re
-from collections.abc import Callable
+from collections.abc import Callable, Collection
+from urllib.parse import urlsplit
 
 from starlette.datastructures import Headers
 from starlette.types import ASGIApp, Receive, Scope, Send
@@ -18,6 +19,7 @@ TARGET_BYTES = 2048
 HEADERS = 128
 HEADER_BYTES = 32 * 1024
 OPEN_PATHS = ("/healthz",)
+_AUTHORITY = re.compile(r"([^:\[\]@/]+|\[[^\[\]]*\])(?::\d*)?")
 _FRAMES_PATH = re.compile(r"/v1/sessions/([^/]+)/frames")
 
 
@@ -70,8 +72,52 @@ def is_local(scope: Scope) -> bool:
     client, server = scope.get("client"), scope.get("server")
     if client is None:  # a unix socket has a path and no port; a peer on the network may be gone already
         return server is not None and server[1] is None
+    return _is_loopback(client[0])
+
+
+def host_check(names: Collection[str]) -> Callable[[Scope], None]:
+    """A check that refuses requests for other hosts than these and loopback's, and from pages of others.
+
+    A web page may resolve its own name to 127.0.0.1 (DNS rebinding), or post there without reading the answer. A
+    browser then tells its name, as ``Host`` or as ``Origin``; which port it is does not matter.
+
+    Parameters
+    ----------
+    names : collection of str
+        In lower case, without ports, IPv6 addresses in brackets.
+    """
+
+    def is_known(authority: str) -> bool:
+        found = _AUTHORITY.fullmatch(authority)
+        host = found[1].lower().rstrip(".") if found else ""
+        return host == "localhost" or host in names or _is_loopback(host.strip("[]"))
+
+    def check(scope: Scope) -> None:
+        if scope["path"] in OPEN_PATHS:
+            return
+        headers = Headers(scope=scope)
+        hosts = headers.getlist("host")
+        if len(hosts) != 1 or not is_known(hosts[0]):
+            detail = "the gateway is not known by the name in 'Host'; ask for localhost, or set ROBOSAC_ALLOWED_HOSTS"
+            raise Refused(Kind.FOREIGN_HOST, detail, "Host")
+        for origin in headers.getlist("origin"):
+            if not is_known(_authority_of(origin)):
+                detail = "web pages of other hosts may not use this gateway; set ROBOSAC_ALLOWED_HOSTS to let them"
+                raise Refused(Kind.FOREIGN_ORIGIN, detail, "Origin")
+
+    return check
+
+
+def _authority_of(origin: str) -> str:
     try:
-        address = ipaddress.ip_address(client[0])
+        return urlsplit(origin).netloc
+    except ValueError:
+        return ""
+
+
+def _is_loopback(text: str) -> bool:
+    try:
+        address = ipaddress.ip_address(text)
     except ValueError:
         return False
     return (getattr(address, "ipv4_mapped", None) or address).is_loopback

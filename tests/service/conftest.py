@@ -88,6 +88,7 @@ async def serve(
     be foreseen.
     """
     settings.setdefault("database_url", "sqlite://")
+    settings.setdefault("allowed_hosts", "gateway")
     options: dict[str, Any] = {"spans": spans, "clock": clock}
     if seeds is not None:
         numbers = iter(seeds)

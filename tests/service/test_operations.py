@@ -10,7 +10,7 @@ from tests.service.conftest import problem
 async def test_alive_at_once_and_ready_after_the_warm_up():
     app = create_app(Settings(database_url="sqlite://"))
     transport = httpx.ASGITransport(app)
-    async with httpx.AsyncClient(base_url="http://gateway", transport=transport) as http:
+    async with httpx.AsyncClient(base_url="http://localhost", transport=transport) as http:
         assert (await http.get("/healthz")).status_code == 200
         problem(await http.get("/readyz"), 503, "not-ready")
         problem(await http.post("/v1/sessions", json={"ego_id": "a", "teammates": ["b"]}), 503, "not-ready")
