@@ -51,10 +51,11 @@ def check_alone() -> None:
 
 
 def _given_sockets() -> Iterator[int]:
-    for name in os.listdir(_OPEN_FILES):
+    for path in _OPEN_FILES.iterdir():
+        number = int(path.name)
         try:
-            if stat.S_ISSOCK(os.fstat(int(name)).st_mode):
-                yield int(name)
+            if stat.S_ISSOCK(os.fstat(number).st_mode):
+                yield number
         except OSError:  # the listing's own descriptor is closed by now
             continue
 

@@ -111,9 +111,13 @@ def test_a_unix_socket_is_shared_no_more_than_another(tmp_path):
 def test_gateways_on_sockets_of_their_own_are_in_nobodys_way(tmp_path, listening):
     """Whatever else they were given together."""
     one, other = socket.socketpair()
-    with socket.create_server(("127.0.0.1", 0)) as second, one, other, socket.socket() as unbound:
-        with socket.create_connection(second.getsockname()) as connected:
-            given = (one, unbound, connected)
-            with running([sys.executable, "-c", CHECKS], tmp_path, listening, *given) as (process, log):
-                wait_for("alone", log, process)
-                assert check(tmp_path, second, *given) == (0, "alone\n")
+    with (
+        one,
+        other,
+        socket.socket() as unbound,
+        socket.create_server(("127.0.0.1", 0)) as second,
+        socket.create_connection(second.getsockname()) as connected,
+        running([sys.executable, "-c", CHECKS], tmp_path, listening, one, unbound, connected) as (process, log),
+    ):
+        wait_for("alone", log, process)
+        assert check(tmp_path, second, one, unbound, connected) == (0, "alone\n")
