@@ -17,8 +17,8 @@ from service.arriving.checking import InFrame, read_frame, read_message, reason_
 from service.deciding.admission import Admission
 from service.deciding.answering import Deciding
 from service.deciding.asked import Answered, Asked
-from service.deciding.keeping import GRACE_S
 from service.errors import Kind, Refused, StoreTooSlow, StoreUnavailable, Unusable
+from service.keeping.patience import GRACE_S
 from service.keeping.record import SessionRecord
 from service.schemas import Receipt
 from service.sessions.gathering import Contradiction, Received

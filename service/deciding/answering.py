@@ -15,9 +15,10 @@ from robosac.answers import FrameAnswer, Reason
 from robosac.defenses import Rejection
 from service.deciding.admission import Admission
 from service.deciding.asked import Answered, Asked
-from service.deciding.keeping import GRACE_S, Keeping
+from service.deciding.keeping import Keeping
 from service.engine import Decided, Engine
 from service.errors import SessionChanged, StoreTooSlow
+from service.keeping.patience import GRACE_S
 from service.keeping.record import SessionRecord
 from service.sessions.gathering import Received
 from service.sessions.sessions import Sessions

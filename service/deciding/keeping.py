@@ -17,14 +17,11 @@ from robosac.defenses import State
 from robosac.fusion import FusionResult
 from service.deciding.asked import Asked, Present
 from service.errors import GivenUp, StoreTooSlow
-from service.keeping.patience import Patience
+from service.keeping.patience import GRACE_S, Patience, ask_for_the_exception
 from service.keeping.record import SessionRecord
 from service.keeping.store import Store
 from service.sessions.live import unlogged
 from service.sessions.sessions import Sessions
-
-GRACE_S = 0.25
-"""How long after the end of its budget a frame waits for the store, or for the frame before it."""
 
 
 @dataclass(frozen=True)
@@ -58,7 +55,7 @@ class Keeping:
         if task.done():
             task.result()
             return write.kept
-        task.add_done_callback(_ask_for_the_exception)
+        task.add_done_callback(ask_for_the_exception)
         if write.patience.give_up():
             write.undo()
             raise StoreTooSlow("did not take the decision in time; nothing of it is kept, send the frame again")
@@ -144,9 +141,3 @@ def whole_frame(asked: Asked, present: Present, before: State, after: State) -> 
     messages = {name: received.message for name, received in present.items()}
     signatures = {name: r.signature for name, r in present.items() if r.signature is not None}
     return wire.pack_frame(asked.frame, asked.ego.message, messages, asked.ego.signature, signatures, states)
-
-
-def _ask_for_the_exception(task: asyncio.Task[None]) -> None:
-    """So that the loop does not complain that nobody did; the database has logged its failure."""
-    if not task.cancelled():
-        task.exception()

@@ -1,10 +1,41 @@
-"""Who waits for a write, and how long: a decision is kept only while somebody waits for it."""
+"""Who waits for the store, and how long: a decision is kept only while somebody waits for it."""
 
 from __future__ import annotations
 
+import asyncio
 import threading
+from collections.abc import Coroutine
+from typing import Any, TypeVar
 
-from service.errors import GivenUp
+from service.errors import GivenUp, StoreTooSlow
+
+T = TypeVar("T")
+
+GRACE_S = 0.25
+"""How long after the end of its budget a frame waits for the store, or for the frame before it."""
+
+
+async def within(reading: Coroutine[Any, Any, T], seconds: float) -> T:
+    """What is read, if that takes no longer.
+
+    Else the read goes on by itself: to cancel it would cost its connection.
+
+    Raises
+    ------
+    StoreTooSlow
+    """
+    task = asyncio.create_task(reading)
+    await asyncio.wait({task}, timeout=seconds)
+    if task.done():
+        return task.result()
+    task.add_done_callback(ask_for_the_exception)
+    raise StoreTooSlow("did not say in time who may speak in the session; nothing was done, try again")
+
+
+def ask_for_the_exception(task: asyncio.Task[Any]) -> None:
+    """So that the loop does not complain that nobody did; the database has logged its failure."""
+    if not task.cancelled():
+        task.exception()
 
 
 class Patience:

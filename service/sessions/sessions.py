@@ -19,6 +19,7 @@ from robosac.session import Session, defense_for
 from service.engine import Engine
 from service.errors import Kind, Refused, SessionOver, TokenRefused
 from service.keeping.gateway_keys import GatewayKeys
+from service.keeping.patience import GRACE_S, within
 from service.keeping.record import SessionRecord, new_seed
 from service.keeping.store import PAGE, Store
 from service.schemas import SessionState
@@ -35,6 +36,8 @@ from service.watching.metrics import Metrics
 logger = structlog.stdlib.get_logger(__name__)
 
 SWEEP_EVERY_S = 30.0
+COLD_S = 2.0
+"""How long the store may take to tell of a session that is not in use here, whose budget is not known yet."""
 
 
 @dataclass
@@ -72,8 +75,12 @@ class Sessions:
         Refused
             If the session is unknown or ended, the token is none of it, or its detector or its defence is not served
             any more.
+        StoreTooSlow
+            If the store does not tell within the time that a frame of the session has.
         """
-        record = await self.store.get(session_id)
+        live = self._live.get(session_id)
+        patience_s = COLD_S if live is None else live.budget_s + GRACE_S
+        record = await within(self.store.get(session_id), patience_s)
         if record is None or record.ended_at is not None:
             self._forget(session_id)
             raise SessionOver("there is no such session; it may have ended or expired")

@@ -8,7 +8,7 @@ import pytest
 
 from clients.errors import GatewayUnavailable
 from robosac import wire
-from service.deciding.keeping import GRACE_S
+from service.keeping.patience import GRACE_S
 from tests.service.conftest import EGO, TEAM, problem, serve
 
 BUDGET_MS = 400

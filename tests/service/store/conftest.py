@@ -4,6 +4,7 @@ import json
 import os
 import pwd
 import shutil
+import signal
 import subprocess
 import tempfile
 from collections.abc import AsyncIterator, Iterator
@@ -47,6 +48,14 @@ class Server:
 
     def stop(self) -> None:
         self.run("pg_ctl", "stop", "--wait", "--silent", "--mode=immediate")
+
+    def send(self, number: signal.Signals) -> None:
+        """A signal to the server and to all that serve its connections."""
+        first = int((self.folder / "data" / "postmaster.pid").read_text().split()[0])
+        children = subprocess.run(["ps", "-o", "pid=", "--ppid", str(first)], check=False, capture_output=True).stdout
+        for process in (first, *map(int, children.split())):
+            with contextlib.suppress(ProcessLookupError):
+                os.kill(process, number)
 
     async def new_database(self) -> str:
         name = f"gateway{next(NUMBERS)}"
