@@ -72,8 +72,10 @@ def _of_team(answer: FrameAnswered, ego_id: str | None) -> Iterator[str]:
     silent = accepted.union(*(o.teammates for o in answer.hypotheses)) - set(answer.messages)
     if silent:
         yield f"{_listed(silent)} fused without a message"
-    supports = (*(answer.support or ()), *(answer.contradicted or ()))
-    unheard = {name for support in supports for name in (*support.witnesses, *support.deniers)} - set(answer.messages)
+    alike = {id(support): support for support in answer.support or ()}  # one object for many boxes
+    supports = (*alike.values(), *(answer.contradicted or ()))
+    told: set[str] = set().union(*(s.witnesses for s in supports), *(s.deniers for s in supports))
+    unheard = told - set(answer.messages)
     if unheard:
         yield f"boxes stand or fall on the word of {_listed(unheard)}, without a message"
     if ego_id is None:

@@ -6,7 +6,8 @@ from collections import deque
 from collections.abc import Iterable
 from dataclasses import dataclass
 
-from robosac.audit.events import DetectorChanged, FrameAnswered, RecordError, SessionOpened, TeamChanged, event_on
+from robosac.audit.events import DetectorChanged, FrameAnswered, SessionOpened, TeamChanged, event_on
+from robosac.audit.lines import RecordError
 from robosac.defenses import State
 from robosac.previous import PreviousAnswer
 

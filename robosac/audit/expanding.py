@@ -3,10 +3,14 @@
 from __future__ import annotations
 
 import json
-from collections.abc import Callable, Mapping, Sequence
-from typing import Any
+from collections.abc import Callable, Collection, Mapping, Sequence
+from typing import Any, TypeVar
 
+from robosac.answers import Support
 from robosac.audit import packing
+from robosac.boxes import FloatArray
+
+T = TypeVar("T")
 
 FORMAT = 2
 """Of the records that this version writes; those without a ``format`` are of 1."""
@@ -23,10 +27,16 @@ USUAL: Mapping[str, Any] = {
 """What is not written where it is so."""
 
 
-def expanded(record: Mapping[str, Any]) -> dict[str, Any]:
+def expanded(record: Mapping[str, Any], but: Collection[str] = ()) -> dict[str, Any]:
     """A record in the form that format 1 had, of either format.
 
     A `frame_answered` that is not full has no ``state``, but its ``state_digest`` and ``trusted``.
+
+    Parameters
+    ----------
+    record : mapping
+    but : collection of str
+        Fields that stay as they are.
 
     Raises
     ------
@@ -42,19 +52,36 @@ def expanded(record: Mapping[str, Any]) -> dict[str, Any]:
     if read.get("event") == "frame_answered":
         _fill_in(read)
     for name, unpack in _READERS.items():
-        if name in read:
-            try:
-                read[name] = unpack(read[name], names)
-            except (ValueError, TypeError, KeyError, IndexError, AttributeError, RecursionError) as error:
-                raise ValueError(f"{name}: {error}") from error
-    for entry in read["rejected"] if read.get("event") == "frame_answered" and "rejected" in read else ():
-        if entry.get("suspicion") is True:
-            entry["suspicion"] = (read["suspicion"] or {}).get(entry.get("vehicle_id"))
+        if name in read and name not in but:
+            read[name] = _blaming(name, unpack, read[name], names)
+    if read.get("event") == "frame_answered" and "rejected" in read:
+        _blaming("rejected", _fill_in_suspicion, read["rejected"], read["suspicion"] or {})
     if "timings_us" in read:
         read["timings_ms"] = read.pop("timings_us")
     if "state" in read and packing.state_digest(read["state"]) != read.get("state_digest"):
         raise ValueError("state: is not the one of state_digest")
     return read
+
+
+def unpacked(record: Mapping[str, Any]) -> tuple[FloatArray, tuple[Support, ...] | None]:
+    """The boxes of a `frame_answered` of this format, and on whose word they stand: as they are, not as JSON values.
+
+    Raises
+    ------
+    ValueError
+        As `expanded`.
+    """
+    boxes, text = _blaming("boxes", packing.unpack_boxes, record["boxes"]), record.get("support")
+    if text is None:
+        return boxes, None
+    return boxes, tuple(_blaming("support", packing.unpack_supports, text, sorted(record["messages"])))
+
+
+def _blaming(name: str, unpack: Callable[..., T], *packed: Any) -> T:
+    try:
+        return unpack(*packed)
+    except (ValueError, TypeError, KeyError, IndexError, AttributeError, RecursionError) as error:
+        raise ValueError(f"{name}: {error}") from error
 
 
 def _fill_in(read: dict[str, Any]) -> None:
@@ -67,6 +94,12 @@ def _fill_in(read: dict[str, Any]) -> None:
         read.setdefault("sampling_steps", len(read["hypotheses"]))
     if "accepted" in read:
         read.setdefault("trusted", read["accepted"])
+
+
+def _fill_in_suspicion(rejected: Sequence[dict[str, Any]], suspicion: Mapping[str, float]) -> None:
+    for entry in rejected:
+        if entry.get("suspicion") is True:
+            entry["suspicion"] = suspicion.get(entry["vehicle_id"])
 
 
 def _read_state(text: Any, _: Sequence[str]) -> dict[str, Any]:
@@ -92,7 +125,12 @@ def _read_hypotheses(hypotheses: Any, names: Sequence[str]) -> list[dict[str, An
 
 
 def _read_supports(supports: Any, names: Sequence[str]) -> Any:
-    return packing.unpack_supports(supports, names) if isinstance(supports, str) else supports
+    if not isinstance(supports, str):
+        return supports
+    return [
+        {"status": each.status.value, "witnesses": list(each.witnesses), "deniers": list(each.deniers)}
+        for each in packing.unpack_supports(supports, names)
+    ]
 
 
 def _read_contradicted(packed: Any, names: Sequence[str]) -> Any:

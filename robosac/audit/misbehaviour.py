@@ -21,8 +21,8 @@ from robosac.audit.events import (
     SessionOpened,
     TeamChanged,
     event_of,
-    read,
 )
+from robosac.audit.lines import read
 from robosac.defenses import Reference
 
 VERSION = 2

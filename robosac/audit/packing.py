@@ -12,6 +12,7 @@ import hashlib
 import json
 import zlib
 from collections.abc import Mapping, Sequence
+from functools import lru_cache
 from typing import Any
 
 import numpy as np
@@ -118,8 +119,8 @@ def pack_supports(supports: Sequence[Support], names: Sequence[str]) -> str:
     return deflated(columns.tobytes())
 
 
-def unpack_supports(text: Any, names: Sequence[str]) -> list[dict[str, Any]]:
-    """The supports of `pack_supports`, as JSON values.
+def unpack_supports(text: Any, names: Sequence[str]) -> list[Support]:
+    """The supports of `pack_supports`; those that are alike are one object.
 
     Raises
     ------
@@ -129,19 +130,21 @@ def unpack_supports(text: Any, names: Sequence[str]) -> list[dict[str, Any]]:
     content, width = inflated(text), -(-len(names) // 8)
     if len(content) % (1 + 2 * width):
         raise ValueError("does not hold whole entries")
-    rows = np.frombuffer(content, dtype=np.uint8).reshape(1 + 2 * width, -1).T
-    known: dict[bytes, list[str]] = {}  # most boxes have the same few witnesses
-    supports = []
-    for row in map(bytes, rows):
-        if row[0] >= len(_STANDINGS):
-            raise ValueError(f"there is no status {row[0]}")
-        masks = row[1 : 1 + width], row[1 + width :]
-        for mask in masks:
-            if mask not in known:
-                known[mask] = _members(int.from_bytes(mask, "little"), names)
-        witnesses, deniers = (known[mask] for mask in masks)
-        supports.append({"status": _STANDINGS[row[0]].value, "witnesses": witnesses, "deniers": deniers})
-    return supports
+    number = 1 + 2 * width
+    rows = np.ascontiguousarray(np.frombuffer(content, dtype=np.uint8).reshape(number, -1).T).tobytes()
+    among = tuple(names)
+    return [_support(rows[start : start + number], among) for start in range(0, len(rows), number)]
+
+
+@lru_cache(4096)  # most boxes of a log have the same few witnesses
+def _support(row: bytes, names: tuple[str, ...]) -> Support:
+    if row[0] >= len(_STANDINGS):
+        raise ValueError(f"there is no status {row[0]}")
+    width = -(-len(names) // 8)
+    witnesses, deniers = (
+        tuple(_members(int.from_bytes(mask, "little"), names)) for mask in (row[1 : 1 + width], row[1 + width :])
+    )
+    return Support.model_construct(status=_STANDINGS[row[0]], witnesses=witnesses, deniers=deniers)
 
 
 def pack_names(chosen: Sequence[str], names: Sequence[str]) -> str | list[str]:

@@ -15,16 +15,14 @@ from robosac.audit.events import (
     Equivocation,
     FrameAnswered,
     Proof,
-    RecordError,
     SessionEnded,
     SessionOpened,
     TeamChanged,
     event_of,
-    is_canonical,
-    read,
 )
 from robosac.audit.expanding import FORMAT
 from robosac.audit.findings import Fault, Finding
+from robosac.audit.lines import RecordError, is_canonical, read
 from robosac.audit.receipts import Receipts
 from robosac.consensus import DEFAULT_THRESHOLD
 from robosac.defenses import trusted_in

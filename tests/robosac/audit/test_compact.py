@@ -10,7 +10,8 @@ from hypothesis import strategies as st
 from robosac.answers import Support
 from robosac.audit import FULL_EVERY, Writer, compact, expanded, packing, seal
 from robosac.audit.compact import logged
-from robosac.audit.events import FrameAnswered, RecordError, event_on
+from robosac.audit.events import FrameAnswered, event_on
+from robosac.audit.lines import RecordError
 from robosac.boxes import from_units, in_units
 
 NAMES = ["car-1", "car-2", "car-3", "rsu"]
@@ -72,6 +73,7 @@ def test_junk_in_any_part_is_told_as_such(events, value):
     ]
     changes += [{"rejected": value}, {"rejected": [value]}, {"contradicted": {"boxes": value, "support": value}}]
     changes += [{"rejected": [{"vehicles": value, "reason": "late"}]}, {"rejected": [{"suspicion": True}]}]
+    changes += [{"rejected": [{"vehicle_id": value, "reason": "late", "suspicion": True}]}, {"support": ["x", value]}]
     told = 0
     for change in changes:
         try:

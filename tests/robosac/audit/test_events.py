@@ -4,7 +4,8 @@ from typing import get_args
 import pytest
 
 from robosac.audit import events as kinds
-from robosac.audit.events import Event, RecordError, event_on
+from robosac.audit.events import Event, event_on
+from robosac.audit.lines import RecordError
 from tests.robosac.audit.conftest import proof
 
 
