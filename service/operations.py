@@ -2,12 +2,11 @@
 
 from __future__ import annotations
 
-import asyncio
-
 from fastapi import APIRouter, Response
 
 from service.callers import GatewayDep
 from service.errors import Kind, Refused
+from service.keeping.patience import within
 
 STORE_PATIENCE_S = 1.0
 """How long readiness waits for the database."""
@@ -25,8 +24,7 @@ async def readyz(gateway: GatewayDep) -> dict[str, str]:
     """Whether the gateway is warm and able to serve, and its database takes changes."""
     gateway.engine.check_ready()
     try:
-        async with asyncio.timeout(STORE_PATIENCE_S):
-            await gateway.store.ping()
+        await within(gateway.store.ping(), STORE_PATIENCE_S)
     except TimeoutError:
         raise Refused(Kind.NOT_READY, f"the database did not answer within {STORE_PATIENCE_S:g} s") from None
     return {"status": "ready"}

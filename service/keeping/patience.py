@@ -7,7 +7,7 @@ import threading
 from collections.abc import Coroutine
 from typing import Any, TypeVar
 
-from service.errors import GivenUp, StoreTooSlow
+from service.errors import GivenUp
 
 T = TypeVar("T")
 
@@ -22,14 +22,14 @@ async def within(reading: Coroutine[Any, Any, T], seconds: float) -> T:
 
     Raises
     ------
-    StoreTooSlow
+    TimeoutError
     """
     task = asyncio.create_task(reading)
     await asyncio.wait({task}, timeout=seconds)
     if task.done():
         return task.result()
     task.add_done_callback(ask_for_the_exception)
-    raise StoreTooSlow("did not say in time who may speak in the session; nothing was done, try again")
+    raise TimeoutError
 
 
 def ask_for_the_exception(task: asyncio.Task[Any]) -> None:

@@ -7,7 +7,7 @@ import time
 from dataclasses import fields
 from typing import Any
 
-from sqlalchemy import Row, bindparam, select, update
+from sqlalchemy import Row, bindparam, false, select, update
 
 from service.keeping.record import SessionRecord
 from service.keeping.tables import sessions
@@ -20,6 +20,8 @@ ENDED = sessions.c.ended_at.is_not(None)
 GET = select(*(sessions.c[name] for name in FIELDS)).where(THIS)
 GET_TO_CHANGE = GET.with_for_update()  # SQLite, which knows no such clause, has locked everything by then
 CHANGE = update(sessions).where(THIS)
+NO_CHANGE = update(sessions).where(false()).values(ended_at=None)
+"""A database that takes no changes refuses it all the same; PostgreSQL is asked nothing before the first statement."""
 
 
 def read_row(row: Row[Any]) -> SessionRecord:

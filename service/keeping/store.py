@@ -17,7 +17,7 @@ from service.keeping.database import connect
 from service.keeping.patience import Patience
 from service.keeping.purging import locked, older_messages, parts
 from service.keeping.record import SessionRecord
-from service.keeping.rows import ENDED, FIELDS, GET, OPEN, columns, read_row
+from service.keeping.rows import ENDED, FIELDS, GET, NO_CHANGE, OPEN, columns, read_row
 from service.keeping.sealing import Sealing, unsealed
 from service.keeping.seen import Seen
 from service.keeping.tables import audit_lines, kept_messages, sessions
@@ -249,7 +249,7 @@ class Store:
 
     async def ping(self) -> None:
         """Find out whether the database takes changes; it makes none."""
-        await self._database.write(lambda _: None)
+        await self._execute(NO_CHANGE)
 
     async def secret(self, name: str, make: Callable[[], str]) -> str:
         """A secret that outlives the process: what ``make`` gave when it was first asked for."""

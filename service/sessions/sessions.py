@@ -17,7 +17,7 @@ from robosac.budget import DomainError
 from robosac.defenses import known, read_settings, suspicion_in
 from robosac.session import Session, defense_for
 from service.engine import Engine
-from service.errors import Kind, Refused, SessionOver, TokenRefused
+from service.errors import Kind, Refused, SessionOver, StoreTooSlow, TokenRefused
 from service.keeping.gateway_keys import GatewayKeys
 from service.keeping.patience import GRACE_S, within
 from service.keeping.record import SessionRecord, new_seed
@@ -80,7 +80,11 @@ class Sessions:
         """
         live = self._live.get(session_id)
         patience_s = COLD_S if live is None else live.budget_s + GRACE_S
-        record = await within(self.store.get(session_id), patience_s)
+        try:
+            record = await within(self.store.get(session_id), patience_s)
+        except TimeoutError:
+            detail = "did not say in time who may speak in the session; nothing was done, try again"
+            raise StoreTooSlow(detail) from None
         if record is None or record.ended_at is not None:
             self._forget(session_id)
             raise SessionOver("there is no such session; it may have ended or expired")

@@ -19,7 +19,8 @@ from clients.crash_test.driven import Driven
 from clients.errors import GatewayUnavailable
 from robosac.audit.verification import verify
 from service.keeping.patience import GRACE_S
-from tests.service.conftest import serve
+from service.operations import STORE_PATIENCE_S
+from tests.service.conftest import problem, serve
 
 BUDGET_MS = 1000
 FAULT_S = 2.5
@@ -80,6 +81,10 @@ async def test_a_server_that_stands_still_or_dies(fault, postgres, good_frame):
         ego = await Ego.of(served, good_frame)
         postgres.send(signal.SIGSTOP if fault == "stopped" else signal.SIGKILL)
         try:
+            if fault == "stopped":  # the connections look good
+                began = time.perf_counter()
+                problem(await served.http.get("/readyz"), 503, "not-ready")
+                assert time.perf_counter() - began < STORE_PATIENCE_S + LATE_S
             assert await ego.post_for(FAULT_S)
         finally:
             if fault == "stopped":
@@ -87,6 +92,7 @@ async def test_a_server_that_stands_still_or_dies(fault, postgres, good_frame):
             else:
                 await asyncio.to_thread(postgres.start)
         await ego.check()
+        assert (await served.http.get("/readyz")).status_code == 200
 
 
 @contextlib.contextmanager
