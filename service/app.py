@@ -99,7 +99,7 @@ def create_app(
     app.add_middleware(BodyLimit, limit=settings.max_body_bytes, timeout_s=settings.body_timeout_s)
     app.add_middleware(Door, check=capacity_check(gateway.admission, gateway.sessions.in_use))
     if not keys or settings.allowed_hosts:
-        app.add_middleware(Door, check=host_check(settings.allowed_hosts))
+        app.add_middleware(Door, check=host_check(settings.hosts))
     if not keys:
         app.add_middleware(Door, check=check_local)
     app.add_middleware(Traced, tracing=tracing)

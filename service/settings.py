@@ -149,6 +149,12 @@ class Settings(BaseSettings):
             read_origin(value)
         return value
 
+    @property
+    def hosts(self) -> frozenset[str]:
+        """Names by which the gateway may be asked for, in lower case, IPv6 addresses without brackets."""
+        public = () if self.public_url is None else (read_origin(self.public_url)[1],)
+        return frozenset([*(host.strip("[]") for host in self.allowed_hosts), *public])
+
     @field_validator("allowed_hosts")
     @classmethod
     def _check_hosts(cls, hosts: tuple[str, ...]) -> tuple[str, ...]:

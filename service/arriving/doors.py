@@ -84,13 +84,13 @@ def host_check(names: Collection[str]) -> Callable[[Scope], None]:
     Parameters
     ----------
     names : collection of str
-        In lower case, without ports, IPv6 addresses in brackets.
+        In lower case, without ports, IPv6 addresses without brackets.
     """
 
     def is_known(authority: str) -> bool:
         found = _AUTHORITY.fullmatch(authority)
-        host = found[1].lower().rstrip(".") if found else ""
-        return host == "localhost" or host in names or _is_loopback(host.strip("[]"))
+        host = found[1].lower().rstrip(".").strip("[]") if found else ""
+        return host == "localhost" or host in names or _is_loopback(host)
 
     def check(scope: Scope) -> None:
         if scope["path"] in OPEN_PATHS:

@@ -62,8 +62,15 @@ async def test_pages_of_other_hosts_are_refused(local):
 @pytest.mark.parametrize("keys", ["", KEY])
 async def test_the_operator_names_others(keys):
     names = "Gateway.example, 10.1.2.3, [2001:db8::1]"
-    async with serve(allowed_hosts=names, api_keys=keys) as served:
-        for host in ("gateway.example:8000", "GATEWAY.example", "10.1.2.3:8000", "[2001:db8::1]", "localhost"):
+    async with serve(allowed_hosts=names, api_keys=keys, public_url="https://Public.example/v") as served:
+        for host in (
+            "public.example",
+            "gateway.example:8000",
+            "GATEWAY.example",
+            "10.1.2.3:8000",
+            "[2001:db8::1]",
+            "localhost",
+        ):
             assert (await opened(served, Host=host, **bearer(KEY))).status_code == 201, host
         problem(await opened(served, Host="evil.example", **bearer(KEY)), 421, "foreign-host")
         origin = {"Host": "localhost", "Origin": "http://evil.example"}
