@@ -17,7 +17,7 @@ help:
 	@echo "make bench   measure frames per second and latency, briefly"
 
 demo: $(VENV)/.installed
-	$(BIN)/robosac demo --report $(OUT)/demo
+	$(BIN)/robosac demo --report $(OUT)/demo --force
 
 serve: $(VENV)/.installed
 	$(BIN)/robosac serve --host $(HOST) --port $(PORT)
@@ -43,7 +43,7 @@ docs: $(VENV)/.installed-docs
 	NO_MKDOCS_2_WARNING=1 $(BIN)/mkdocs build --strict
 
 bench: $(VENV)/.installed
-	$(BIN)/robosac load-test --seconds 4 --out $(OUT)/bench
+	$(BIN)/robosac load-test --seconds 4 --out $(OUT)/bench --force
 
 $(VENV)/.created:
 	$(PYTHON) -c 'import sys; assert sys.version_info >= (3, 11), "Python 3.11 or newer is needed; set PYTHON=..."'

@@ -32,6 +32,7 @@ from clients.hostile import LOCKED, Attack, Target, run_attack, strange_frame
 from clients.load_test import WARM_UP_FRAMES, Bodies, new_ego, prepare
 from clients.local_gateway import GatewayProcess
 
+REPORT = "adversary.json"
 HONEST_HZ = 5.0
 CLOCK_MS = 5.0
 """What the ego's clock sees more than the gateway's, on one machine: the way there and back."""
@@ -192,6 +193,7 @@ def show(console: Console, results: Sequence[Result], plan: Plan) -> None:
 
 def main(
     out: trial.Out = None,
+    force: trial.Force = False,
     only: Annotated[list[Attack] | None, typer.Option(help="Attacks to play; by default all.")] = None,
     seconds: trial.Seconds = 4.0,
     budget_ms: trial.Budget = 200.0,
@@ -206,12 +208,12 @@ def main(
     """
     torch.set_num_threads(1)
     console = Console()
-    trial.make_folder(out, "--out")
+    trial.make_folder(out, "--out", REPORT, force)
     plan = Plan(seconds, budget_ms)
     bodies = prepare(True, 3, console)
     results = trial.run(play_all(only or list(Attack), plan, bodies, console), console, "The adversary")
     show(console, results, plan)
-    trial.write([_as_dict(result) for result in results], out, "adversary.json", console)
+    trial.write([_as_dict(result) for result in results], out, REPORT, console)
     enough = [r.during.share(r.during.tested) >= at_least for r in results if r.attack is not Attack.DATABASE]
     if not all(enough) or not all(result.held for result in results):
         sys.exit(1)

@@ -13,7 +13,7 @@ from rich.console import Console
 from clients import trial
 from clients.fleet import FleetOptions, close_run, run_fleet
 from clients.local_gateway import local_gateway
-from clients.summary import FleetSummary
+from clients.summary import REPORT, FleetSummary
 
 CLEAN_SHARE = 0.95
 
@@ -22,6 +22,7 @@ def main(
     report: Annotated[Path, typer.Option(help="Folder for the summary, the picture and the gateway's log.")],
     scenes: Annotated[int, typer.Option(min=1, help="Sequences.")] = 8,
     frames: Annotated[int, typer.Option(min=1, help="Frames of a sequence.")] = 25,
+    force: trial.Force = False,
 ) -> None:
     """Start a gateway, drive six vehicles through it, one of them a PGD attacker, and show what came of it.
 
@@ -29,7 +30,7 @@ def main(
     """
     torch.set_num_threads(1)
     console = Console()
-    trial.make_folder(report, "--report", for_pictures=True)
+    trial.make_folder(report, "--report", REPORT, force, for_pictures=True)
     options, summary = trial.run(_run(report, scenes, frames, console), console, "The demo")
     close_run(options, summary, console)
     if summary.clean_share < CLEAN_SHARE:

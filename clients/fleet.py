@@ -21,10 +21,12 @@ from clients.client import GatewayClient, OpenedSession, VehicleClient
 from clients.errors import FrameConflict
 from clients.simulation import EgoFrame, Fleet
 from clients.standing import shown
-from clients.summary import FleetSummary
+from clients.summary import REPORT, FleetSummary
 from robosac import attacks, defenses, detectors
 from robosac.answers import FrameAnswer, Reason
 from robosac.attacks import CAMPAIGN_HELP
+from robosac.cli.blame import blaming
+from robosac.cli.options import check_attack, load_data, load_detector
 from robosac.detectors import DEFAULT_DETECTOR
 from robosac.evaluation.frames import another_scene
 from robosac.scenes import DATA_HELP, DEFAULT_DATA, SOURCES, first_scenes
@@ -227,20 +229,16 @@ def main(  # the options of a command line
     report: Annotated[Path | None, typer.Option(help="Folder for summary.json and example.png.")] = None,
     data: Annotated[str, typer.Option(help=DATA_HELP)] = DEFAULT_DATA,
     api_key: trial.ApiKey = None,
+    force: trial.Force = False,
 ) -> None:
     """Drive a simulated fleet, some of it hostile, through a running gateway."""
     torch.set_num_threads(1)
     console = Console()
-    trial.make_folder(report, "--report", for_pictures=True)
-    for option, load, value in (
-        ("--attack", attacks.load_campaign, attack),
-        ("--detector", detectors.load, detector),
-        ("--data", SOURCES.make, data),
-    ):
-        try:
-            load(value)
-        except ValueError as error:
-            raise typer.BadParameter(str(error), param_hint=option) from error
+    trial.make_folder(report, "--report", REPORT, force, for_pictures=True)
+    with blaming("--attack", ValueError):
+        campaign = attacks.load_campaign(attack)
+    check_attack(campaign, load_detector(detector))
+    load_data(data)
     chosen = {"attacker_ratio": attacker_ratio, "sampling_budget": sampling_budget, "collaborators": collaborators}
     asked = _asked(defense, {name: value for name, value in chosen.items() if value is not None})
     options = FleetOptions(
@@ -269,12 +267,10 @@ def _asked(defense: str | None, given: dict[str, Any]) -> dict[str, Any] | None:
         if given:
             raise typer.BadParameter("its settings need to know the kind of defence", param_hint="--defense")
         return None
-    try:
+    with blaming("--defense", ValueError):
         loaded = defenses.load(defense)
         asked = {**loaded.model_dump(mode="json", exclude_unset=True), "kind": loaded.kind, **given}
         defenses.read_settings(asked, {loaded.kind: type(loaded)})
-    except ValueError as error:
-        raise typer.BadParameter(str(error), param_hint="--defense") from error
     return asked
 
 
@@ -284,7 +280,7 @@ def close_run(options: FleetOptions, summary: FleetSummary, console: Console) ->
     if options.report is not None:
         settings = {name: value for name, value in vars(options).items() if name not in ("report", "url", "api_key")}
         picture = summary.write(options.report, settings)
-        console.print(f"Report: {options.report / 'summary.json'} and {picture}")
+        console.print(f"Report: {options.report / REPORT} and {picture}")
 
 
 if __name__ == "__main__":

@@ -30,6 +30,7 @@ from clients.client import MSGPACK, GatewayClient
 from clients.load_test import Bodies, Figures, Load, prepare, run_load
 from clients.raw_http import connected, post_head, read_response
 
+REPORT = "flood.json"
 BUDGET_MS = 200.0
 HONEST_HZ = 5.0
 BODY_BYTES = 32 * 2**20
@@ -205,6 +206,7 @@ def show(console: Console, results: Results) -> None:
 
 def main(
     out: trial.Out = None,
+    force: trial.Force = False,
     url: trial.Url = None,
     egos: Annotated[int, typer.Option(min=1, help="Honest egos, each at five frames a second.")] = 2,
     rate: Annotated[float, typer.Option(min=0.1, help="Requests of strangers a second.")] = 20.0,
@@ -217,7 +219,7 @@ def main(
     """
     torch.set_num_threads(1)
     console = Console()
-    trial.make_folder(out, "--out")
+    trial.make_folder(out, "--out", REPORT, force)
     bodies, plan = prepare(True, 3, console), Plan(egos, rate, seconds)
     results = trial.run(run_flood(url, api_key, plan, bodies, console), console, "The flood test")
     show(console, results)
@@ -225,7 +227,7 @@ def main(
         strangers.value: {"honest": figures.as_dict(), "strangers": asdict(refusals)}
         for strangers, (figures, refusals) in results.items()
     }
-    trial.write(report, out, "flood.json", console)
+    trial.write(report, out, REPORT, console)
     if any(refusals.others for _, refusals in results.values()):
         sys.exit(1)
 

@@ -34,6 +34,7 @@ from robosac.attacks import PGD
 from robosac.detectors import load
 from robosac.scenes import FRAME_PERIOD_S, IntersectionScene
 
+REPORT = "load_test.json"
 PREPARED_FRAMES = 20
 WARM_UP_FRAMES = 3
 REFUSED_WAIT_S = 0.05
@@ -221,12 +222,13 @@ def main(  # the options of a command line
     budget_ms: trial.Budget = 200.0,
     scene: Annotated[int, typer.Option(min=0, help="Seed of the scene whose frames are sent.")] = 3,
     out: trial.Out = None,
+    force: trial.Force = False,
     api_key: trial.ApiKey = None,
 ) -> None:
     """Measure a gateway's capacity and latency, with and without attackers, for one ego and for several."""
     torch.set_num_threads(1)
     console = Console()
-    trial.make_folder(out, "--out")
+    trial.make_folder(out, "--out", REPORT, force)
     bodies = {attacked: prepare(attacked, scene, console) for attacked in (False, True)}
     loads = [
         Load(loop, count, attacked, rate if loop == "open" else None)
@@ -251,7 +253,7 @@ def main(  # the options of a command line
         "defense": DEFENSE,
         "loads": [figures.as_dict() for figures in results],
     }
-    trial.write(report, out, "load_test.json", console)
+    trial.write(report, out, REPORT, console)
     if any(not figures.latencies_ms for figures in results):
         console.print("[red]A load got no answer at all.[/red]")
         sys.exit(1)

@@ -25,6 +25,7 @@ from clients.load_test import Bodies, Load, new_ego, prepare, run_load
 from clients.raw_http import connected, post_head, read_response
 from robosac import wire
 
+REPORT = "overload.json"
 CAPACITY_EGOS = 8
 
 
@@ -148,6 +149,7 @@ def show(console: Console, figures: OverloadFigures) -> None:
 
 def main(
     out: trial.Out = None,
+    force: trial.Force = False,
     url: trial.Url = None,
     egos: Annotated[int, typer.Option(min=1, help="Sessions that the frames are spread over.")] = 100,
     factor: Annotated[float, typer.Option(min=1, help="Multiple of the capacity.")] = 10.0,
@@ -157,12 +159,12 @@ def main(
     """Offer a gateway more than it can answer, and measure what it answers in time and how fast it refuses the rest."""
     torch.set_num_threads(1)
     console = Console()
-    trial.make_folder(out, "--out")
+    trial.make_folder(out, "--out", REPORT, force)
     bodies, plan = prepare(True, 3, console), Plan(egos, factor, seconds, budget_ms)
     with Progress(console=console, transient=True) as progress:
         figures = trial.run(run_overload(url, plan, bodies, progress), console, "The overload test")
     show(console, figures)
-    trial.write(figures.as_dict(), out, "overload.json", console)
+    trial.write(figures.as_dict(), out, REPORT, console)
 
 
 if __name__ == "__main__":

@@ -20,9 +20,11 @@ from robosac.boxes import FloatArray
 from robosac.consensus import at_least
 from robosac.detectors import Detector
 from robosac.evaluation import AveragePrecision
-from robosac.figures import new_figure
+from robosac.figures import new_figure, save_figure
+from robosac.files import write_text
 from robosac.scenes.drawing import TRUE_COLOUR, draw_answer, draw_boxes, draw_points, frame_axes
 
+REPORT = "summary.json"
 GATEWAY = "gateway"
 BASELINES = ("all benign", "ego only", "no defence")
 
@@ -191,9 +193,8 @@ class FleetSummary:
 
     def write(self, folder: Path, settings: dict[str, Any]) -> Path:
         """Write ``summary.json`` and ``example.png`` to a folder; returns the picture's path."""
-        folder.mkdir(parents=True, exist_ok=True)
         text = json.dumps({"settings": settings, **self.as_dict()}, indent=2)
-        (folder / "summary.json").write_text(text + "\n")
+        write_text(folder / REPORT, text + "\n")
         picture = folder / "example.png"
         if self.example is not None:
             _draw(self.example, picture)
@@ -219,4 +220,4 @@ def _draw(example: Example, path: Path) -> None:
             draw_boxes(axes, boxes, colour, label)
         frame_axes(axes, title)
     figure.suptitle(f"Scene {frame.scene}, frame {answer.frame}, {frame.ego_id}; boxes from the consensus score on")
-    figure.savefig(path, dpi=90, bbox_inches="tight")
+    save_figure(figure, path, dpi=90, bbox_inches="tight")

@@ -20,8 +20,10 @@ from rich.table import Table
 from clients.client import API_KEY_VARIABLE, GatewayClient
 from clients.errors import GatewayError
 from clients.local_gateway import local_gateway
+from robosac.cli import outputs
 from robosac.extras import MissingExtra
 from robosac.figures import need_figures
+from robosac.files import write_text
 
 T = TypeVar("T")
 
@@ -31,24 +33,23 @@ ApiKey = Annotated[
 ]
 Seconds = Annotated[float, typer.Option(min=0.5, help="Length of each part.")]
 Budget = Annotated[float, typer.Option(min=1, help="Latency budget.")]
+Force = outputs.Force
 Out = Annotated[Path | None, typer.Option(help="Folder for the report, a JSON file.")]
 
 
-def make_folder(path: Path | None, option: str, *, for_pictures: bool = False) -> None:
+def make_folder(path: Path | None, option: str, report: str, force: bool, *, for_pictures: bool = False) -> None:
     """Make an output folder, where one is wanted, before any work is done; a bad one is the option's fault.
 
-    Ends the program where pictures are wanted and none can be drawn.
+    So is one that holds the report already. Ends the program where pictures are wanted and none can be drawn.
     """
     if path is None:
         return
     try:
         if for_pictures:
             need_figures()
-        path.mkdir(parents=True, exist_ok=True)
     except MissingExtra as missing:
         sys.exit(f"Error: {missing}")
-    except OSError as error:
-        raise typer.BadParameter(str(error), param_hint=option) from error
+    outputs.make_folder(path, option, force, report)
 
 
 @asynccontextmanager
@@ -79,7 +80,7 @@ def run(trial: Coroutine[Any, Any, T], console: Console, what: str, *others: typ
 def write(report: Any, out: Path | None, name: str, console: Console) -> None:
     """Write a report to a folder, where one is given, and say so."""
     if out is not None:
-        (out / name).write_text(json.dumps(report, indent=2) + "\n")
+        write_text(out / name, json.dumps(report, indent=2) + "\n")
         console.print(f"Written: {out / name}")
 
 

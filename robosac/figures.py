@@ -2,9 +2,11 @@
 
 from __future__ import annotations
 
-from typing import TYPE_CHECKING
+from pathlib import Path
+from typing import TYPE_CHECKING, Any
 
 from robosac.extras import need
+from robosac.files import replacing
 
 if TYPE_CHECKING:
     from matplotlib.figure import Figure
@@ -33,3 +35,9 @@ def new_figure(width: float, height: float) -> Figure:
     from matplotlib.figure import Figure  # noqa: PLC0415 (a second to import, and only pictures need it)
 
     return Figure(figsize=(width, height), layout="constrained")
+
+
+def save_figure(figure: Figure, path: Path, dpi: int, **options: Any) -> None:
+    """Write a picture by `replacing`; the suffix chooses the format. ``options`` are those of ``Figure.savefig``."""
+    with replacing(path) as beside:
+        figure.savefig(beside, dpi=dpi, **options)

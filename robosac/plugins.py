@@ -99,7 +99,7 @@ class Kind(Generic[T]):
             faults.insert(0, f"has to derive from {contract.__name__}")
         if any(faults):
             said = " and ".join(filter(None, faults))
-            raise self.error(f"{who} made no {self.noun} but {candidate!r:.100}, which {said}")
+            raise self.error(f"{who} made no {self.noun} but {_shown(candidate)}, which {said}")
 
     def _foreign(self, name: str, arguments: list[str], text: str) -> T:
         offered = next((f"{point.module}:{point.attr}" for point in entry_points(group=self.package, name=name)), None)
@@ -107,7 +107,7 @@ class Kind(Generic[T]):
             raise self.error(f"no {self.noun} {text!r}: give one of {', '.join(sorted(self.shipped))}, {self.forms}")
         try:
             made: T = pkgutil.resolve_name(text)() if offered is None else pkgutil.resolve_name(offered)(*arguments)
-        except Exception as error:  # the user's code may raise anything
+        except (Exception, SystemExit) as error:  # the user's code may raise anything, or be a script that ends
             said = " ".join(str(error).split())
             raise self.error(f"{text}: {type(error).__name__}: {said}") from error
         return made
@@ -155,3 +155,9 @@ def lacks(candidate: object, contract: type[Any], needed: Collection[str] | None
 
 def _is_protocol(contract: type[Any]) -> bool:
     return bool(getattr(contract, "_is_protocol", False))
+
+
+def _shown(candidate: object) -> str:
+    """What was made, for a message: by its own description, or by its class where it has none of its own."""
+    kind = type(candidate)
+    return f"{candidate!r:.100}" if kind.__repr__ is not object.__repr__ else f"a {kind.__module__}.{kind.__qualname__}"

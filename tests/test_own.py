@@ -40,6 +40,11 @@ def robosac(*arguments):
     return subprocess.run(words, check=False, capture_output=True, text=True, timeout=300)
 
 
+def said(done):
+    """What a command complains of."""
+    return " ".join(done.stderr.replace("│", "").split())
+
+
 def test_all_four_are_compared(own):
     options = ["--detector", "my_detector:build", "--data", "my_data:Road", "--defense", "my_defense:RunningScore"]
     settings = ["--setting", "my_attack:Suppress:1", "--only", "one_by_one", "--scenes", 2, "--frames", 6, "--jobs", 2]
@@ -98,21 +103,26 @@ def test_data_can_be_disturbed_and_compared_with_itself(own):
 
 def test_what_cannot_be_is_said_before_the_work(own):
     shifting = robosac("calibrate", "--detector", "my_detector:build", "--data", "my_data:Road", "--out", "x.json")
-    said = " ".join(shifting.stdout.split())
-    assert shifting.returncode == 1
-    assert "shift cannot attack the detector occupancy-max: its attack surface lacks perceive" in said
-    assert said.endswith("It can be calibrated with the others: pgd, erase")
+    assert shifting.returncode == 2
+    assert "for --attack: invent cannot attack the detector occupancy-max: its attack surface lacks" in said(shifting)
+    assert "It can be calibrated with the others: pgd, erase" in said(shifting)
+    assert "frames" not in shifting.stdout
     few = ["--attack", "pgd", "--pose-error", 0, "--scenes", 2, "--check-scenes", 0, "--out", "x.json"]
     small = robosac("calibrate", "--detector", "my_detector:build", "--data", "my_data:Road", *few)
-    assert small.returncode == 1
-    assert " ".join(small.stdout.split()).endswith("take 6")
+    assert small.returncode == 2
+    assert "for --scenes: 2 scenes are too few" in said(small)
+    assert "take 6" in said(small)
     quick = ["--quick", "--scenes", 1, "--frames", 6, "--only", "one_by_one", "--only", "group_testing"]
     asked = robosac("compare", "--detector", "my_detector:build", "--out", "out", *quick)
     assert asked.returncode == 2
-    assert "occupancy-max is not calibrated" in " ".join(asked.stderr.replace("│", "").split())
+    assert "for --only: group_testing: the detector occupancy-max is not calibrated" in said(asked)
+    short = ["--setting", "honest:0", "--scenes", 1, "--frames", 6, "--live"]
+    rest = robosac("compare", "--detector", "my_detector:build", "--data", "my_data:Road", "--out", "out", *short)
+    assert rest.returncode == 0, rest.stderr
+    assert "Left out: group_testing: the detector occupancy-max is not calibrated" in " ".join(rest.stdout.split())
     shifted = robosac("fleet", "--detector", "my_detector:build", "--data", "my_data:Road", "--attack", "shift")
-    assert shifted.returncode == 1
-    assert "The fleet stopped: shift cannot attack the detector occupancy-max" in " ".join(shifted.stdout.split())
+    assert shifted.returncode == 2
+    assert "for --detector: shift cannot attack the detector occupancy-max" in said(shifted)
     many = robosac("evaluate", "--data", "my_data:Road", "--scenes", 1, "--collaborators", 3)
-    assert "no 3 of 3 teammates can be free of 1 attackers" in " ".join(many.stderr.replace("│", "").split())
+    assert "no 3 of 3 teammates can be free of 1 attackers" in said(many)
     assert not (own / "x.json").exists()

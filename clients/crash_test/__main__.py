@@ -19,6 +19,7 @@ from clients import trial
 from clients.crash_test.rounds import Incident, Kill, Rounds, possible
 from clients.load_test import prepare
 
+REPORT = "crash_test.json"
 PREPARED_FRAMES = 4
 
 
@@ -48,6 +49,7 @@ def main(
     ] = None,
     database_url: Annotated[str | None, typer.Option(help="By default SQLite in a temporary folder.")] = None,
     out: trial.Out = None,
+    force: trial.Force = False,
 ) -> None:
     """Kill gateways under load again and again, and check that nothing acknowledged is lost.
 
@@ -55,7 +57,7 @@ def main(
     """
     torch.set_num_threads(1)
     console = Console()
-    trial.make_folder(out, "--out")
+    trial.make_folder(out, "--out", REPORT, force)
     with tempfile.TemporaryDirectory(prefix="robosac-") as folder:
         url = database_url or f"sqlite:///{folder}/robosac.db"
         if not set(incidents or ()) <= set(possible(url)):
@@ -65,7 +67,7 @@ def main(
         done = trial.run(_run(rounds, incidents or possible(url), kills, sessions, console), console, "The crash test")
     show(console, sessions, done)
     report = {"seed": seed, "sessions": sessions, "kills": [asdict(kill) for kill in done]}
-    trial.write(report, out, "crash_test.json", console)
+    trial.write(report, out, REPORT, console)
     if any(kill.wrong for kill in done):
         sys.exit(1)
 

@@ -97,11 +97,7 @@ def calibrate(
     robosac.calibration.fit.TooFewVerdicts
         If the scenes do not show all that is needed.
     """
-    chosen = {name: attacks.load(name) for name in recipe.attacks}
-    faults = {name: fault for name, attack in chosen.items() if (fault := attacks.lacking(attack, detector))}
-    if faults:
-        others = ", ".join(name for name in chosen if name not in faults) or "none"
-        raise ValueError(f"{'; '.join(faults.values())}. It can be calibrated with the others: {others}")
+    chosen = load_attacks(detector, recipe.attacks)
     scenes = _scenes(recipe)
     levels: list[EvidenceModel] = []
     reliability: dict[float, list[ReliabilityBin]] = {}
@@ -128,6 +124,22 @@ def calibrate(
     }
     info = detector.info
     return Calibration(info.name, info.weights_digest, made_by, tuple(levels)), reliability
+
+
+def load_attacks(detector: Detector, names: Sequence[str]) -> dict[str, Attack]:
+    """Attacks to calibrate a detector with, by the names of a recipe.
+
+    Raises
+    ------
+    ValueError
+        If there is no such attack, or the detector lacks what one needs; the message says which others are possible.
+    """
+    chosen = {name: attacks.load(name) for name in names}
+    faults = {name: fault for name, attack in chosen.items() if (fault := attacks.lacking(attack, detector))}
+    if faults:
+        others = ", ".join(name for name in chosen if name not in faults) or "none"
+        raise ValueError(f"{'; '.join(faults.values())}. It can be calibrated with the others: {others}")
+    return chosen
 
 
 def _scenes(recipe: Recipe) -> list[Scene]:

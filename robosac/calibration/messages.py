@@ -5,6 +5,7 @@ from __future__ import annotations
 import json
 from collections.abc import Callable, Iterable, Mapping
 from pathlib import Path
+from typing import Any
 
 import numpy as np
 
@@ -12,6 +13,7 @@ from robosac.boxes import FloatArray
 from robosac.defenses.group_testing import CalibrationError
 from robosac.detectors import Encoder
 from robosac.detectors.base import for_role
+from robosac.files import write_text
 from robosac.scenes import Scene
 from robosac.screening import Bounds
 from robosac.screening.fingerprints import fingerprints, likeness
@@ -62,8 +64,8 @@ def measure(
     return {name: Bounds(round(largest[name], 4), round(rms[name], 4), round(greatest, 5)) for name in largest}
 
 
-def add(path: Path, weights_digest: str, bounds: Mapping[str, Bounds], command: str) -> None:
-    """Put what was measured into a calibration file; the rest of it stays as it is.
+def held(path: Path, weights_digest: str) -> dict[str, Any]:
+    """What a calibration file holds.
 
     Raises
     ------
@@ -71,12 +73,24 @@ def add(path: Path, weights_digest: str, bounds: Mapping[str, Bounds], command: 
         If the file cannot be read, is no calibration, or belongs to other weights.
     """
     try:
-        content = json.loads(path.read_text())
+        content: dict[str, Any] = json.loads(path.read_text())
         belongs_to = content["weights_digest"]
     except (OSError, KeyError, TypeError, ValueError) as error:
         raise CalibrationError(f"{path} is no calibration: {error}") from error
     if belongs_to != weights_digest:
-        raise CalibrationError(f"{path} belongs to weights with the digest {belongs_to:.12}..., calibrate again")
+        raise CalibrationError(f"{path} belongs to weights with the digest {belongs_to!s:.12}..., calibrate again")
+    return content
+
+
+def add(path: Path, weights_digest: str, bounds: Mapping[str, Bounds], command: str) -> None:
+    """Put what was measured into a calibration file; the rest of it stays as it is.
+
+    Raises
+    ------
+    CalibrationError
+        As `held`.
+    """
+    content = held(path, weights_digest)
     content["messages"] = {name: each.as_json() for name, each in bounds.items()}
     content["messages_command"] = command
-    path.write_text(json.dumps(content) + "\n")
+    write_text(path, json.dumps(content) + "\n")

@@ -15,7 +15,9 @@ from robosac import detectors, wire
 from robosac.audit import Receipts, digest, misbehaviour, verification
 from robosac.audit.receipts import by_id
 from robosac.cli.blame import blaming
+from robosac.cli.outputs import Force, check_file
 from robosac.detectors.base import split_precision
+from robosac.files import write_text
 
 app = typer.Typer(no_args_is_help=True, add_completion=False, help=__doc__)
 
@@ -111,8 +113,11 @@ def report(
     file: Log,
     vehicle: Annotated[str, typer.Option(help="Whom to report.")],
     out: Annotated[Path | None, typer.Option(help="Where to write it; by default to standard output.")] = None,
+    force: Force = False,
 ) -> None:
     """Write what a log says against a vehicle, in the terms of ETSI TS 103 759; 1 if it says nothing or is broken."""
+    if out is not None:
+        check_file(out, "--out", force)
     with blaming("FILE", OSError), file.open("rb") as lines:
         findings = verification.verify(lines)
     if findings:
@@ -129,7 +134,7 @@ def report(
         typer.echo(text, nl=False)
         return
     with blaming("--out", OSError):
-        out.write_text(text)
+        write_text(out, text)
     _say(f"{out}: {len(fields['report']['content']['v2xPduEvidence'])} observations of {vehicle}")
 
 

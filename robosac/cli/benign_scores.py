@@ -10,10 +10,12 @@ import torch
 import typer
 from rich.console import Console
 
-from robosac.cli.blame import blaming, make_folder
+from robosac.cli.blame import blaming
 from robosac.cli.options import DataName, DetectorName, load_data, load_detector, progress
+from robosac.cli.outputs import Force, check_file
 from robosac.detectors import DEFAULT_DETECTOR
 from robosac.evaluation.benign_scores import single_teammate_indices
+from robosac.files import write_text
 from robosac.scenes import DEFAULT_DATA, first_scenes
 
 DIGITS = 3
@@ -24,17 +26,16 @@ def run(
     scenes: Annotated[int, typer.Option(min=1, help="Validation scenes.")] = 60,
     detector: DetectorName = DEFAULT_DETECTOR,
     data: DataName = DEFAULT_DATA,
+    force: Force = False,
 ) -> None:
     """Measure the Jaccard indices of honest single teammates: the calibration of the defence `conformal`."""
     torch.set_num_threads(1)
     console = Console()
+    check_file(out, "--out", force)
     chosen, source = load_detector(detector), load_data(data)
-    make_folder(out.parent, "--out")
-    with blaming("--out", OSError):
-        out.touch()
     with blaming("--data", ValueError), progress(console) as bar:
         wanted = first_scenes(source, "validation", scenes)
         task = bar.add_task("scenes", total=scenes)
         indices = single_teammate_indices(chosen, wanted, lambda: bar.advance(task))
-    out.write_text(json.dumps([round(index, DIGITS) for index in indices]) + "\n")
+    write_text(out, json.dumps([round(index, DIGITS) for index in indices]) + "\n")
     console.print(f"{out}: {len(indices)} Jaccard indices")

@@ -1,10 +1,9 @@
-"""What is wrong with an option is said in a line, before work begins."""
+"""What is wrong with an option is said in a line, before work begins; what fails afterwards is said in a line, too."""
 
 from __future__ import annotations
 
 from collections.abc import Collection, Iterator
 from contextlib import contextmanager
-from pathlib import Path
 
 import typer
 
@@ -18,10 +17,14 @@ def blaming(option: str, *errors: type[Exception]) -> Iterator[None]:
         raise typer.BadParameter(str(error), param_hint=option) from error
 
 
-def make_folder(path: Path, option: str) -> None:
-    """Make an output folder."""
-    with blaming(option, OSError):
-        path.mkdir(parents=True, exist_ok=True)
+@contextmanager
+def failing(*errors: type[Exception]) -> Iterator[None]:
+    """End the command with 1 and a line that says what went wrong, if one of these errors comes up in its work."""
+    try:
+        yield
+    except errors as error:
+        typer.secho(f"Error: {error}", fg="red", err=True)
+        raise typer.Exit(1) from error
 
 
 def check_known(names: Collection[str], known: Collection[str], option: str) -> None:

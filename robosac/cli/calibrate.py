@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from collections.abc import Sequence
 from pathlib import Path
 from typing import Annotated
 
@@ -11,11 +12,17 @@ from rich.console import Console
 from rich.table import Table
 
 from robosac.attacks import ATTACKS
-from robosac.calibration import Recipe, ReliabilityBin, calibrate
-from robosac.calibration.messages import add, measure
-from robosac.cli.options import DataName, DetectorName, Seed, command, load_detector, progress
-from robosac.detectors import DEFAULT_DETECTOR, Detector
-from robosac.scenes import DEFAULT_DATA, SOURCES, first_scenes
+from robosac.calibration import Recipe, ReliabilityBin, TooFewVerdicts, calibrate
+from robosac.calibration.making import load_attacks
+from robosac.calibration.messages import add, held, measure
+from robosac.cli.blame import blaming, failing
+from robosac.cli.options import DataName, DetectorName, Seed, command, load_data, load_detector, progress
+from robosac.cli.outputs import Force, check_file
+from robosac.defenses.group_testing import CalibrationError
+from robosac.detectors import DEFAULT_DETECTOR, Detector, Encoder
+from robosac.files import replacing
+from robosac.plugins import lacks
+from robosac.scenes import DEFAULT_DATA, Scene, SceneError, first_scenes
 
 _DEFAULTS = Recipe()
 
@@ -47,6 +54,7 @@ def run(  # the options of a command line
         bool,
         typer.Option("--messages-only", help="Measure only what honest messages hold, and put that into FILE."),
     ] = False,
+    force: Force = False,
 ) -> None:
     """Observe what tests show when it is known who attacks, write the likelihoods, and check them.
 
@@ -55,11 +63,21 @@ def run(  # the options of a command line
     """
     torch.set_num_threads(1)
     console = Console()
-    chosen = load_detector(detector)
+    if not messages_only:
+        check_file(out, "--out", force)
+    chosen, source = load_detector(detector), load_data(data)
+    if missing := lacks(chosen, Encoder if messages_only else Detector):
+        why = f"{chosen.info.name} cannot be calibrated: it {missing}"
+        raise typer.BadParameter(why, param_hint="--detector")
+    with blaming("--data", SceneError):
+        honest = first_scenes(source, "validation", scenes)
     if messages_only:
-        _measure_messages(chosen, data, scenes, out, command(context), console)
+        with blaming("--out", CalibrationError):
+            held(out, chosen.info.weights_digest)
+        with failing(OSError, ValueError):
+            _measure_messages(chosen, honest, out, command(context), console)
         return
-    try:
+    with blaming("--attackers", ValueError):
         recipe = Recipe(
             attacks=tuple(attack or _DEFAULTS.attacks),
             attackers=tuple(attackers or _DEFAULTS.attackers),
@@ -70,14 +88,15 @@ def run(  # the options of a command line
             seed=seed,
             data=data,
         )
+    with blaming("--attack", ValueError):
+        load_attacks(chosen, recipe.attacks)
+    too_few = blaming("--scenes", TooFewVerdicts)
+    with failing(OSError, ValueError), too_few, blaming("--data", SceneError), replacing(out) as beside:
         with progress(console) as bar:
             task = bar.add_task("frames", total=recipe.frames_per_level * len(recipe.pose_errors_m))
             calibration, reliability = calibrate(chosen, recipe, command(context), lambda: bar.advance(task))
-        calibration.write(out)
-        _measure_messages(chosen, data, scenes, out, command(context), console)
-    except (OSError, ValueError) as error:
-        console.print(f"[red]{error}[/red]")
-        raise typer.Exit(1) from error
+        calibration.write(beside)
+        _measure_messages(chosen, honest, beside, command(context), console)
     for error_m, bins in reliability.items():
         _print(console, error_m, bins)
     console.print(f"{out}: {calibration.detector}, weights {calibration.weights_digest:.12}...")
@@ -85,17 +104,12 @@ def run(  # the options of a command line
         console.print("Single objects can be judged, too, once robosac witness has made NAME.witness.safetensors.")
 
 
-def _measure_messages(detector: Detector, data: str, scenes: int, out: Path, made_by: str, console: Console) -> None:
+def _measure_messages(detector: Encoder, scenes: Sequence[Scene], out: Path, made_by: str, console: Console) -> None:
     """Add what honest messages hold to the calibration in a file."""
-    try:
-        chosen = first_scenes(SOURCES.make(data), "validation", scenes)
-        with progress(console) as bar:
-            task = bar.add_task("messages", total=scenes)
-            measured = measure(detector, chosen, tick=lambda: bar.advance(task))
-        add(out, detector.info.weights_digest, measured, made_by)
-    except (OSError, ValueError) as error:
-        console.print(f"[red]{error}[/red]")
-        raise typer.Exit(1) from error
+    with progress(console) as bar:
+        task = bar.add_task("messages", total=len(scenes))
+        measured = measure(detector, scenes, tick=lambda: bar.advance(task))
+    add(out, detector.info.weights_digest, measured, made_by)
     for name, bounds in measured.items():
         console.print(
             f"{name}: at most {bounds.largest:g}, root mean square {bounds.rms:g}; "

@@ -6,6 +6,7 @@ Other packages add commands by the entry point group ``robosac.commands``, so th
 from __future__ import annotations
 
 import ast
+from collections.abc import Sequence
 from importlib.metadata import entry_points
 from importlib.util import find_spec
 from pathlib import Path
@@ -89,8 +90,20 @@ class Commands(TyperGroup):
         return name, None if name is None else load(name, self._places[name]), rest
 
     def invoke(self, ctx: Any) -> Any:
+        words = [*ctx._protected_args, *ctx.args]
         try:
             return super().invoke(ctx)
+        except typer.BadParameter as refused:
+            refused.param_hint = _as_typed(refused, words)
+            raise
         except MissingExtra as missing:
             typer.echo(f"Error: {missing}", err=True)
             raise typer.Exit(1) from missing
+
+
+def _as_typed(refused: Any, words: Sequence[str]) -> Any:
+    """The option that an error is about, by that of its names which the user wrote."""
+    options: list[Any] = refused.ctx.command.params if refused.ctx else []
+    names: list[str] = next((option.opts for option in options if refused.param_hint in option.opts), [])
+    written = [name for name in names for word in words if word.partition("=")[0] == name]
+    return written[0] if written else refused.param_hint

@@ -15,8 +15,9 @@ from rich.console import Console
 
 from robosac import defenses
 from robosac.attacks import lacking, load_campaign
-from robosac.cli.blame import blaming, check_known, make_folder
+from robosac.cli.blame import blaming, check_known
 from robosac.cli.options import DataName, DetectorName, Seed, command, load_data, load_detector, progress
+from robosac.cli.outputs import Force, make_folder
 from robosac.defenses import Defense
 from robosac.detectors import DEFAULT_DETECTOR, Detector
 from robosac.evaluation.comparison import (
@@ -32,7 +33,9 @@ from robosac.evaluation.comparison import (
     write_comparison,
     write_worlds,
 )
+from robosac.evaluation.comparison.report import REPORT
 from robosac.evaluation.comparison.rows import EARLY
+from robosac.evaluation.comparison.worlds import WORLDS_REPORT
 from robosac.figures import need_figures
 from robosac.scenes import DEFAULT_DATA, SOURCES, WORLDS, SceneError, SceneSource, World
 
@@ -77,6 +80,7 @@ def run(  # the options of a command line
             "one's own, module:callable; may be repeated.",
         ),
     ] = None,
+    force: Force = False,
 ) -> None:
     """Play every defence against every attack on the same test sequences, and write tables and pictures."""
     if live and recordings is not None:
@@ -85,12 +89,13 @@ def run(  # the options of a command line
     extent = _extent(QUICK if quick else FULL, setting or (), scenes, frames)
     torch.set_num_threads(1)
     console = Console()
-    make_folder(out, "--out")
-    if recordings is not None:
-        make_folder(recordings, "--recordings")
     if world and data != DEFAULT_DATA:
         raise typer.BadParameter("--world says where scenes come from; --data does, too", param_hint="--world")
     chosen, sources = load_detector(detector), _worlds(world) if world else {"": load_data(data)}
+    reports = [str(Path(name, REPORT)) for name in sources] + ([WORLDS_REPORT] if world else [])
+    make_folder(out, "--out", force, *reports)
+    if recordings is not None:
+        make_folder(recordings, "--recordings")
     columns, left_out = _defenses(only or (), defense or (), chosen)
     possible, impossible = _possible(extent, chosen, asked=bool(setting))
     for why in (*left_out, *impossible):
@@ -122,7 +127,6 @@ def _worlds(names: Sequence[str]) -> dict[str, SceneSource]:
 def _write(rows: Mapping[str, Sequence[Row]], plans: Mapping[str, Plan], out: Path, line: str) -> Path:
     """The report of each world in its folder, and that of all; without worlds the only one there is."""
     for name, plan in plans.items():
-        (out / name).mkdir(parents=True, exist_ok=True)
         path = write_comparison(rows[name], plan, out / name, line)
     return path if "" in plans else write_worlds(rows, plans, out, line)
 
@@ -149,10 +153,11 @@ def _defenses(only: Sequence[str], own: Sequence[str], detector: Detector) -> tu
                 raise ValueError(f"{name} ships and has its column: see --only")
             chosen[name] = defenses.load(name)
         made, left_out = built(chosen, detector)
-        reasons = [f"{name}: {why}" for name, why in left_out.items()]
-        if not left_out.keys().isdisjoint((*only, *own)):
-            raise ValueError("; ".join(reasons))
-        return made, reasons
+    reasons = [f"{name}: {why}" for name, why in left_out.items()]
+    for option, asked in (("--only", only), ("--defense", own)):
+        if not left_out.keys().isdisjoint(asked):
+            raise typer.BadParameter("; ".join(reasons), param_hint=option)
+    return made, reasons
 
 
 def _extent(extent: Extent, settings: list[str] | tuple[()], scenes: int | None, frames: int | None) -> Extent:

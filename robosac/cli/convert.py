@@ -11,6 +11,7 @@ import torch
 import typer
 
 from robosac.cli.blame import blaming, check_known
+from robosac.cli.outputs import Force, check_file
 from robosac.detectors.v2xsim.detector import FUSIONS, write_weights
 from robosac.detectors.weights_file import WeightsError
 
@@ -19,9 +20,11 @@ def run(
     checkpoint: Annotated[Path, typer.Argument(help="A published checkpoint (.pth).")],
     out: Annotated[Path, typer.Argument(help="The weights file to write (.safetensors).")],
     fusion: Annotated[str, typer.Option(help=f"One of {', '.join(FUSIONS)}.")] = "mean",
+    force: Force = False,
 ) -> None:
     """Convert a published V2X-Sim checkpoint into a weights file. Nothing in the checkpoint is executed."""
     check_known([fusion], FUSIONS, "--fusion")
+    check_file(out, "OUT", force)
     with blaming("CHECKPOINT", WeightsError), blaming("OUT", OSError):
         recipe = write_weights(read_state(checkpoint), fusion, out)
     typer.echo(f"{out}: {recipe['detector']}, {out.stat().st_size / 1e6:.1f} MB")

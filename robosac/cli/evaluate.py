@@ -15,14 +15,17 @@ from rich.table import Table
 
 from robosac import attacks
 from robosac.attacks import CAMPAIGN_HELP
-from robosac.cli.blame import blaming, make_folder
+from robosac.cli.blame import blaming
 from robosac.cli.options import DataName, DetectorName, Seed, check_attack, load_data, load_detector, progress
+from robosac.cli.outputs import Force, make_folder
 from robosac.detectors import DEFAULT_DETECTOR
 from robosac.evaluation import BoundsReport, NoFrames, Sampling, evaluate_bounds
 from robosac.evaluation.frames import evaluation_frames
+from robosac.files import write_text
 from robosac.scenes import DEFAULT_DATA, SceneError
 
 DEFAULT_SCENES = 40
+REPORT = "bounds.json"
 
 
 def run(  # the options of a command line
@@ -34,13 +37,14 @@ def run(  # the options of a command line
     seed: Seed = 0,
     detector: DetectorName = DEFAULT_DETECTOR,
     data: DataName = DEFAULT_DATA,
-    out: Annotated[Path | None, typer.Option(help="Folder for bounds.json.")] = None,
+    out: Annotated[Path | None, typer.Option(help=f"Folder for {REPORT}.")] = None,
+    force: Force = False,
 ) -> None:
     """Average precision of Algorithm 1 between its bounds, and the error rates of the consensus test."""
     torch.set_num_threads(1)
     console = Console()
     if out is not None:
-        make_folder(out, "--out")
+        make_folder(out, "--out", force, REPORT)
     with blaming("--attack", ValueError):
         chosen_attack = attacks.load_campaign(attack)
     chosen, source = load_detector(detector), load_data(data)
@@ -72,8 +76,8 @@ def run(  # the options of a command line
             "data": data,
         }
         text = json.dumps({"settings": settings, **asdict(report)}, indent=2, allow_nan=False)
-        (out / "bounds.json").write_text(text + "\n")
-        console.print(f"Written: {out / 'bounds.json'}")
+        write_text(out / REPORT, text + "\n")
+        console.print(f"Written: {out / REPORT}")
 
 
 def _print(console: Console, report: BoundsReport, attack: str, attackers: int) -> None:

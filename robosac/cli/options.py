@@ -60,6 +60,8 @@ def command(context: typer.Context) -> str:
     words = ["robosac", str(context.info_name)]
     options: list[Any] = context.command.params
     for option in options:
+        if option.name == "force":  # it makes no difference to what comes of it
+            continue
         value = context.params[option.name]
         if value is True:
             words.append(option.opts[0])

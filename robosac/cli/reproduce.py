@@ -11,14 +11,17 @@ import torch
 import typer
 from rich.console import Console
 
-from robosac.cli.blame import blaming, check_known, make_folder
+from robosac.cli.blame import blaming, check_known
 from robosac.cli.options import DataName, DetectorName, Seed, command, load_data, load_detector, progress
+from robosac.cli.outputs import Force, make_folder
 from robosac.detectors import DEFAULT_DETECTOR, EmbeddedDetector
 from robosac.detectors.embedded import ADVERSARIAL_WEIGHTS
 from robosac.evaluation.experiments import EXPERIMENTS, FULL, HEAD, QUICK, Context
 from robosac.evaluation.report import Section, write_report
 from robosac.figures import need_figures
 from robosac.scenes import DEFAULT_DATA, SceneError
+
+REPORT = "report.md"
 
 
 def run(  # the options of a command line
@@ -29,13 +32,14 @@ def run(  # the options of a command line
     seed: Seed = 0,
     detector: DetectorName = DEFAULT_DETECTOR,
     data: DataName = DEFAULT_DATA,
+    force: Force = False,
 ) -> None:
     """Run the paper's experiments and write a report with the paper's numbers beside ours."""
     check_known(only or (), EXPERIMENTS, "--only")
     need_figures()
     torch.set_num_threads(1)
     console = Console()
-    make_folder(out, "--out")
+    make_folder(out, "--out", force, REPORT)
     chosen, source = load_detector(detector), load_data(data)
     hardened = EmbeddedDetector(ADVERSARIAL_WEIGHTS) if detector == DEFAULT_DETECTOR else None
     started = time.monotonic()
@@ -61,5 +65,5 @@ def run(  # the options of a command line
             bar.advance(overall)
     minutes = (time.monotonic() - started) / 60
     head = HEAD.format(command=command(context), minutes=max(minutes, 1.0))
-    path = write_report(out / "report.md", head, sections)
+    path = write_report(out / REPORT, head, sections)
     console.print(f"{path}: {len(sections)} experiments in {minutes:.1f} minutes")

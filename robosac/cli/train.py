@@ -12,10 +12,11 @@ import typer
 from rich.console import Console
 from rich.progress import TaskID, TextColumn
 
-from robosac.cli.blame import check_known
+from robosac.cli.blame import check_known, failing
 from robosac.cli.options import progress
+from robosac.cli.outputs import Force, make_folder
 from robosac.detectors.embedded import ADVERSARIAL_WEIGHTS, SHIPPED_WEIGHTS
-from robosac.detectors.weights_file import WeightsError, read_weights
+from robosac.detectors.weights_file import read_weights
 from robosac.training.adversary import AdversaryConfig
 from robosac.training.export import export_weights, shipped_tensors
 from robosac.training.loop import TrainingConfig, train_network
@@ -33,6 +34,7 @@ def run(
     scenes: Annotated[int, typer.Option(min=1, help="Training scenes, five frames each.")] = _DEFAULTS.scenes,
     adversarial: Annotated[str | None, typer.Option(help="pgd: go on from the shipped weights, under attack.")] = None,
     threads: Annotated[int, typer.Option(min=1, help="CPU threads.")] = 1,
+    force: Force = False,
 ) -> None:
     """Train the embedded detector on generated scenes. Checkpoints come every 50 steps; the same command goes on
     from there.
@@ -40,15 +42,14 @@ def run(
     check_known([adversarial or "pgd"], ["pgd"], "--adversarial")
     torch.set_num_threads(threads)
     console = Console()
+    plan = (_plain if adversarial is None else _hardened)(seed, steps, scenes)
+    make_folder(out, "--out", force, plan.weights)
     try:
-        out.mkdir(parents=True, exist_ok=True)
-        _train(console, out, (_plain if adversarial is None else _hardened)(seed, steps, scenes))
+        with failing(OSError, ValueError):
+            _train(console, out, plan)
     except KeyboardInterrupt:
         console.print("Stopped. The same command goes on from the latest checkpoint, if there is one yet.")
         raise typer.Exit(130) from None
-    except (OSError, ValueError, WeightsError) as error:
-        console.print(f"[red]{error}[/red]")
-        raise typer.Exit(1) from error
 
 
 @dataclass(frozen=True)

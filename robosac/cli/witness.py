@@ -13,11 +13,13 @@ from rich.table import Table
 
 from robosac.calibration.witness import WitnessRecipe, lessons, train, training_scenes, usual_size
 from robosac.calibration.witness_check import check
+from robosac.cli.blame import blaming, failing
 from robosac.cli.options import DetectorName, Seed, command, load_data, load_detector, progress
+from robosac.cli.outputs import Force, check_file
 from robosac.detectors import DEFAULT_DETECTOR, Encoder
 from robosac.detectors.witness import Layout
 from robosac.plugins import lacks
-from robosac.scenes import DATA_HELP
+from robosac.scenes import DATA_HELP, SceneError
 
 _DEFAULTS = WitnessRecipe()
 
@@ -37,6 +39,7 @@ def run(  # the options of a command line
     frames: Annotated[int, typer.Option(min=1, help="Frames of each, 1 s apart.")] = _DEFAULTS.frames_per_scene,
     epochs: Annotated[int, typer.Option(min=1, help="Times that each message is read.")] = _DEFAULTS.epochs,
     seed: Seed = _DEFAULTS.seed,
+    force: Force = False,
 ) -> None:
     """Train a small network that reads one message alone and says for every place what is there.
 
@@ -45,13 +48,16 @@ def run(  # the options of a command line
     """
     torch.set_num_threads(1)
     console = Console()
+    check_file(out, "--out", force)
     chosen = load_detector(detector)
     recipe = WitnessRecipe(tuple(data or _DEFAULTS.data), scenes, frames, check_scenes, epochs, seed=seed)
     sources = [load_data(name) for name in recipe.data]
     if missing := lacks(chosen, Encoder):
-        raise typer.BadParameter(f"a witness needs a detector that encodes scans: {chosen.info.name} {missing}")
-    try:
+        why = f"a witness needs a detector that encodes scans: {chosen.info.name} {missing}"
+        raise typer.BadParameter(why, param_hint="--detector")
+    with blaming("--data", SceneError):
         found = [training_scenes(source, scenes + check_scenes) for source in sources]
+    with failing(OSError, ValueError), blaming("--data", SceneError):
         layout = Layout.of(chosen.info, usual_size(chosen, found[0][0]))
         with progress(console) as bar:
             task = bar.add_task("frames", total=recipe.frames)
@@ -66,9 +72,6 @@ def run(  # the options of a command line
             )
         figures = check(witness, held_out)
         witness.write(out, chosen.info, {"command": command(context), **asdict(recipe), "check": asdict(figures)})
-    except (OSError, ValueError) as error:
-        console.print(f"[red]{error}[/red]")
-        raise typer.Exit(1) from error
     table = Table(title=f"{figures.places} places of scenes held out", title_justify="left", show_header=False)
     for name, value in list(asdict(figures).items())[1:]:
         table.add_row(name.replace("_m", ", metres").replace("_", " "), f"{value:.4f}")

@@ -6,6 +6,7 @@ that ``opens`` weights files lists the detectors that they are for, and is then 
 
 from __future__ import annotations
 
+import os
 from pathlib import Path
 
 from robosac.detectors.base import Detector, Precise, Preparer, split_precision
@@ -43,12 +44,13 @@ def load(detector: str = DEFAULT_DETECTOR) -> Detector:
         If there is no such detector, it lacks what a gateway needs, or it cannot decode in that precision.
     """
     plain, precision = split_precision(detector)
-    if plain != detector and not Path(detector).exists():
+    there = os.path.exists(detector)  # noqa: PTH110 (Path raises for a long name)
+    if plain != detector and not there:
         loaded = load(plain)
         if not isinstance(loaded, Precise):
             raise ValueError(f"{plain} cannot decode in {precision}: it has no method in_precision")
         return loaded.in_precision(precision)
-    if detector not in DETECTORS.shipped and Path(detector).exists():
+    if detector not in DETECTORS.shipped and there:
         return _open_weights(Path(detector))
     return DETECTORS.make(detector)
 

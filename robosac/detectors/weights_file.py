@@ -12,6 +12,8 @@ import torch
 from safetensors import safe_open
 from safetensors.torch import save_file
 
+from robosac.files import replacing
+
 
 class WeightsError(ValueError):
     """A weights file is missing, damaged or not one of this detector."""
@@ -59,7 +61,7 @@ def save_weights(tensors: dict[str, torch.Tensor], recipe: Mapping[str, Any], pa
         The recipe as it is in the file: with the digest of the tensors.
     """
     signed = {**recipe, "tensors_sha256": tensors_digest(tensors)}
-    path.parent.mkdir(parents=True, exist_ok=True)
-    save_file(tensors, path, metadata={"robosac": json.dumps(signed)})
-    path.chmod(0o644)  # safetensors writes for the owner alone
+    with replacing(path) as beside:
+        save_file(tensors, beside, metadata={"robosac": json.dumps(signed)})
+        beside.chmod(0o644)  # safetensors writes for the owner alone
     return signed

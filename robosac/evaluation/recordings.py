@@ -4,7 +4,6 @@ from __future__ import annotations
 
 import hashlib
 import json
-import os
 import re
 from collections.abc import Callable, Iterator, Mapping, Sequence
 from dataclasses import dataclass, field
@@ -20,6 +19,7 @@ from robosac.defenses import EGO
 from robosac.detectors import Detector, Message
 from robosac.evaluation.encounters import NOBODY_ACTS, Act, Encounters
 from robosac.evaluation.frames import DecodedOnce, EvaluationFrame, Subset
+from robosac.files import replacing
 from robosac.scenes import DEFAULT_DATA
 
 FORMAT = 2
@@ -118,18 +118,17 @@ def save(path: Path, frames: Mapping[int, DecodedOnce], whole: bool) -> None:
         if whole or name in frame.attackers
         for tensor, values in message.tensors.items()
     }
-    partial = path.with_name(f"{path.stem}.{os.getpid()}.npz")
-    np.savez_compressed(
-        partial,
-        head=np.array(json.dumps(head)),
-        pose=np.stack([f.ego.pose for _, f in ordered]),
-        truth=np.concatenate([f.truth for _, f in ordered]),
-        truths=np.array([len(f.truth) for _, f in ordered]),
-        boxes=np.concatenate(boxes).astype(np.float32),
-        counts=np.array([len(each) for each in boxes]),
-        **tensors,
-    )
-    partial.replace(path)
+    with replacing(path) as beside:
+        np.savez_compressed(
+            beside,
+            head=np.array(json.dumps(head)),
+            pose=np.stack([f.ego.pose for _, f in ordered]),
+            truth=np.concatenate([f.truth for _, f in ordered]),
+            truths=np.array([len(f.truth) for _, f in ordered]),
+            boxes=np.concatenate(boxes).astype(np.float32),
+            counts=np.array([len(each) for each in boxes]),
+            **tensors,
+        )
 
 
 def load(

@@ -8,6 +8,8 @@ from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
 
+from robosac.files import replacing, write_text
+
 
 @dataclass(frozen=True)
 class Table:
@@ -50,7 +52,7 @@ def write_report(path: Path, head: str, sections: Iterable[Section]) -> Path:
                 parts.append(f"{table.caption} ([{table.name}.csv]({table.name}.csv)):\n")
             parts.append(markdown(table) + "\n")
         parts += [f"![{section.title}]({picture})\n" for picture in section.pictures]
-    path.write_text("\n".join(parts))
+    write_text(path, "\n".join(parts))
     return path
 
 
@@ -63,7 +65,7 @@ def markdown(table: Table) -> str:
 
 def write_csv(path: Path, table: Table) -> None:
     """Write a table as a CSV file; None is an empty cell."""
-    with path.open("w", newline="") as file:
+    with replacing(path) as beside, beside.open("w", newline="") as file:
         writer = csv.writer(file)
         writer.writerow(table.columns)
         writer.writerows(table.rows)

@@ -10,7 +10,7 @@ import numpy as np
 
 from robosac.answers import FrameAnswer, Standing
 from robosac.boxes import FloatArray, corners, from_world
-from robosac.figures import new_figure
+from robosac.figures import new_figure, save_figure
 
 if TYPE_CHECKING:
     from matplotlib.axes import Axes
@@ -112,6 +112,5 @@ def draw_view(frame: SceneFrame, agent: str, path: Path, title: str = "") -> tup
         axes.plot(places[:, 0], places[:, 1], "s", color="#762a83", markersize=6, linestyle="none", label="teammate")
     heading = f"{title}frame {frame.index}, {agent}: {len(seen)} vehicles seen, {len(hidden)} hidden"
     frame_axes(axes, heading, viewer=agent)
-    path.parent.mkdir(parents=True, exist_ok=True)
-    figure.savefig(path, dpi=110)
+    save_figure(figure, path, dpi=110)
     return len(seen), len(hidden)

@@ -15,6 +15,7 @@ from robosac.boxes import FloatArray
 from robosac.detectors.network import MeanFusionNetwork
 from robosac.detectors.voxels import AREA_M
 from robosac.detectors.warp import sampling_matrix, warp
+from robosac.files import replacing
 from robosac.scenes.splits import TRAINING_SEEDS
 from robosac.training.adversary import AdversaryConfig, add_adversary
 from robosac.training.data import TrainingFrame, generate
@@ -148,9 +149,8 @@ def _fuse(
 
 def _save(checkpoint: Path, config: TrainingConfig, parts: dict[str, Any], step: int) -> None:
     state = {name: part.state_dict() for name, part in parts.items()}
-    temporary = checkpoint.with_suffix(".part")
-    torch.save({**state, "config": asdict(config), "step": step}, temporary)
-    temporary.replace(checkpoint)
+    with replacing(checkpoint) as beside:
+        torch.save({**state, "config": asdict(config), "step": step}, beside)
 
 
 def _resume(checkpoint: Path, config: TrainingConfig, parts: dict[str, Any]) -> int:

@@ -25,6 +25,7 @@ FILES = {
         "class Wall:\n    name = 'wall'\n"
         "class Derived(Sized):\n    pass\n"
         "def fail(): raise KeyError('two\\nlines')\n"
+        "def leave(): raise SystemExit(3)\n"
     ),
 }
 
@@ -97,11 +98,12 @@ def test_an_argument_follows_the_name_where_the_kind_takes_one():
     ("text", "complaint"),
     [
         ("nonesuch", "no shape 'nonesuch': give one of sized, square, wall, or module:callable$"),
-        ("wall", r"wall made no shape but <house.* which lacks area \(Square metres.\)$"),
+        ("wall", r"wall made no shape but a house.others.Wall, which lacks area \(Square metres.\)$"),
         ("house.others:Wall", r"others:Wall made no shape but .* which lacks area"),
         ("house.others:fail", r"^house.others:fail: KeyError: 'two\\nlines'$"),
         ("house.others:nothing", "no attribute 'nothing'"),
         ("elsewhere:shape", "ModuleNotFoundError: No module named 'elsewhere'"),
+        ("house.others:leave", "^house.others:leave: SystemExit: 3$"),
     ],
 )
 def test_what_cannot_be_had_is_explained_in_a_line(text, complaint):

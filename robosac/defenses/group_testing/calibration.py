@@ -12,6 +12,7 @@ import numpy as np
 
 from robosac.boxes import FloatArray
 from robosac.defenses.group_testing.model import CalibrationError, EvidenceModel
+from robosac.files import write_text
 
 FORMAT = 3
 
@@ -61,7 +62,7 @@ class Calibration:
                 for level in self.levels
             ],
         }
-        path.write_text(json.dumps(content) + "\n")
+        write_text(path, json.dumps(content) + "\n")
 
     @classmethod
     def read(cls, path: Path) -> Calibration:

@@ -10,7 +10,7 @@ import numpy as np
 from robosac.evaluation.comparison.playing import EGO_ONLY, ORACLE
 from robosac.evaluation.comparison.rows import EARLY, Row
 from robosac.evaluation.comparison.settings import NOBODY
-from robosac.figures import new_figure
+from robosac.figures import new_figure, save_figure
 
 
 def draw_precision(rows: Sequence[Row], path: Path) -> None:
@@ -31,7 +31,7 @@ def draw_precision(rows: Sequence[Row], path: Path) -> None:
     axes.set_yticks(range(len(settings)), [setting.label for setting in settings], fontsize=8)
     axes.set_title("AP at IoU 0.7; colour: lost against the oracle", fontsize=9)
     figure.colorbar(image, ax=axes)
-    figure.savefig(path, dpi=110)
+    save_figure(figure, path, dpi=110)
 
 
 def draw_passes(rows: Sequence[Row], path: Path) -> None:
@@ -50,4 +50,4 @@ def draw_passes(rows: Sequence[Row], path: Path) -> None:
     axes.set_xlabel(f"fused passes a frame, after the first {EARLY}")
     axes.set_ylabel("AP at IoU 0.7, mean over the attacks")
     axes.grid(alpha=0.3)
-    figure.savefig(path, dpi=110)
+    save_figure(figure, path, dpi=110)

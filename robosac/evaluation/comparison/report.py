@@ -27,6 +27,7 @@ frame. Passes are fused ones; that of the ego alone comes on top. Standard error
 jackknife; those of differences and ratios to the oracle take both on the same sequences. All figures are in
 `comparison.csv`.
 """
+REPORT = "comparison.md"
 PRECISION, PASSES = "precision.png", "passes.png"
 ESTIMATES = ("ap50", "ap70", "ap50_difference", "ap70_difference", "ap70_ratio")
 OVERALL = ("passes_first", "passes_early", "passes_steady", "honest_refused", "milliseconds")
@@ -57,7 +58,7 @@ def write_comparison(rows: Sequence[Row], plan: Plan, out: Path, command: str) -
         ego=" or ".join(egos),
         poses=f", teammates wrong about their positions by {plan.pose_error_m:g} m" if plan.pose_error_m else "",
     )
-    return write_report(out / "comparison.md", head, sections(rows, PRECISION, PASSES))
+    return write_report(out / REPORT, head, sections(rows, PRECISION, PASSES))
 
 
 def _flat(row: Row) -> dict[str, object]:

@@ -19,6 +19,7 @@ sequences, by the jackknife. *Named* counts honest teammates that were ever name
 in which this happened. Passes are fused ones, in the first frames and later. All figures are in `worlds.csv`; each
 world has its own report in the folder of its name.
 """
+WORLDS_REPORT = "worlds.md"
 UNDEFENDED = next(name for name, settings in DEFENSES.items() if settings.kind == "none")
 
 
@@ -49,7 +50,7 @@ def write_worlds(rows: Mapping[str, Sequence[Row]], plans: Mapping[str, Plan], o
         for setting in extent.settings
     ]
     head = HEAD.format(command=command, scenes=extent.scenes, frames=extent.frames)
-    return write_report(out / "worlds.md", head, sections)
+    return write_report(out / WORLDS_REPORT, head, sections)
 
 
 _Line = tuple[str, Row, Row, Row | None, Row]

@@ -16,7 +16,7 @@ from robosac.evaluation.experiments import paper
 from robosac.evaluation.experiments.common import TEAM_SIZE, Context, precision
 from robosac.evaluation.frames import DecodedOnce
 from robosac.evaluation.report import Section, Table
-from robosac.figures import new_figure
+from robosac.figures import new_figure, save_figure
 from robosac.fusion import fuse
 from robosac.scenes.drawing import FOUND_COLOUR, TRUE_COLOUR, draw_boxes, frame_axes
 
@@ -140,7 +140,7 @@ def trade_off(context: Context) -> Section:
     axes.axhline(_undefended(frames)[0], color="#b2182b", linestyle=":", label="no defence")
     axes.set(xlabel="decoder passes a frame (the ego's own included)", ylabel="AP at IoU 0.5")
     axes.legend(fontsize="small")
-    figure.savefig(context.out / "trade_off.png", dpi=100)
+    save_figure(figure, context.out / "trade_off.png", dpi=100)
     return Section(
         "Performance over computation",
         "Each curve is one hypothesis size with N = 1, 2, 3, 5, 7, 10.",
@@ -166,7 +166,7 @@ def qualitative(context: Context) -> Section:
         draw_boxes(axes, frame.truth, TRUE_COLOUR, "true", dashed=True, width=1.0)
         draw_boxes(axes, at_least(boxes, SHOWN_SCORE), FOUND_COLOUR, f"found, score from {SHOWN_SCORE}")
         frame_axes(axes, title)
-    figure.savefig(context.out / "qualitative.png", dpi=80)
+    save_figure(figure, context.out / "qualitative.png", dpi=80)
     return Section("A frame", "The test frame in which the attack did most.", [], ["qualitative.png"])
 
 

@@ -13,7 +13,7 @@ from robosac.evaluation.experiments.common import TEAM_SIZE, Context
 from robosac.evaluation.frames import DecodedOnce
 from robosac.evaluation.oracle import converse_with_oracle, simulate_sampling
 from robosac.evaluation.report import Section, Table
-from robosac.figures import new_figure
+from robosac.figures import new_figure, save_figure
 from robosac.session import Session
 
 MOST_STEPS = 500
@@ -90,7 +90,7 @@ def numerical(context: Context) -> Section:
     left.set(xlabel="sampling budget N", ylabel="collaborators s", title="Eq. 1")
     right.set(xlabel="collaborators s", ylabel="sampling budget N", title="Eq. 2", yscale="log")
     left.legend(fontsize="small")
-    figure.savefig(context.out / "numerical.png", dpi=100)
+    save_figure(figure, context.out / "numerical.png", dpi=100)
     rows = [
         ("Eq. 1: s at N = 5, eta = 0.1", 4, eq1_collaborators(5, 0.1)),
         ("Eq. 2: N at s = 5, eta = 0.2", 12, eq2_budget(5, 0.2)),

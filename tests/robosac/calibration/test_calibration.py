@@ -183,7 +183,7 @@ def test_the_command_writes_a_calibration(tmp_path):
 
 def test_the_command_names_an_unknown_attack(tmp_path):
     result = CliRunner().invoke(app, ["calibrate", "--out", str(tmp_path / "x.json"), "--attack", "nonesuch"])
-    assert result.exit_code == 1
+    assert result.exit_code == 2
     assert "no attack 'nonesuch'" in " ".join(result.output.split())
 
 

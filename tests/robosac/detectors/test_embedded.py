@@ -39,7 +39,7 @@ def test_what_is_only_served_needs_to_prepare_frames_and_no_more(detector, monke
     served = SimpleNamespace(info=detector.info, prepare=detector.prepare)
     monkeypatch.setitem(sys.modules, "own", SimpleNamespace(whole=lambda: served, bare=object))
     assert load("own:whole") is served
-    with pytest.raises(ValueError, match=r"own:bare made no detector but <.*lacks info \(Name.* prepare \(Do"):
+    with pytest.raises(ValueError, match=r"own:bare made no detector but a .*, which lacks info \(Name.* prepare \(Do"):
         load("own:bare")
 
 

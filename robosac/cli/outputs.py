@@ -1,0 +1,42 @@
+"""Where a command may write. No command overwrites what is there unless it is told to, and it says so before its work.
+
+Of a folder of reports the page or summary counts: a folder without one may hold anything else, such as what a run that
+was interrupted has left.
+"""
+
+from __future__ import annotations
+
+import os
+from pathlib import Path
+from typing import Annotated
+
+import typer
+
+from robosac.cli.blame import blaming
+from robosac.files import is_special
+
+Force = Annotated[bool, typer.Option("--force", help="Overwrite what an earlier run has written.")]
+
+
+def check_file(path: Path, option: str, force: bool) -> None:
+    """Refuse a file that is there already or could not be written; the folder for it is made."""
+    _refuse_existing(path, option, force)
+    with blaming(option, OSError):
+        if path.is_dir():
+            raise IsADirectoryError(f"{path} is a folder")
+        make_folder(path.parent, option)
+
+
+def make_folder(path: Path, option: str, force: bool = False, *reports: str) -> None:
+    """Make a folder for reports; refuse one that holds any of these already, or that cannot be written to."""
+    for report in reports:
+        _refuse_existing(path / report, option, force)
+    with blaming(option, OSError):
+        path.mkdir(parents=True, exist_ok=True)
+        if not os.access(path, os.W_OK | os.X_OK):
+            raise PermissionError(f"{path} cannot be written to")
+
+
+def _refuse_existing(path: Path, option: str, force: bool) -> None:
+    if not force and os.path.lexists(path) and not path.is_dir() and not is_special(path):
+        raise typer.BadParameter(f"{path} is there already; --force overwrites it", param_hint=option)

@@ -1,0 +1,117 @@
+"""No command overwrites what is there unless it is told to, and says so before it works."""
+
+import json
+
+import pytest
+import typer
+from typer.testing import CliRunner
+
+from robosac.cli import app, commands
+
+runner = CliRunner()
+WRITTEN = {
+    "scene": ("--out", "x.png"),
+    "train": ("--out", "intersection-mean.safetensors"),
+    "evaluate": ("--out", "bounds.json"),
+    "benign-scores": ("--out", "x.json"),
+    "reproduce": ("--out", "report.md"),
+    "compare": ("--out", "comparison.md"),
+    "calibrate": ("--out", "x.json"),
+    "witness": ("--out", "x.safetensors"),
+    "convert-checkpoint": ("OUT", "x.safetensors"),
+    "audit report": ("--out", "x.json"),
+    "demo": ("--report", "summary.json"),
+    "fleet": ("--report", "summary.json"),
+    "load-test": ("--out", "load_test.json"),
+    "overload": ("--out", "overload.json"),
+    "flood": ("--out", "flood.json"),
+    "adversary": ("--out", "adversary.json"),
+    "crash-test": ("--out", "crash_test.json"),
+}
+"""By command: what its user names, and what it would write there."""
+FOLDERS = ("train", "evaluate", "reproduce", "compare", *list(WRITTEN)[10:])
+ARGUMENTS = {"audit report": ["pyproject.toml", "--vehicle", "car-2"]}
+
+
+def every_command():
+    """All commands by what a user types, those inside another one too."""
+    for name, place in commands.places().items():
+        command = commands.load(name, place)
+        inner = getattr(command, "commands", {})
+        yield from ((f"{name} {each}", inner[each]) for each in inner) if inner else [(name, command)]
+
+
+def test_every_command_that_writes_can_be_forced():
+    writing = {
+        name
+        for name, command in every_command()
+        if any(parameter.name in ("out", "report") for parameter in command.params)
+    }
+    forced = {name for name, command in every_command() if any(p.name == "force" for p in command.params)}
+    assert writing == forced == set(WRITTEN)
+
+
+@pytest.mark.parametrize("name", WRITTEN)
+def test_a_command_refuses_to_overwrite_before_it_works(name, tmp_path):
+    option, file = WRITTEN[name]
+    there = tmp_path / file
+    there.write_text("made in hours")
+    place = str(tmp_path if name in FOLDERS else there)
+    where = ["/nowhere.pth", place] if option == "OUT" else [*ARGUMENTS.get(name, []), option, place]
+    result = runner.invoke(app, [*name.split(), *where], env={"COLUMNS": "400"})
+    assert result.exit_code == 2, result.output
+    assert f"Invalid value for {option}: {there} is there already; --force overwrites it" in result.output
+    assert there.read_text() == "made in hours"
+    assert list(tmp_path.iterdir()) == [there]
+
+
+def test_a_command_overwrites_if_it_is_told_to(tmp_path):
+    (tmp_path / "bounds.json").write_text("old")
+    short = ["evaluate", "--scenes", "1", "--frames", "1", "--out", str(tmp_path), "--force"]
+    result = runner.invoke(app, short)
+    assert result.exit_code == 0, result.output
+    assert json.loads((tmp_path / "bounds.json").read_text())["frames"] == 1
+    assert [path.name for path in tmp_path.iterdir()] == ["bounds.json"]
+
+
+@pytest.mark.parametrize(
+    ("name", "place"), [("scene", "file/x.png"), ("scene", "folder"), ("compare", "file"), ("calibrate", "folder")]
+)
+def test_a_place_that_cannot_be_written_to_is_refused_before_the_work(name, place, tmp_path):
+    (tmp_path / "file").write_text("")
+    (tmp_path / "folder").mkdir()
+    result = runner.invoke(app, [name, "--out", str(tmp_path / place), "--force"], env={"COLUMNS": "400"})
+    assert result.exit_code == 2
+    assert "Invalid value for --out" in result.output
+
+
+def test_a_folder_with_the_rest_of_an_interrupted_run_is_taken(tmp_path):
+    (tmp_path / "precision.png").write_text("")
+    arguments = ["compare", "--only", "no defence", "--setting", "honest:0", "--scenes", "1", "--frames", "6", "--live"]
+    result = runner.invoke(app, [*arguments, "--out", str(tmp_path)])
+    assert result.exit_code == 0, result.output
+    again = runner.invoke(app, [*arguments, "--out", str(tmp_path)])
+    assert again.exit_code == 2
+    assert "--force" not in (tmp_path / "comparison.md").read_text()
+
+
+def test_what_is_wrong_with_an_option_is_said_under_the_name_that_was_typed():
+    for option in ("--detector", "--weights"):
+        for words in ([option, "nonesuch"], [f"{option}=nonesuch"]):
+            result = runner.invoke(app, ["evaluate", *words], env={"COLUMNS": "400"})
+            assert result.exit_code == 2
+            assert f"Invalid value for {option}: no detector 'nonesuch'" in result.output
+
+
+def test_work_that_fails_ends_with_a_line():
+    from robosac.cli.blame import failing
+
+    own = typer.Typer()
+
+    @own.command()
+    def run() -> None:
+        with failing(OSError):
+            raise OSError("the disk is full")
+
+    result = runner.invoke(own, [])
+    assert (result.exit_code, result.output) == (1, "Error: the disk is full\n")
