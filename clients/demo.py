@@ -44,8 +44,7 @@ async def _run(report: Path, scenes: int, frames: int, console: Console) -> tupl
         console.print(
             f"It is ready at {url}. Six vehicles, one of them a PGD attacker, post at 5 Hz of simulated time."
         )
-        defense = {"kind": "group_testing", "pose_error_m": 0.0}
-        options = FleetOptions(url=url, scenes=scenes, frames=frames, defense=defense, report=report)
+        options = FleetOptions(url=url, scenes=scenes, frames=frames, report=report)
         return options, await run_fleet(options, console)
 
 

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import json
 from collections import Counter
+from collections.abc import Mapping
 from dataclasses import dataclass, field
 from pathlib import Path
 from typing import Any
@@ -63,6 +64,8 @@ class FleetSummary:
     attacked_from: dict[Met, int] = field(default_factory=dict)
     named_in: dict[Met, int] = field(default_factory=dict)
     names: bool = False
+    defense: Mapping[str, Any] | None = None
+    """As the gateway took it on."""
     lies: Lies = field(default_factory=Lies)
     standings: Standings = field(default_factory=Standings)
     example: Example | None = None
@@ -134,6 +137,7 @@ class FleetSummary:
         """Plain values for JSON."""
         return {
             "frames": self.frames,
+            "defense": self.defense,
             "average_precision": {name: {"ap50": ap.at(0.5), "ap70": ap.at(0.7)} for name, ap in self.ap.items()},
             "clean_share": self.clean_share,
             "answers_with_attacker": self.with_attacker,
@@ -169,6 +173,9 @@ class FleetSummary:
             if tally:
                 table.add_row(role, *(str(tally[column]) for column in ("accepted", *reasons)))
         console.print(table)
+        if self.defense is not None:
+            chosen = ", ".join(f"{name} {value}" for name, value in self.defense.items() if name != "kind")
+            console.print(f"Defence: {self.defense['kind']}; {chosen}.")
         latency, steps = values["latency_ms"], values["sampling_steps"]
         sources = ", ".join(f"{count} {source.replace('_', ' ')}" for source, count in self.sources.most_common())
         console.print(

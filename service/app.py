@@ -8,6 +8,7 @@ tune_process()  # before anything imports torch
 
 import asyncio  # noqa: E402
 import contextlib  # noqa: E402
+import sys  # noqa: E402
 import time  # noqa: E402
 from collections.abc import AsyncIterator, Callable  # noqa: E402
 from importlib.metadata import version  # noqa: E402
@@ -39,10 +40,11 @@ from service.sessions.possession import Possession  # noqa: E402
 from service.sessions.room import Room  # noqa: E402
 from service.sessions.sessions import Sessions  # noqa: E402
 from service.sessions.teams import Teams  # noqa: E402
-from service.settings import Settings, SettingsError, settings_of_environment  # noqa: E402
-from service.watching.logs import logging_to_stderr  # noqa: E402
+from service.settings import Settings, settings_of_environment  # noqa: E402
+from service.watching.logs import log_as_the_gateway, logging_to_stderr  # noqa: E402
 from service.watching.metrics import Metrics  # noqa: E402
 from service.watching.stalls import LoopWatch  # noqa: E402
+from service.watching.starting import Starting, blamed_on  # noqa: E402
 from service.watching.tracing import Traced, Tracing, provider_from_environment  # noqa: E402
 
 if TYPE_CHECKING:
@@ -77,6 +79,7 @@ def create_app(
     tracing = Tracing(provider_from_environment() if spans is None else spans)
     gateway = _built(settings, ApiKeys(keys), tokens, seeds, tracing)
     secrets = [*keys, *(secret.get_secret_value() for secret in settings.token_secrets)]
+    log_as_the_gateway(settings, secrets)
 
     @contextlib.asynccontextmanager
     async def lifespan(_: FastAPI) -> AsyncIterator[None]:
@@ -105,6 +108,7 @@ def create_app(
     app.add_middleware(Traced, tracing=tracing)
     app.add_middleware(Door, check=check_head)
     app.add_middleware(Arrival, watch=gateway.watch)
+    app.add_middleware(Starting)
     app.include_router(v1)
     app.include_router(operations)
     return app
@@ -142,7 +146,10 @@ async def _running(gateway: Gateway, settings: Settings, tokens: Tokens, tracing
     """Start what a gateway needs, and stop it after the block or when the start fails."""
     store, engine = gateway.store, gateway.engine
     try:
-        await asyncio.gather(store.start(), engine.start())
+        await asyncio.gather(
+            blamed_on("ROBOSAC_DATABASE_URL", store.start()),
+            blamed_on("ROBOSAC_EXTRA_DETECTORS", engine.start()),
+        )
         await tokens.start(store)
         await gateway.keys.start(store)
         gateway.metrics.sessions.set(await store.count())
@@ -167,5 +174,8 @@ async def _running(gateway: Gateway, settings: Settings, tokens: Tokens, tracing
 
 try:
     app = create_app()
-except (MissingExtra, SettingsError) as wrong:
-    raise SystemExit(f"Error: {wrong}") from wrong
+except MissingExtra as missing:
+    raise SystemExit(f"Error: {missing}") from missing
+except ValueError as fault:  # a setting, named in the message
+    print(f"Error: {fault}", file=sys.stderr)
+    raise SystemExit(2) from fault

@@ -59,7 +59,10 @@ class Sessions:
     def __post_init__(self) -> None:
         self._live: dict[str, LiveSession] = {}
         self._standing: set[str] = set()
-        self.defenses = known(self.settings.extra_defenses)
+        try:
+            self.defenses = known(self.settings.extra_defenses)
+        except ValueError as fault:
+            raise ValueError(f"ROBOSAC_EXTRA_DEFENSES: {fault}") from fault
         self.backlog = Room(self.settings.max_pending_bytes, name="ROBOSAC_MAX_PENDING_BYTES")
         self.journal = Journal(self.store, self.metrics)
 

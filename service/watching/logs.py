@@ -57,24 +57,20 @@ class _Stderr(logging.StreamHandler):  # type: ignore[type-arg]
         return sys.stderr
 
 
+def log_as_the_gateway(settings: Settings, secrets: Sequence[str] = ()) -> None:
+    """Let a server that logs already do so as the gateway does: it has lines of its own before the start and after the
+    end of `logging_to_stderr`.
+    """
+    handler = _handler(settings, secrets)
+    for logger in map(logging.getLogger, _SERVER):
+        if logger.handlers:
+            logger.handlers = [handler]
+
+
 @contextmanager
 def logging_to_stderr(settings: Settings, secrets: Sequence[str] = ()) -> Iterator[None]:
     """Write the gateway's and the server's events to standard error for the length of a block, but no such secret."""
-    renderer: structlog.types.Processor = (
-        structlog.processors.JSONRenderer() if settings.log_format == "json" else structlog.dev.ConsoleRenderer()
-    )
-    handler = _Stderr()
-    handler.setFormatter(
-        structlog.stdlib.ProcessorFormatter(
-            foreign_pre_chain=[*_SHARED, _message_in_short],
-            processors=[
-                structlog.stdlib.ProcessorFormatter.remove_processors_meta,
-                structlog.processors.ExceptionRenderer(_traceback),
-                _Bounded(secrets),
-                renderer,
-            ],
-        )
-    )
+    handler = _handler(settings, secrets)
     loggers = [logging.getLogger(name) for name in (*_OWN, *_RUNTIME, *_SERVER)]
     before = [(logger, list(logger.handlers), logger.level, logger.propagate) for logger in loggers]
     for logger in loggers:
@@ -92,6 +88,25 @@ def logging_to_stderr(settings: Settings, secrets: Sequence[str] = ()) -> Iterat
             logger.handlers = handlers
             logger.setLevel(level)
             logger.propagate = propagate
+
+
+def _handler(settings: Settings, secrets: Sequence[str]) -> logging.Handler:
+    renderer: structlog.types.Processor = (
+        structlog.processors.JSONRenderer() if settings.log_format == "json" else structlog.dev.ConsoleRenderer()
+    )
+    handler = _Stderr()
+    handler.setFormatter(
+        structlog.stdlib.ProcessorFormatter(
+            foreign_pre_chain=[*_SHARED, _message_in_short],
+            processors=[
+                structlog.stdlib.ProcessorFormatter.remove_processors_meta,
+                structlog.processors.ExceptionRenderer(_traceback),
+                _Bounded(secrets),
+                renderer,
+            ],
+        )
+    )
+    return handler
 
 
 class _Bounded:

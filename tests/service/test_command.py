@@ -1,3 +1,4 @@
+import json
 import os
 import re
 import signal
@@ -7,13 +8,15 @@ import sys
 import time
 
 import httpx
+import pytest
 
 from service.arriving.connections import HEAD_BYTES
 
+PROGRAM = "import typer; from service.command import main; typer.run(main)"
+
 
 def test_serve_runs_the_gateway_where_it_is_told_until_it_is_terminated(tmp_path):
-    program = "import typer; from service.command import main; typer.run(main)"
-    command = [sys.executable, "-c", program, "--host", "127.0.0.2", "--port", "0"]
+    command = [sys.executable, "-c", PROGRAM, "--host", "127.0.0.2", "--port", "0"]
     environment = os.environ | {"ROBOSAC_DATABASE_URL": f"sqlite:///{tmp_path}/robosac.db"}
     with (tmp_path / "log").open("wb") as log:
         process = subprocess.Popen(command, env=environment, stdout=log, stderr=log)
@@ -32,4 +35,24 @@ def test_serve_runs_the_gateway_where_it_is_told_until_it_is_terminated(tmp_path
     finally:
         process.send_signal(signal.SIGTERM)
         assert process.wait(30) in (0, -signal.SIGTERM)
-    assert "gateway stopped" in (tmp_path / "log").read_text()
+    events = [json.loads(line)["event"] for line in (tmp_path / "log").read_text().splitlines()]
+    assert "gateway stopped" in events
+    assert events[0].startswith("Started server process")
+    assert events[-1].startswith("Finished server process")
+
+
+@pytest.mark.parametrize(
+    ("variable", "value", "complaint"),
+    [
+        ("ROBOSAC_LATENCY_BUDGET_MS", "soon", "Error: ROBOSAC_LATENCY_BUDGET_MS: Input should be a valid number, "),
+        ("ROBOSAC_EXTRA_DETECTORS", "nonesuch:build", "ROBOSAC_EXTRA_DETECTORS: nonesuch:build: ModuleNotFoundError"),
+    ],
+)
+def test_a_wrong_setting_ends_it_in_a_line_with_status_2(variable, value, complaint):
+    environment = os.environ | {"ROBOSAC_DATABASE_URL": "sqlite://", variable: value}
+    command = [sys.executable, "-c", PROGRAM, "--port", "0"]
+    ended = subprocess.run(command, env=environment, capture_output=True, text=True, timeout=60, check=False)
+    assert ended.returncode == 2
+    assert ended.stderr.count(complaint) == 1
+    assert "Traceback" not in ended.stderr
+    assert all(line.startswith(("{", "Error: ")) for line in ended.stderr.splitlines())

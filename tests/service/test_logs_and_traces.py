@@ -228,6 +228,9 @@ def test_a_running_gateway_writes_no_more_either(tmp_path):
         process.terminate()
         process.wait(30)
     text = (tmp_path / "log").read_text()
+    events = [json.loads(line)["event"] for line in text.splitlines()]  # the server's, too, from the first to the last
+    assert events[0].startswith("Started server process")
+    assert events[-1].startswith("Finished server process")
     assert "RuntimeError: broken" in text
     assert "Exception in ASGI application" in text
     assert len(text.encode()) - before < LOG_BYTES

@@ -111,9 +111,9 @@ def test_every_variable_that_the_project_speaks_of_is_known():
     assert others <= set(OTHERS)
 
 
-def test_a_gateway_with_a_misspelt_variable_does_not_start(environment):
+def test_a_gateway_with_a_misspelt_variable_does_not_start(environment, capsys):
     environment(ROBOSAC_MAX_SESION="5")
     with pytest.raises(SystemExit) as ended:
         runpy.run_path(str(ROOT / "service" / "app.py"))
     told = "Error: ROBOSAC_MAX_SESION: there is no such setting; do you mean ROBOSAC_MAX_SESSIONS?"
-    assert ended.value.code == told
+    assert (ended.value.code, capsys.readouterr().err) == (2, f"{told}\n")

@@ -1,0 +1,47 @@
+"""What keeps a gateway from starting, told in one line that names the setting."""
+
+from __future__ import annotations
+
+import sys
+from collections.abc import Awaitable
+
+from starlette.types import ASGIApp, Message, Receive, Scope, Send
+
+from robosac.faults import describe
+from service.errors import StoreUnavailable
+
+
+async def blamed_on(variable: str, starting: Awaitable[None]) -> None:
+    """Wait for a part of the gateway to start.
+
+    Raises
+    ------
+    ValueError
+        If it cannot, with the variable that is to blame.
+    """
+    try:
+        await starting
+    except ValueError as fault:
+        raise ValueError(f"{variable}: {fault}") from fault
+    except StoreUnavailable as fault:
+        cause = fault.__cause__ or fault
+        raise ValueError(f"{variable}: {describe(getattr(cause, 'orig', None) or cause)}") from fault
+
+
+class Starting:
+    """Middleware that lets a server tell a wrong setting in one line, where the framework hands it a traceback.
+
+    Any other fault keeps its traceback, as it is not the operator's.
+    """
+
+    def __init__(self, app: ASGIApp) -> None:
+        self._app = app
+
+    async def __call__(self, scope: Scope, receive: Receive, send: Send) -> None:
+        async def tell(message: Message) -> None:
+            fault = sys.exception()  # the framework is handling it while it sends this
+            if message["type"] == "lifespan.startup.failed" and isinstance(fault, ValueError):
+                message = {**message, "message": str(fault)}
+            await send(message)
+
+        await self._app(scope, receive, tell if scope["type"] == "lifespan" else send)

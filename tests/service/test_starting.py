@@ -1,0 +1,73 @@
+import pytest
+
+from service.app import create_app
+from service.settings import Settings
+from service.watching.starting import Starting
+
+
+async def started(app):
+    """What a server is told when it starts an app that cannot."""
+    told = []
+
+    async def receive():
+        return {"type": "lifespan.startup"}
+
+    async def send(message):
+        told.append(message)
+
+    with pytest.raises((ValueError, ZeroDivisionError)) as raised:
+        await app({"type": "lifespan", "asgi": {}, "state": {}}, receive, send)
+    (message,) = told
+    assert message["type"] == "lifespan.startup.failed"
+    return message["message"], raised.value
+
+
+@pytest.mark.parametrize(
+    ("settings", "complaint"),
+    [
+        ({"extra_detectors": "nonesuch:build"}, "ROBOSAC_EXTRA_DETECTORS: nonesuch:build: ModuleNotFoundError: No "),
+        ({"extra_detectors": "pyproject.toml"}, "ROBOSAC_EXTRA_DETECTORS: pyproject.toml is not a readable "),
+        ({"detector": "nonesuch"}, "ROBOSAC_DETECTOR: unknown detector 'nonesuch'"),
+        ({"database_url": "sqlite:////nowhere/x.db"}, "ROBOSAC_DATABASE_URL: OperationalError: unable to open "),
+        ({"gateway_key_file": "/nowhere/key"}, "ROBOSAC_GATEWAY_KEY_FILE: /nowhere/key cannot be read: "),
+    ],
+)
+async def test_a_setting_that_keeps_the_gateway_from_starting_is_named_in_a_line(settings, complaint):
+    told, _ = await started(create_app(Settings(**{"database_url": "sqlite://", **settings})))
+    assert told.startswith(complaint)
+    assert "\n" not in told
+
+
+async def test_a_fault_that_is_no_setting_keeps_its_traceback():
+    app = create_app(Settings(database_url="sqlite://", extra_detectors="tests.service.test_starting:Fragile"))
+    told, raised = await started(app)
+    assert isinstance(raised, ZeroDivisionError)
+    assert told.startswith("Traceback")
+
+
+class Fragile:
+    """A detector that cannot be warmed up."""
+
+    @property
+    def info(self):
+        from robosac.detectors import EmbeddedDetector
+
+        return EmbeddedDetector().info
+
+    def prepare(self, ego, teammates):
+        return 1 / 0
+
+
+async def test_requests_pass():
+    passed = []
+
+    async def app(scope, receive, send):
+        passed.append((scope, receive, send))
+
+    await Starting(app)({"type": "http"}, "receive", "send")
+    assert passed == [({"type": "http"}, "receive", "send")]
+
+
+def test_a_defence_that_cannot_be_had_is_blamed_on_its_variable():
+    with pytest.raises(ValueError, match=r"^ROBOSAC_EXTRA_DEFENSES: nonesuch:build: ModuleNotFoundError"):
+        create_app(Settings(database_url="sqlite://", extra_defenses="nonesuch:build"))
