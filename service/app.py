@@ -27,6 +27,7 @@ from service.arriving.limits import BodyLimit  # noqa: E402
 from service.deciding.admission import Admission  # noqa: E402
 from service.deciding.answering import Deciding  # noqa: E402
 from service.deciding.keeping import Keeping  # noqa: E402
+from service.description import TAGS  # noqa: E402
 from service.engine import Engine  # noqa: E402
 from service.gateway import Gateway  # noqa: E402
 from service.keeping.gateway_keys import GatewayKeys  # noqa: E402
@@ -96,6 +97,7 @@ def create_app(
         version=version("robosac"),
         lifespan=lifespan,
         redirect_slashes=False,
+        openapi_tags=TAGS,
     )
     app.state.gateway = gateway
     problems.install(app)

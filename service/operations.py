@@ -4,22 +4,25 @@ from __future__ import annotations
 
 from fastapi import APIRouter, Response
 
+from service import description
 from service.callers import GatewayDep
 from service.errors import Kind, Refused
 from service.keeping.patience import within
+from service.problems import documented
 
 STORE_PATIENCE_S = 1.0
 """How long readiness waits for the database."""
-operations = APIRouter()
+operations = APIRouter(tags=["operations"])
+_TEXT = "text/plain; version=0.0.4; charset=utf-8"
 
 
-@operations.get("/healthz")
+@operations.get("/healthz", responses=description.status("alive", "It lives."))
 async def healthz() -> dict[str, str]:
     """Whether the process lives."""
     return {"status": "alive"}
 
 
-@operations.get("/readyz")
+@operations.get("/readyz", responses={**description.status("ready", "It is ready."), **documented(503)})
 async def readyz(gateway: GatewayDep) -> dict[str, str]:
     """Whether the gateway is warm and able to serve, and its database takes changes."""
     gateway.engine.check_ready()
@@ -30,7 +33,7 @@ async def readyz(gateway: GatewayDep) -> dict[str, str]:
     return {"status": "ready"}
 
 
-@operations.get("/metrics", response_class=Response)
+@operations.get("/metrics", response_class=Response, responses=description.METRICS)
 async def metrics(gateway: GatewayDep) -> Response:
     """Counters and timings for Prometheus."""
-    return Response(gateway.metrics.render(), media_type="text/plain; version=0.0.4; charset=utf-8")
+    return Response(gateway.metrics.render(), media_type=_TEXT)

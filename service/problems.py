@@ -77,7 +77,7 @@ ANSWERS: Mapping[Kind, tuple[int, Mapping[str, str]]] = {
 
 
 def documented(*statuses: int) -> dict[int | str, dict[str, Any]]:
-    """Problem responses of a route, for its OpenAPI description."""
+    """Problem responses of a route, for its OpenAPI description, each with an example."""
     schema = {
         "type": "object",
         "required": ["type", "title", "status", "detail"],
@@ -89,10 +89,13 @@ def documented(*statuses: int) -> dict[int | str, dict[str, Any]]:
             "field": {"type": "string", "description": "The part of the request that is to blame, if one is."},
         },
     }
-    return {
-        status: {"description": HTTPStatus(status).phrase, "content": {MEDIA_TYPE: {"schema": schema}}}
-        for status in statuses
-    }
+    told: dict[int | str, dict[str, Any]] = {}
+    for status in statuses:
+        kind = next(kind for kind, (answered, _) in ANSWERS.items() if answered == status)
+        example = _fields(status, kind.value, "what was wrong, for a human")
+        content = {MEDIA_TYPE: {"schema": schema, "example": example}}
+        told[status] = {"description": HTTPStatus(status).phrase, "content": content}
+    return told
 
 
 def response(refused: Refused) -> JSONResponse:
@@ -138,12 +141,10 @@ def install(app: FastAPI) -> None:
 def _problem(
     status: int, slug: str, detail: str, field: str | None = None, headers: Mapping[str, str] | None = None
 ) -> JSONResponse:
-    body: dict[str, Any] = {
-        "type": TYPE_PREFIX + slug,
-        "title": slug.replace("-", " ").capitalize(),
-        "status": status,
-        "detail": detail,
-    }
-    if field is not None:
-        body["field"] = field
+    body = _fields(status, slug, detail) | ({} if field is None else {"field": field})
     return JSONResponse(body, status, dict(headers or {}), media_type=MEDIA_TYPE)
+
+
+def _fields(status: int, slug: str, detail: str) -> dict[str, Any]:
+    title = slug.replace("-", " ").capitalize()
+    return {"type": TYPE_PREFIX + slug, "title": title, "status": status, "detail": detail}

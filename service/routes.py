@@ -3,16 +3,16 @@
 from __future__ import annotations
 
 import re
-from typing import Annotated, Any
+from typing import Annotated
 
 from fastapi import APIRouter, Depends, Header, Path, Query, Request, Response
 from fastapi.responses import StreamingResponse
 from pydantic import BaseModel
 
 from robosac import wire
-from robosac.answers import FrameAnswer
+from service import description
 from service.arriving.arrival import arrival_of
-from service.arriving.bodies import JSON_BYTES, MSGPACK, MSGPACK_TYPES, check_type, described, read_json
+from service.arriving.bodies import JSON_BYTES, MSGPACK, MSGPACK_TYPES, check_type, read_json
 from service.arriving.limits import expected_bytes, read_bounded
 from service.callers import Ego, GatewayDep, KeyId, ProvenEgo, ProvenVehicle, Token, Vehicle
 from service.deciding.asked import Answered
@@ -48,32 +48,18 @@ async def _enrolment_request(request: Request, gateway: GatewayDep, caller: Prov
         return await read_json(request, EnrolmentRequest)
 
 
-_TENSOR_SCHEMA = {
-    "type": "string",
-    "format": "binary",
-    "description": "msgpack of {frame, vehicle_id, pose, tensors: {NAME: {dtype, shape, data}}} for a message, of "
-    "{frame, ego: {pose, tensors}, teammates: {ID: {pose, tensors}}} for a whole frame",
-}
-_TENSOR_BODY: dict[str, Any] = {"requestBody": {"required": True, "content": {MSGPACK: {"schema": _TENSOR_SCHEMA}}}}
-_EGO_PROBLEMS = documented(401, 403, 404)
-_PROVEN_PROBLEMS = documented(401, 403, 404, 429)
 _NO_STORE = {"Cache-Control": "no-store"}
 """On answers with tokens (RFC 6749, section 5.1)."""
-_JSON_PROBLEMS = (400, 408, 413, 415)
-_FRAME_RESPONSES: dict[int | str, dict[str, Any]] = {
-    **documented(400, 401, 403, 404, 408, 409, 413, 415),
-    200: {"model": FrameAnswer, "description": "The answer to the frame, as JSON or msgpack by `Accept`."},
-}
 
 
-@v1.get("/detectors")
+@v1.get("/detectors", tags=["gateway"], responses=description.DETECTORS)
 async def list_detectors(gateway: GatewayDep) -> DetectorList:
     """What each detector wants to be sent."""
     infos = [detector.info for detector in gateway.engine.detectors.values()]
     return DetectorList(detectors=[DetectorEntry.model_validate(info) for info in infos])
 
 
-@v1.get("/keys")
+@v1.get("/keys", tags=["gateway"], responses=description.KEYS)
 async def list_keys(gateway: GatewayDep) -> GatewayKeyList:
     """The gateway's public keys, with which receipts are checked."""
     keys = [GatewayKey(key_id=name, public_key=key, signs=signs) for name, key, signs in gateway.keys.published()]
@@ -83,8 +69,9 @@ async def list_keys(gateway: GatewayDep) -> GatewayKeyList:
 @v1.post(
     "/sessions",
     status_code=201,
-    openapi_extra=described(SessionRequest),
-    responses=documented(*_JSON_PROBLEMS, 401),
+    tags=["sessions"],
+    openapi_extra=description.body(SessionRequest),
+    responses=description.OPENED,
 )
 async def open_session(
     request: Annotated[SessionRequest, Depends(_session_request)],
@@ -97,19 +84,29 @@ async def open_session(
     return await gateway.opening.open(request, key_id)
 
 
-@v1.get("/sessions/{sid}", responses=_EGO_PROBLEMS)
+@v1.get("/sessions/{sid}", tags=["sessions"], responses=description.STATE)
 async def get_session(caller: Ego, gateway: GatewayDep) -> SessionState:
     """The session's settings and what its defence remembers."""
     return await gateway.sessions.describe(caller)
 
 
-@v1.delete("/sessions/{sid}", status_code=204, responses=_PROVEN_PROBLEMS)
+@v1.delete(
+    "/sessions/{sid}",
+    status_code=204,
+    tags=["sessions"],
+    responses=description.ENDED,
+)
 async def delete_session(caller: ProvenEgo, gateway: GatewayDep, response: Response) -> None:
     """End the session; its log can be read until it is purged. The header `Audit-Head` is its last record's hash."""
     response.headers["Audit-Head"] = await gateway.sessions.close(caller)
 
 
-@v1.post("/sessions/{sid}/token", status_code=201, responses=documented(401, 404, 429))
+@v1.post(
+    "/sessions/{sid}/token",
+    status_code=201,
+    tags=["sessions"],
+    responses=description.RENEWED,
+)
 async def renew_token(caller: ProvenVehicle, gateway: GatewayDep, response: Response) -> RenewedToken:
     """A fresh token for the vehicle that asks; the one it asks with is worth nothing any more."""
     response.headers.update(_NO_STORE)
@@ -119,8 +116,9 @@ async def renew_token(caller: ProvenVehicle, gateway: GatewayDep, response: Resp
 @v1.post(
     "/sessions/{sid}/teammates",
     status_code=201,
-    openapi_extra=described(EnrolmentRequest),
-    responses={**_PROVEN_PROBLEMS, **documented(*_JSON_PROBLEMS, 409)},
+    tags=["sessions"],
+    openapi_extra=description.body(EnrolmentRequest),
+    responses=description.JOINED,
 )
 async def enrol_teammates(
     request: Annotated[EnrolmentRequest, Depends(_enrolment_request)],
@@ -133,7 +131,12 @@ async def enrol_teammates(
     return await gateway.teams.enrol(caller, request.teammates, request.public_keys)
 
 
-@v1.delete("/sessions/{sid}/teammates/{vehicle_id}", status_code=204, responses=_PROVEN_PROBLEMS)
+@v1.delete(
+    "/sessions/{sid}/teammates/{vehicle_id}",
+    status_code=204,
+    tags=["sessions"],
+    responses=description.LEFT,
+)
 async def dismiss_teammate(vehicle_id: str, caller: ProvenEgo, gateway: GatewayDep) -> None:
     """Let a teammate leave from the next frame on; its token is worth nothing any more."""
     await gateway.teams.dismiss(caller, vehicle_id)
@@ -142,7 +145,8 @@ async def dismiss_teammate(vehicle_id: str, caller: ProvenEgo, gateway: GatewayD
 @v1.get(
     "/sessions/{sid}/audit",
     response_class=Response,
-    responses={**_EGO_PROBLEMS, 200: {"content": {"application/jsonl": {}}}},
+    tags=["audit"],
+    responses=description.AUDIT,
 )
 async def get_audit(
     sid: str,
@@ -153,16 +157,14 @@ async def get_audit(
 ) -> Response:
     """The audit log as JSON Lines: at most `limit` records with a number above `after`; of an ended session, too."""
     pages = await gateway.sessions.audit_log(sid, token, after, limit)
-    return StreamingResponse(pages, media_type="application/jsonl")
+    return StreamingResponse(pages, media_type=description.JSONL)
 
 
 @v1.post(
     "/sessions/{sid}/messages",
-    openapi_extra=_TENSOR_BODY,
-    responses={
-        **_FRAME_RESPONSES,
-        202: {"model": Receipt, "description": "A teammate's message is kept for its frame."},
-    },
+    tags=["frames"],
+    openapi_extra=description.MESSAGE_BODY,
+    responses=description.TAKEN,
     response_class=Response,
 )
 async def post_message(
@@ -176,7 +178,13 @@ async def post_message(
     return _negotiated(answer, accept, 202) if isinstance(answer, Receipt) else _handed_over(answer, accept, gateway)
 
 
-@v1.post("/sessions/{sid}/frames", openapi_extra=_TENSOR_BODY, responses=_FRAME_RESPONSES, response_class=Response)
+@v1.post(
+    "/sessions/{sid}/frames",
+    tags=["frames"],
+    openapi_extra=description.FRAME_BODY,
+    responses=description.DECIDED,
+    response_class=Response,
+)
 async def post_frame(
     request: Request, caller: Ego, gateway: GatewayDep, accept: Annotated[str | None, Header()] = None
 ) -> Response:
@@ -191,7 +199,8 @@ async def post_frame(
 @v1.get(
     "/sessions/{sid}/frames/{frame}/messages",
     response_class=Response,
-    responses={**_EGO_PROBLEMS, 200: {"content": {MSGPACK: {"schema": _TENSOR_SCHEMA}}}},
+    tags=["audit"],
+    responses=description.KEPT,
 )
 async def get_messages(
     caller: Ego, gateway: GatewayDep, frame: Annotated[int, Path(ge=0, le=wire.MAX_FRAME)]
