@@ -5,9 +5,10 @@ from __future__ import annotations
 import asyncio
 import time
 from collections import deque
+from collections.abc import Awaitable, Callable
 from dataclasses import dataclass, field
 from pathlib import Path
-from typing import Annotated, Any
+from typing import Annotated, Any, TypeVar
 
 import torch
 import typer
@@ -18,7 +19,7 @@ from rich.table import Table
 
 from clients import trial
 from clients.client import GatewayClient, OpenedSession, VehicleClient
-from clients.errors import FrameConflict
+from clients.errors import FrameConflict, GatewayUnavailable
 from clients.simulation import EgoFrame, Fleet
 from clients.standing import shown
 from clients.summary import REPORT, FleetSummary
@@ -32,6 +33,9 @@ from robosac.evaluation.frames import another_scene
 from robosac.scenes import DATA_HELP, DEFAULT_DATA, SOURCES, first_scenes
 
 RECENT = 12
+PATIENCE = 5
+"""How often a message is sent to a gateway that cannot serve now."""
+T = TypeVar("T")
 
 
 @dataclass(frozen=True)
@@ -129,16 +133,36 @@ class _Vehicle:
 
     async def send(self, frame: EgoFrame, index: int) -> None:
         """Send to an ego; if it did not wait so long, its answer tells who is missing."""
+        message = frame.sent[self.vehicle_id]
         try:
-            await self._at[frame.ego_id].send(index, frame.sent[self.vehicle_id])
+            await _patiently(lambda: self._at[frame.ego_id].send(index, message))
         except FrameConflict as conflict:
             if not conflict.type.endswith("stale-frame"):
                 raise
 
     async def ask(self, frame: EgoFrame, index: int) -> tuple[FrameAnswer, float]:
+        """The answer, and after how many milliseconds it came."""
         started = time.perf_counter()
-        answer = await self._at[frame.ego_id].ask(index, frame.message)
+        answer = await _patiently(lambda: self._at[frame.ego_id].ask(index, frame.message))
         return answer, (time.perf_counter() - started) * 1e3
+
+
+async def _patiently(call: Callable[[], Awaitable[T]]) -> T:
+    """Call; where the gateway cannot serve now and says when to ask again, do so: the machine may be slow for a while.
+
+    Raises
+    ------
+    GatewayError
+        As the call does, and if the gateway could not serve `PATIENCE` times.
+    """
+    for _ in range(PATIENCE - 1):
+        try:
+            return await call()
+        except GatewayUnavailable as busy:
+            if busy.retry_after_s is None:
+                raise
+            await asyncio.sleep(busy.retry_after_s)
+    return await call()
 
 
 async def run_fleet(options: FleetOptions, console: Console) -> FleetSummary:
