@@ -95,7 +95,7 @@ class Message:
     pose: FloatArray
     """(4, 4) float64: world_from_sensor."""
     tensors: Mapping[str, np.ndarray[Any, np.dtype[Any]]]
-    """By name: as the detector declares for the sender's role."""
+    """By name: as the detector declares for the sender's role. In C order, whether made here or received."""
 
 
 def for_role(message: Message, info: DetectorInfo, role: Role) -> Message:

@@ -108,7 +108,7 @@ class EmbeddedDetector(MapFusionDetector):
         """As `robosac.detectors.base.Encoder.encode`; the z of the pose is the sensor's height above ground, metres."""
         grid = torch.from_numpy(occupancy(points, float(pose[2, 3]))).float()
         with torch.inference_mode():
-            features = self._network.encode(grid[None])[0] * self._gain
+            features = (self._network.encode(grid[None])[0] * self._gain).contiguous()
         return Message(np.asarray(pose, dtype=np.float64), {FEATURES: features.numpy().astype(np.float16)})
 
     def unscaled(self, sent: torch.Tensor) -> torch.Tensor:

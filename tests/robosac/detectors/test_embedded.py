@@ -7,6 +7,7 @@ import pytest
 import torch
 from safetensors.torch import load_file, save_file
 
+from robosac import wire
 from robosac.boxes import pairwise_iou, pose_matrix
 from robosac.detectors import EmbeddedDetector, Message, WeightsError, available, load
 from robosac.detectors.base import in_precision
@@ -71,6 +72,24 @@ def test_in_bfloat16_it_sees_the_same(detector, ego_message, benign):
     overlap = pairwise_iou(sure, boxes)
     assert (overlap.max(axis=1) > 0.8).all()
     assert 0 < np.abs(boxes[overlap.argmax(axis=1), 5] - sure[:, 5]).max() < 0.05
+
+
+def test_a_message_lies_in_memory_as_one_that_was_received(detector, attacked, ego_message):
+    body = wire.read_frame(wire.pack_frame(0, ego_message, attacked))
+    received = {name: wire.check_message(each, detector.info, "teammate") for name, each in body.teammates.items()}
+    for name in ("rsu", "car-2"):  # as encoded, and as perturbed
+        here, there = attacked[name].tensors["features"], received[name].tensors["features"]
+        assert here.strides == there.strides
+        np.testing.assert_array_equal(here, there)
+
+
+def test_maps_of_any_layout_are_fused_in_one(detector, benign, ego_message):
+    """The sum of maps of unlike layouts takes many times longer."""
+    features = ego_message.tensors["features"]
+    channels_last = np.ascontiguousarray(features.transpose(1, 2, 0)).transpose(2, 0, 1)
+    for teammates in ({}, benign):
+        prepared = detector.prepare(Message(ego_message.pose, {"features": channels_last}), teammates)
+        assert {maps.stride() for maps in (prepared.own, *prepared.warped.values())} == {(1024, 32, 1)}
 
 
 def found(boxes, truth):

@@ -64,6 +64,10 @@ def test_a_message_is_what_the_detector_declares(v2xsim, ego, others):
     assert v2xsim.info.tensors["ego"]["grid"].nbytes == 256 * 256 * 13 // 8
 
 
+def test_a_message_is_in_c_order(frame):
+    assert all(tensor.flags.c_contiguous for message in frame.values() for tensor in message.tensors.values())
+
+
 def test_messages_survive_the_wire(v2xsim, ego, others):
     for role, message in (("ego", ego), ("teammate", others["car-2"])):
         envelope = read_message(pack_message(3, "car", message))
