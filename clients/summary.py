@@ -174,8 +174,9 @@ class FleetSummary:
                 table.add_row(role, *(str(tally[column]) for column in ("accepted", *reasons)))
         console.print(table)
         if self.defense is not None:
-            chosen = ", ".join(f"{name} {value}" for name, value in self.defense.items() if name != "kind")
-            console.print(f"Defence: {self.defense['kind']}; {chosen}.")
+            error_m = self.defense.get("pose_error_m")
+            expecting = "" if error_m is None else f", expecting positions to be wrong by {error_m:g} m"
+            console.print(f"Defence: {self.defense['kind']}{expecting}.")
         latency, steps = values["latency_ms"], values["sampling_steps"]
         sources = ", ".join(f"{count} {source.replace('_', ' ')}" for source, count in self.sources.most_common())
         console.print(

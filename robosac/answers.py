@@ -21,7 +21,7 @@ from pydantic import (
     field_validator,
 )
 
-from robosac.boxes import FloatArray
+from robosac.boxes import FloatArray, pose_fault, to_world
 
 
 class Verdict(StrEnum):
@@ -256,7 +256,35 @@ class FrameAnswer(Typed):
             raise ValueError(f"must be parallel to the boxes: {len(support)} for {len(boxes)}")
         return support
 
+    def boxes_in_world(self, pose: FloatArray) -> FloatArray:
+        """The boxes (n, 6) in the world's frame.
+
+        Parameters
+        ----------
+        pose : (4, 4) ndarray
+            world_from_sensor of the ego, as it sent it with the frame.
+
+        Raises
+        ------
+        ValueError
+            If that is no pose.
+        """
+        return _in_world(self.boxes, pose)
+
+    def contradicted_in_world(self, pose: FloatArray) -> FloatArray:
+        """Boxes (n, 6) that were left out as contradicted, as `boxes_in_world` gives the others; often none."""
+        return _in_world(np.array([out.box for out in self.contradicted or ()]).reshape(-1, 6), pose)
+
     @property
     def named(self) -> tuple[str, ...]:
         """Teammates that the defence names as attackers."""
         return tuple(name for name, entry in self.rejected.items() if entry.distrust is Distrust.NAMED)
+
+
+def _in_world(boxes: FloatArray, pose: FloatArray) -> FloatArray:
+    matrix = np.asarray(pose, dtype=np.float64)
+    if matrix.shape != (4, 4) or not np.isfinite(matrix).all():
+        raise ValueError(f"a pose must be 4 x 4 finite numbers, got shape {matrix.shape}")
+    if fault := pose_fault(matrix):
+        raise ValueError(f"a pose {fault}")
+    return to_world(boxes, matrix)

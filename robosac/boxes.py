@@ -69,8 +69,14 @@ def from_world(boxes: FloatArray, pose: FloatArray) -> FloatArray:
 
 
 def to_world(boxes: FloatArray, pose: FloatArray) -> FloatArray:
-    """Boxes (n, 5+) of a sensor's frame in the world frame; the inverse of `from_world`."""
-    return from_world(boxes, np.linalg.inv(pose))
+    """Boxes (n, 5+) of a sensor's frame in the world frame; the inverse of `from_world`, of a tilted sensor too."""
+    yaw = np.arctan2(pose[1, 0], pose[0, 0])
+    c, s = np.cos(yaw), np.sin(yaw)
+    moved = np.array(boxes, dtype=np.float64)
+    moved[:, 0] = c * boxes[:, 0] - s * boxes[:, 1] + pose[0, 3]
+    moved[:, 1] = s * boxes[:, 0] + c * boxes[:, 1] + pose[1, 3]
+    moved[:, 4] = np.mod(boxes[:, 4] + yaw + np.pi, 2 * np.pi) - np.pi
+    return moved
 
 
 def corners(boxes: FloatArray) -> FloatArray:

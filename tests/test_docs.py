@@ -99,9 +99,12 @@ async def test_the_programs_of_the_readme_run(tmp_path, capsys, monkeypatch):
     client, library = re.findall(r"```python\n(.*?)```", (ROOT / "README.md").read_text(), re.DOTALL)
     async with local_gateway(tmp_path / "gateway.log") as url:
         await asyncio.to_thread(exec, client.replace("http://127.0.0.1:8000", url), {"__name__": "client"})
-    answer, *events = capsys.readouterr().out.splitlines()
+    answer, best, *told = capsys.readouterr().out.splitlines()
     assert answer.startswith("consensus ('car-2', 'car-3', 'car-4', 'car-5', 'rsu') ")
-    assert events == ["1 session_opened", "2 frame_answered"]
+    assert best.startswith("the best of them, in the world: [")
+    opened, answered = told
+    assert opened.startswith("car-1 opened a session with car-2, car-3, car-4, car-5 and rsu; the detector is ")
+    assert answered.startswith("Frame 0 was answered with ")
     exec(library.replace("Session(detector, team)", "Session(detector, team, rng=np.random.default_rng(0))"), {})
     lines = capsys.readouterr().out.splitlines()
     assert len(lines) == 5

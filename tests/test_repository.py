@@ -69,3 +69,15 @@ def test_links_of_the_pages_lead_somewhere():
             if not target.exists() or (anchor and anchor not in headings.get(target, set())):
                 broken.append(f"{page.name}: {link}")
     assert not broken
+
+
+def test_the_bound_on_torch_is_explained_and_is_that_of_the_tested_version():
+    """The tests run with the version of the constraints; the next minor one is not allowed yet, and it is said why."""
+    (tested,) = re.findall(r"^torch==(\d+)\.(\d+)", (ROOT / "constraints.txt").read_text(), re.MULTILINE)
+    (bound,) = [name for name in PROJECT["dependencies"] if name.startswith("torch")]
+    assert bound.endswith(f",<{tested[0]}.{int(tested[1]) + 1}")
+    newest = ".".join(tested)
+    assert re.search(
+        rf"# {newest} is the newest .*\n.*\n *\"{re.escape(bound)}\"", (ROOT / "pyproject.toml").read_text()
+    )
+    assert f"`<{bound.rpartition('<')[2]}`, as {newest} is the newest" in README

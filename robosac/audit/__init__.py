@@ -5,6 +5,7 @@ from robosac.audit.compact import FULL_EVERY, Writer, compact
 from robosac.audit.expanding import expanded
 from robosac.audit.findings import Fault, Finding
 from robosac.audit.receipts import Receipts
+from robosac.audit.sentences import sentence
 from robosac.audit.verification import verify
 
 __all__ = [
@@ -20,5 +21,6 @@ __all__ = [
     "digest",
     "expanded",
     "seal",
+    "sentence",
     "verify",
 ]

@@ -12,7 +12,8 @@ from typing import Annotated
 import typer
 
 from robosac import detectors, wire
-from robosac.audit import Receipts, digest, misbehaviour, verification
+from robosac.audit import Receipts, digest, misbehaviour, sentence, verification
+from robosac.audit.events import RecordError, read
 from robosac.audit.receipts import by_id
 from robosac.cli.blame import blaming
 from robosac.cli.outputs import Force, check_file
@@ -62,6 +63,23 @@ def verify(
         _say(f"{file}: as {len(promised.heads)} receipts promised")
     proved = "which is the head given" if head else "to be compared with a head from elsewhere"
     _say(f"{file}: {count} records, nothing wrong; head {digest(last.decode().removesuffix(chr(10)))}, {proved}")
+
+
+@app.command()
+def show(file: Log) -> None:
+    """Tell what a log says, a sentence a record; 1 if a line is no record. It proves nothing: that is for `verify`."""
+    broken = 0
+    with blaming("FILE", OSError), file.open("rb") as lines:
+        for number, line in enumerate(lines, 1):
+            try:
+                record, told = read(line.removesuffix(b"\n")), sentence(line)
+            except RecordError as error:
+                broken += 1
+                _say(f"line {number}: {error}", err=True)
+            else:
+                _say(f"{record.get('seq', '?')} {record.get('time', '')} {told}")
+    if broken:
+        raise typer.Exit(1)
 
 
 @app.command("replay")

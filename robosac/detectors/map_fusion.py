@@ -84,7 +84,7 @@ class MapFusionDetector(ABC):
 
 
 def _sent(messages: Sequence[Message]) -> torch.Tensor:
-    """Maps (n, C, H, W) as float32 in C order, as warped ones are: to add maps of unlike layouts takes many times longer.
+    """Maps (n, C, H, W) as float32 in C order, as warped ones are: to add maps of unlike layouts takes far longer.
 
     Torch widens half floats several times faster than numpy.
     """

@@ -9,6 +9,7 @@ from pydantic import ValidationError
 from robosac import wire
 from robosac.answers import Distrust, FrameAnswer, Reason, Source, Standing, Verdict
 from robosac.audit import GENESIS, seal
+from robosac.boxes import pose_matrix
 
 FIELDS = {
     "frame": 3,
@@ -121,3 +122,22 @@ def test_a_number_that_json_does_not_have_is_not_changed_into_something_else():
     assert {name: answer.as_json()[name] for name in changed} == changed
     with pytest.raises(rfc8785.FloatDomainError):
         seal(answer.as_json(), "s", 1, GENESIS)
+
+
+def test_boxes_are_turned_into_the_world_by_the_egos_pose():
+    """The ego stands at (10, -3) and looks along +y: what it has ahead lies north of it."""
+    answer, pose = FrameAnswer.model_validate(FIELDS), pose_matrix(10.0, -3.0, 1.7, np.pi / 2)
+    np.testing.assert_allclose(answer.boxes_in_world(pose), [[7.5, -2.0, 4.0, 2.0, 0.1 + np.pi / 2, 0.9]])
+    np.testing.assert_allclose(answer.contradicted_in_world(pose)[0, :2], [7.5, 6.5])
+    np.testing.assert_array_equal(answer.boxes, FIELDS["boxes"])
+    none = FrameAnswer.model_validate(FIELDS | {"contradicted": None, "boxes": [], "support": None})
+    assert none.boxes_in_world(pose).shape == none.contradicted_in_world(pose).shape == (0, 6)
+
+
+@pytest.mark.parametrize(
+    ("pose", "complaint"),
+    [(np.eye(3), "4 x 4"), (np.full((4, 4), np.nan), "finite"), (2 * np.eye(4), "must be a rigid transform")],
+)
+def test_boxes_are_turned_by_a_pose_only(pose, complaint):
+    with pytest.raises(ValueError, match=f"a pose must be .*{complaint.removeprefix('must be ')}"):
+        FrameAnswer.model_validate(FIELDS).boxes_in_world(pose)

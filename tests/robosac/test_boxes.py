@@ -4,7 +4,7 @@ import shapely
 from hypothesis import given
 from hypothesis import strategies as st
 
-from robosac.boxes import corners, from_world, nms, pairwise_iou, pose_matrix
+from robosac.boxes import corners, from_world, nms, pairwise_iou, pose_matrix, to_world
 from tests.robosac.rectangles import from_corners
 
 coordinate = st.floats(-20, 20)
@@ -81,3 +81,12 @@ def test_nms_is_greedy(n, rng):
     boxes = np.column_stack([rng.uniform(-15, 15, (n, 2)), rng.uniform(1, 6, (n, 2)), rng.uniform(-3, 3, n)])
     scores = rng.choice([0.2, 0.5, 0.9], n)
     assert nms(boxes, scores, 0.1).tolist() == greedy_nms(boxes, scores, 0.1)
+
+
+@pytest.mark.parametrize("tilt", [0.0, 0.3])
+def test_to_world_is_the_inverse_of_from_world_whatever_the_tilt(tilt):
+    tilted = np.eye(4)
+    tilted[:3, :3] = [[np.cos(tilt), 0, np.sin(tilt)], [0, 1, 0], [-np.sin(tilt), 0, np.cos(tilt)]]
+    pose = pose_matrix(10.0, -3.0, 1.7, 2.5) @ tilted
+    boxes = np.array([[12.0, 5.0, 4.0, 2.0, 3.0, 0.9], [-7.0, 0.5, 4.0, 2.0, -1.0, 0.5]])
+    np.testing.assert_allclose(from_world(to_world(boxes, pose), pose), boxes, atol=1e-12)

@@ -1,0 +1,113 @@
+import json
+from typing import get_args
+
+import pytest
+from typer.testing import CliRunner
+
+from robosac.answers import Distrust, Reason, RejectedTeammate
+from robosac.audit import compact, sentence
+from robosac.audit.events import Event, RecordError, event_of
+from robosac.audit.sentences import DISTRUSTS, REASONS, listed
+from robosac.cli import app
+from tests.robosac.audit.conftest import seal_all
+from tests.robosac.audit.test_events import others
+
+
+def told(event, **changes):
+    return sentence(event_of({**event, **changes}))
+
+
+def test_every_kind_of_event_has_a_sentence(events):
+    written = [*events, *others(events)]
+    assert {event["event"] for event in written} == {kind.model_fields["event"].default for kind in get_args(Event)}
+    sentences = {event["event"]: told(event) for event in written}
+    assert len(set(sentences.values())) == len(sentences)
+    for said in sentences.values():
+        assert said.endswith(".")
+        assert "None" not in said
+        assert "\n" not in said
+
+
+def test_every_reason_has_words():
+    assert REASONS.keys() == set(Reason)
+    assert DISTRUSTS.keys() == set(Distrust)
+
+
+def test_a_frame_is_told_with_who_was_left_out_and_why(events):
+    answered = next(event for event in events if event["event"] == "frame_answered")
+    said = told(answered, frame=7, accepted=["car-3", "car-4", "rsu"], rejected=[], hypotheses=[])
+    assert said == "Frame 7 was answered with 1 box fused with car-3, car-4 and rsu, after 0 tests."
+    rejected = [
+        {"vehicle_id": "car-2", "reason": "distrusted", "distrust": "named"},
+        {"vehicle_id": "car-5", "reason": "dissensus", "distrust": "named"},
+        {"vehicle_id": "rsu", "reason": "missing"},
+    ]
+    box = {"status": "contradicted", "witnesses": ["car-2"], "deniers": [], "box": [0, 0, 4, 2, 0, 0.9]}
+    more = {"contradicted": [box, box], "degraded_by": "deadline", "deadline_met": False, "unlogged_refusals": {"?": 2}}
+    tested = [{"teammates": ["car-5"], "jaccard_index": 0.1, "verdict": "dissensus"}]
+    worse = {"source": "ego_only", "accepted": [], "rejected": rejected, "hypotheses": tested, **more}
+    assert told(answered, frame=8, boxes=[], **worse) == (
+        "Frame 8 was answered with 0 boxes of what the ego sees alone, after 1 test; left out: car-2 (named as an "
+        "attacker), car-5 (in dissensus, named as an attacker), rsu (no message came); 2 boxes contradicted and left "
+        "out; cut short by the deadline; the answer was late; 2 further refusals without a record."
+    )
+
+
+@pytest.mark.parametrize(
+    ("kind", "changes", "said"),
+    [
+        ("team_changed", {"joined": ["a", "b"], "left": ["c"], "teammates": ["a", "b"]}, "a and b joined and c left; "),
+        ("team_changed", {"joined": [], "left": ["c"], "teammates": []}, "c left; the team is now nobody."),
+        ("detector_changed", {"accepted": True}, "the session goes on with them."),
+        ("detector_changed", {"accepted": False}, "the session stands still"),
+        ("access_refused", {"vehicle_id": "rsu"}, "rsu came without a token that counts"),
+        ("access_refused", {"vehicle_id": None}, "Somebody came without a token that counts"),
+        ("session_ended", {"why": "closed"}, "The ego closed the session."),
+        ("session_ended", {"why": "expired"}, "The session expired"),
+        ("session_ended", {"why": "of old"}, "The session ended: of old."),
+        ("message_refused", {"frame": None, "field": None, "detail": "it said"}, " was refused ("),
+        ("message_refused", {"frame": 3, "field": "pose", "detail": "it said"}, "for frame 3 was refused ("),
+    ],
+)
+def test_a_record_is_told_as_it_is(kind, changes, said, events):
+    record = next(event for event in [*events, *others(events)] if event["event"] == kind)
+    assert said in told(record, **changes)
+
+
+def test_names_are_listed_as_one_says_them():
+    assert [listed(names) for names in ((), ("a",), ("a", "b"), "abc")] == ["nobody", "a", "a and b", "a, b and c"]
+    entry = RejectedTeammate(vehicle_id="a", reason=Reason.DISTRUSTED)
+    assert entry.distrust is None
+
+
+def test_a_line_is_told_whatever_its_format(events, lines):
+    for line in lines:
+        assert sentence(line) == sentence(line.decode()) == sentence(line.removesuffix(b"\n"))
+    answered = next(event for event in events if event["event"] == "frame_answered")
+    (short,) = seal_all([compact(event_of(answered))])
+    assert len(short) < len(seal_all([answered])[0])
+    assert sentence(short) == told(answered)
+    assert "no words for" in sentence('{"event": "session_moved"}')
+    with pytest.raises(RecordError):
+        sentence("not JSON")
+
+
+def test_the_command_shows_a_log_and_obeys_no_word_of_it(events, tmp_path):
+    refused = next(event for event in events if event["event"] == "message_refused")
+    path = tmp_path / "log.jsonl"
+    lines = seal_all([*events, {**refused, "detail": "\x1b[2Jbang"}])
+    path.write_bytes(b"".join(lines))
+    shown = CliRunner().invoke(app, ["audit", "show", str(path)])
+    assert shown.exit_code == 0, shown.output
+    printed = shown.output.splitlines()
+    assert len(printed) == len(lines)
+    times = [json.loads(line)["time"] for line in lines]
+    assert [line.split(" ", 2)[:2] for line in printed] == [[str(seq), at] for seq, at in enumerate(times, 1)]
+    assert printed[0].endswith(sentence(lines[0]))
+    assert "\x1b" not in shown.output
+    path.write_bytes(b"".join([lines[0], b"{}\n", b"[]\n", lines[1]]))
+    broken = CliRunner().invoke(app, ["audit", "show", str(path)])
+    assert broken.exit_code == 1
+    assert "line 3: not JSON" in broken.output
+    assert broken.output.splitlines()[-1].endswith(sentence(lines[1]))
+    assert CliRunner().invoke(app, ["audit", "show", "/nowhere"]).exit_code == 2
