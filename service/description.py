@@ -48,6 +48,7 @@ _DETECTOR = {
     "area_m": [-32.0, -32.0, 32.0, 32.0],
     "cell_m": 2.0,
     "weights_digest": _HASH,
+    "precision": "float32",
     "consensus_score": 0.3,
     "calibration": {"kinds": ["pgd", "erase", "open"], "pose_errors_m": [0.0, 0.2], "digest": _HASH},
 }
