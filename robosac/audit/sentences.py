@@ -53,7 +53,7 @@ def sentence(record: Event | bytes | str) -> str:
 
     Raises
     ------
-    robosac.audit.events.RecordError
+    robosac.audit.lines.RecordError
         If a line is no record.
     """
     if isinstance(record, bytes | str):

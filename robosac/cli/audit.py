@@ -13,7 +13,7 @@ import typer
 
 from robosac import detectors, wire
 from robosac.audit import Receipts, digest, misbehaviour, sentence, verification
-from robosac.audit.events import RecordError, read
+from robosac.audit.lines import RecordError, read
 from robosac.audit.receipts import by_id
 from robosac.cli.blame import blaming
 from robosac.cli.outputs import Force, check_file

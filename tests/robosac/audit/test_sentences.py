@@ -6,7 +6,8 @@ from typer.testing import CliRunner
 
 from robosac.answers import Distrust, Reason, RejectedTeammate
 from robosac.audit import compact, sentence
-from robosac.audit.events import Event, RecordError, event_of
+from robosac.audit.events import Event, event_of
+from robosac.audit.lines import RecordError
 from robosac.audit.sentences import DISTRUSTS, REASONS, listed
 from robosac.cli import app
 from tests.robosac.audit.conftest import seal_all
