@@ -20,6 +20,7 @@ MIN_UPRIGHT = 0.5
 MAX_TRANSLATION_M = 1e8
 """Farther than any earth-fixed frame needs; beyond it single precision would lose the warp."""
 _UNIT_CORNERS = np.array([[0.5, 0.5], [-0.5, 0.5], [-0.5, -0.5], [0.5, -0.5]])
+_CLOSED = _UNIT_CORNERS[[0, 1, 2, 3, 0]]
 _NMS_BLOCK = 64
 
 
@@ -120,24 +121,31 @@ def pairwise_iou(a: FloatArray, b: FloatArray) -> FloatArray:
 
 
 def _paired_iou(a: FloatArray, b: FloatArray) -> FloatArray:
-    c, s = np.cos(b[:, 4:5]), np.sin(b[:, 4:5])
-    offset = corners(a) - b[:, None, :2]
-    x = c * offset[..., 0] + s * offset[..., 1]
-    y = -s * offset[..., 0] + c * offset[..., 1]
-    half_l, half_w = b[:, 2:3] / 2, b[:, 3:4] / 2
-    x2, y2 = np.roll(x, -1, axis=1), np.roll(y, -1, axis=1)
-
-    x_from, x_to = np.clip(x, -half_l, half_l), np.clip(x2, -half_l, half_l)
-    run = x2 - x
-    with np.errstate(divide="ignore", invalid="ignore"):
-        slope = np.where(x_from == x_to, 0.0, (y2 - y) / run)
-    y_from, y_to = y + (x_from - x) * slope, y + (x_to - x) * slope
-    area = np.abs(np.sum((x_to - x_from) * _mean_clamp(y_from, y_to, half_w), axis=1))
+    """IoU (n,) of boxes (n, 5+) with as many others, pair by pair."""
+    c, s = np.cos(b[:, 4]), np.sin(b[:, 4])
+    x, y = _outline(a)
+    x -= b[:, 0]
+    y -= b[:, 1]
+    x, y = c * x + s * y, c * y - s * x
+    half_l, half_w = b[:, 2] / 2, b[:, 3] / 2
+    cut = np.minimum(np.maximum(x, -half_l), half_l)
+    x_from, x_to = cut[:-1], cut[1:]
+    slope = np.zeros_like(x_from)
+    np.divide(y[1:] - y[:-1], x[1:] - x[:-1], out=slope, where=x_from != x_to)
+    y_from, y_to = y[:-1] + (x_from - x[:-1]) * slope, y[:-1] + (x_to - x[:-1]) * slope
+    area = np.abs(((x_to - x_from) * _mean_clamp(y_from, y_to, half_w)).sum(axis=0))
 
     total = a[:, 2] * a[:, 3] + b[:, 2] * b[:, 3] - area
-    with np.errstate(divide="ignore", invalid="ignore"):
-        iou = np.where(total > 0, area / total, 0.0)
-    return np.clip(iou, 0.0, 1.0)
+    iou = np.zeros_like(area)
+    np.divide(area, total, out=iou, where=total > 0)
+    return np.minimum(np.maximum(iou, 0.0), 1.0)
+
+
+def _outline(boxes: FloatArray) -> tuple[FloatArray, FloatArray]:
+    """x and y (5, n) of the corners of boxes (n, 5+), as `corners` gives them, the first once more at the end."""
+    ahead, aside = _CLOSED[:, :1] * boxes[:, 2], _CLOSED[:, 1:] * boxes[:, 3]
+    c, s = np.cos(boxes[:, 4]), np.sin(boxes[:, 4])
+    return c * ahead - s * aside + boxes[:, 0], s * ahead + c * aside + boxes[:, 1]
 
 
 def _mean_clamp(p: FloatArray, q: FloatArray, limit: FloatArray) -> FloatArray:
@@ -145,10 +153,10 @@ def _mean_clamp(p: FloatArray, q: FloatArray, limit: FloatArray) -> FloatArray:
     low, high = np.minimum(p, q), np.maximum(p, q)
     below = np.minimum(high, -limit) - np.minimum(low, -limit)
     above = np.maximum(high, limit) - np.maximum(low, limit)
-    a, b = np.clip(low, -limit, limit), np.clip(high, -limit, limit)
-    with np.errstate(divide="ignore", invalid="ignore"):
-        mean = ((above - below) * limit + (b - a) * (a + b) / 2) / (high - low)
-    return np.where(high > low, mean, a)
+    a, b = np.minimum(np.maximum(low, -limit), limit), np.minimum(np.maximum(high, -limit), limit)
+    whole = (above - below) * limit + (b - a) * (a + b) / 2
+    np.divide(whole, high - low, out=a, where=high > low)
+    return a
 
 
 def nms(boxes: FloatArray, scores: FloatArray, iou_threshold: float) -> IntArray:
