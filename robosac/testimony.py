@@ -8,11 +8,11 @@ from __future__ import annotations
 
 from collections.abc import Collection, Sequence
 from dataclasses import dataclass
-from functools import cached_property
+from functools import cached_property, lru_cache
 
 import numpy as np
 
-from robosac.boxes import FloatArray
+from robosac.boxes import FloatArray, IntArray
 
 LIKELIHOOD, X, Y, ALONG, ACROSS = range(5)
 """Layers of a map: L, the vehicle's centre seen from the place's centre (x and y, metres), and logarithms of how far it
@@ -55,36 +55,57 @@ class Testimony:
 
     def ego_places(self) -> FloatArray:
         """Centres (H, W, 2) of the places of the ego's map, ego frame, metres."""
-        height, width = self.over_ego.shape[-2:]
-        x = (np.arange(width) + 0.5) * (2 * self.half_extent_m / width) - self.half_extent_m
-        y = (np.arange(height) + 0.5) * (2 * self.half_extent_m / height) - self.half_extent_m
-        return np.stack(np.meshgrid(x, y), axis=-1)
+        return _centres(*self.over_ego.shape[-2:], self.half_extent_m)
 
     def places(self, points: FloatArray) -> FloatArray:
         """Places (n, 2), ego frame, in each sender's frame: (agents, n, 2), metres."""
-        turned: FloatArray = np.einsum("aij,nj->ani", self.from_ego[:, :2, :2], points) + self.from_ego[:, None, :2, 2]
+        turned: FloatArray = points @ self.from_ego[:, :2, :2].swapaxes(1, 2) + self.from_ego[:, None, :2, 2]
         return turned
 
     def likelihood(self, points: FloatArray) -> FloatArray:
         """L at places (n, 2), ego frame: (agents, n), bilinear, within +- `MOST`, 0 outside a map."""
-        height, width = self.maps.shape[-2:]
-        local = self.places(points)
-        column = (local[..., 0] + self.half_extent_m) * width / (2 * self.half_extent_m) - 0.5
-        row = (local[..., 1] + self.half_extent_m) * height / (2 * self.half_extent_m) - 0.5
-        padded = self._padded
-        r = np.clip(np.floor(row).astype(np.int64) + 1, 0, height)
-        c = np.clip(np.floor(column).astype(np.int64) + 1, 0, width)
-        y, x = np.clip(row + 1 - r, 0.0, 1.0), np.clip(column + 1 - c, 0.0, 1.0)
-        who = np.arange(len(self.agents))[:, None]
-        top = padded[who, r, c] * (1 - x) + padded[who, r, c + 1] * x
-        bottom = padded[who, r + 1, c] * (1 - x) + padded[who, r + 1, c + 1] * x
+        turn, move = self._to_cells
+        place = (turn @ points.T).reshape(2, len(self.agents), len(points)) + move  # rows and columns of the padded maps
+        first = np.minimum(np.maximum(np.floor(place), 0.0), self._last)
+        y, x = np.minimum(np.maximum(place - first, 0.0), 1.0)
+        padded, (row, column) = self._padded, first.astype(np.int64)
+        wide = padded.shape[2]
+        corner = (row + self._starts) * wide + column
+        flat = padded.ravel()
+        top = flat[corner] * (1 - x) + flat[corner + 1] * x
+        corner += wide
+        bottom = flat[corner] * (1 - x) + flat[corner + 1] * x
         value: FloatArray = top * (1 - y) + bottom * y
         return value
 
     @cached_property
+    def _to_cells(self) -> tuple[FloatArray, FloatArray]:
+        """From places (2,) of the ego's frame to rows, then columns, of each padded map: a turn (2 agents, 2) and a
+        move (2, agents, 1), in cells.
+        """
+        cells = np.array(self.maps.shape[-2:])[:, None] / (2 * self.half_extent_m)
+        turn = self.from_ego[:, 1::-1, :2].swapaxes(0, 1) * cells[..., None]
+        move = (self.from_ego[:, 1::-1, 2].T + self.half_extent_m) * cells + 0.5
+        return turn.reshape(-1, 2), move[..., None]
+
+    @cached_property
+    def _last(self) -> IntArray:
+        """The last row and column (2, 1, 1) of a padded map between which and the next something can lie."""
+        return np.array(self.maps.shape[-2:])[:, None, None]
+
+    @cached_property
+    def _starts(self) -> IntArray:
+        """The first row (agents, 1) of each of the padded maps, one below the other."""
+        return np.arange(len(self.agents))[:, None] * self._padded.shape[1]
+
+    @cached_property
     def _padded(self) -> FloatArray:
         """L within its bounds, zeros around each map: (agents, H + 3, W + 3)."""
-        padded: FloatArray = np.pad(np.clip(self.maps[:, LIKELIHOOD], -MOST, MOST), [(0, 0), (1, 2), (1, 2)])
+        agents, _, height, width = self.maps.shape
+        padded = np.zeros((agents, height + 3, width + 3), dtype=self.maps.dtype)
+        inside = padded[:, 1:-2, 1:-2]
+        np.maximum(self.maps[:, LIKELIHOOD], -MOST, out=inside)
+        np.minimum(inside, MOST, out=inside)
         return padded
 
     @cached_property
@@ -93,21 +114,22 @@ class Testimony:
 
     def sighting(self, points: FloatArray) -> Sighting:
         """Where each agent sees the vehicles at places (n, 2), ego frame. It means something where L is high."""
-        height, width = self.maps.shape[-2:]
-        cell_x, cell_y = 2 * self.half_extent_m / width, 2 * self.half_extent_m / height
-        local = self.places(points)
-        column = np.clip(((local[..., 0] + self.half_extent_m) / cell_x).astype(np.int64), 0, width - 1)
-        row = np.clip(((local[..., 1] + self.half_extent_m) / cell_y).astype(np.int64), 0, height - 1)
-        found = self.maps[np.arange(len(self.agents))[:, None], :, row, column]  # (agents, n, LAYERS)
-        x = (column + 0.5) * cell_x - self.half_extent_m + found[..., X]
-        y = (row + 0.5) * cell_y - self.half_extent_m + found[..., Y]
+        size = np.array(self.maps.shape[:-3:-1])
+        cell = 2 * self.half_extent_m / size
+        place = (self.places(points) + self.half_extent_m) / cell
+        nearest = np.minimum(np.maximum(place.astype(np.int64), 0), size - 1)
+        found = self.maps[np.arange(len(self.agents))[:, None], :, nearest[..., 1], nearest[..., 0]]
+        seen = (nearest + 0.5) * cell - self.half_extent_m + found[..., X : Y + 1]
         back = self._to_ego
-        centre = np.einsum("aij,anj->ani", back[:, :2, :2], np.stack([x, y], axis=-1)) + back[:, None, :2, 2]
-        return Sighting(centre, np.exp(found[..., ALONG]), np.exp(found[..., ACROSS]))
+        centre = seen @ back[:, :2, :2].swapaxes(1, 2) + back[:, None, :2, 2]
+        off = np.exp(found[..., ALONG : ACROSS + 1])
+        return Sighting(centre, off[..., 0], off[..., 1])
 
     def of(self, agents: Collection[str]) -> Testimony:
         """That of some of them alone."""
         kept = [i for i, name in enumerate(self.agents) if name in agents]
+        if len(kept) == len(self.agents):
+            return self
         return Testimony(
             tuple(self.agents[i] for i in kept),
             self.maps[kept],
@@ -115,6 +137,16 @@ class Testimony:
             self.over_ego[kept],
             self.half_extent_m,
         )
+
+
+@lru_cache(maxsize=16)
+def _centres(height: int, width: int, half_extent_m: float) -> FloatArray:
+    """Centres (H, W, 2) of the places of a map; nobody may write to them."""
+    x = (np.arange(width) + 0.5) * (2 * half_extent_m / width) - half_extent_m
+    y = (np.arange(height) + 0.5) * (2 * half_extent_m / height) - half_extent_m
+    centres = np.stack(np.meshgrid(x, y), axis=-1)
+    centres.flags.writeable = False
+    return centres
 
 
 def planar(ego_pose: FloatArray, poses: Sequence[FloatArray]) -> FloatArray:
