@@ -55,6 +55,8 @@ class Claims:
     def without(self, agents: Collection[str]) -> Claims:
         """The same boxes, and what the other witnesses say of them."""
         kept = [i for i, name in enumerate(self.witnesses) if name not in agents]
+        if len(kept) == len(self.witnesses):
+            return self
         return Claims(self.boxes, tuple(self.witnesses[i] for i in kept), self.likelihood[kept])
 
     def of_boxes(self, which: BoolArray) -> Claims:
@@ -98,5 +100,5 @@ class Claims:
 
 def two_witnesses(speaking: BoolArray) -> BoolArray:
     """Which places (n,) the ego, or two teammates, speak of: ``speaking`` (witnesses, n), the ego first."""
-    enough: BoolArray = speaking[0] | (speaking[1:].sum(axis=0) >= 2)
+    enough: BoolArray = speaking[0] | (np.add.reduce(speaking[1:], axis=0, dtype=np.int16) >= 2)
     return enough

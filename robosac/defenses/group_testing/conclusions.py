@@ -9,7 +9,7 @@ import numpy as np
 
 from robosac.defenses.group_testing.findings import UNHEARD, Findings
 from robosac.defenses.group_testing.model import CELLS, CLEAN, LIE
-from robosac.defenses.group_testing.objects import SAME_LIE_M, Lie, Shown, blame, effects
+from robosac.defenses.group_testing.objects import SAME_LIE_M, Lie, Shown, blame
 from robosac.defenses.protocol import Hypothesis
 
 CLEARING = 1.5
@@ -28,7 +28,7 @@ def conclude(found: Findings, answer: Hypothesis) -> None:
     comparisons = _comparisons(found)
     for joined, shown in found.shown.items():
         done = {
-            suspect: effects(shown, found.shown[without], (suspect,))
+            suspect: found.effects(joined, without, (suspect,))
             for (fused, without), suspect in comparisons.items()
             if fused == joined
         }
@@ -55,7 +55,7 @@ def _together(found: Findings, answer: Hypothesis) -> list[tuple[str, Lie]]:
         group = found.vouching(answer, lie)
         without = tuple(name for name in answer if name not in group)
         if group and without in found.shown:
-            done = effects(found.shown[answer], found.shown[without], group)
+            done = found.effects(answer, without, group)
             if any(np.hypot(*(each.place - lie.place)) <= SAME_LIE_M for each in done if each.kind == lie.kind):
                 blamed += [(name, lie) for name in group]
     return blamed

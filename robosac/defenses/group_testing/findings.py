@@ -55,6 +55,7 @@ class Findings:
         self.decoded: set[Hypothesis] = set()
         self.hearing: Hearing | None = None
         self.pose: FloatArray = np.eye(4)
+        self._effects: dict[tuple[Hypothesis, Hypothesis, Hypothesis], list[Lie]] = {}
 
     def learn(self, outcome: Outcome) -> Shown | None:
         """Take in a decoded subset; what it shows is given back, checked, if there is testimony to check it by."""
@@ -82,9 +83,16 @@ class Findings:
         for group in groups:
             without = tuple(name for name in answer if name not in group)
             if group and lies and without in self.shown:
-                done = effects(self.shown[answer], self.shown[without], group)
+                done = self.effects(answer, without, group)
                 lies = [a for a in lies if all(np.hypot(*(a.place - b.place)) > SAME_LIE_M for b in done)]
         return lies
+
+    def effects(self, joined: Hypothesis, without: Hypothesis, suspects: Hypothesis) -> list[Lie]:
+        """What is wrong in a fusion, and is not in one without the suspects; both are decoded."""
+        asked = joined, without, suspects
+        if asked not in self._effects:
+            self._effects[asked] = effects(self.shown[joined], self.shown[without], suspects)
+        return self._effects[asked]
 
     def vouching(self, fused: Hypothesis, lie: Lie) -> Hypothesis:
         """Those fused whose own messages go with a ghost or a hole, if they are several and not all."""

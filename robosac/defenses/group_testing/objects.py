@@ -11,6 +11,7 @@ from __future__ import annotations
 from collections.abc import Collection, Mapping, Sequence
 from dataclasses import dataclass
 from functools import cached_property
+from weakref import WeakKeyDictionary
 
 import numpy as np
 
@@ -91,19 +92,28 @@ class Hearing:
     def __init__(self, testimony: Testimony, unheard: Collection[str]) -> None:
         self.everybody = testimony
         self.heard = testimony.of([name for name in testimony.agents if name not in unheard])
+        self._said: dict[bytes, FloatArray] = {}
+
+    def said(self, places: FloatArray) -> FloatArray:
+        """What everybody says of places (n, 2), heard or not: (agents, n)."""
+        new = [place for place in places if place.tobytes() not in self._said]
+        if new:
+            found = self.everybody.likelihood(np.stack(new))
+            self._said.update(zip((place.tobytes() for place in new), found.T, strict=True))
+        return np.stack([self._said[place.tobytes()] for place in places], axis=-1)
 
     @cached_property
     def standing(self) -> FloatArray:
         """Centres (k, 2) of vehicles that the ego, or two teammates, know of, and all together without the one who
         denies them most. The surest come first; of one vehicle there may be many.
         """
-        over = np.clip(self.heard.over_ego, -WEIGHTY, WEIGHTY)
+        rows, columns = np.nonzero(two_witnesses(self.heard.over_ego >= CERTAIN))
+        over = np.minimum(np.maximum(self.heard.over_ego[:, rows, columns], -WEIGHTY), WEIGHTY)
         total = over.sum(axis=0) - np.minimum(over[1:].min(axis=0, initial=0.0), 0.0)
-        rows, columns = np.nonzero(two_witnesses(over >= CERTAIN) & (total >= STANDING_SUM))
-        order = np.argsort(-total[rows, columns], kind="stable")
-        rows, columns = rows[order], columns[order]
-        places = self.heard.ego_places()[rows, columns]
-        supporting = (over[:, rows, columns] >= CERTAIN)[..., None]
+        enough = np.flatnonzero(total >= STANDING_SUM)
+        order = enough[np.argsort(-total[enough], kind="stable")]
+        places = self.heard.ego_places()[rows[order], columns[order]]
+        supporting = (over[:, order] >= CERTAIN)[..., None]
         seen = np.where(supporting, self.heard.sighting(places).centre, 0.0).sum(axis=0)
         centres: FloatArray = seen / np.maximum(supporting.sum(axis=0), 1)
         standing: FloatArray = centres[np.hypot(*(centres - places).T) <= REACH_M]
@@ -127,6 +137,7 @@ class Shown:
         self.teammates = teammates
         self.boxes = boxes
         self._hearing = hearing
+        self._overlaps: WeakKeyDictionary[Shown, FloatArray] = WeakKeyDictionary()
         self._testimony = hearing.heard
         self.everybody = Claims.of(boxes, hearing.everybody)
         """What everybody says of the boxes, heard or not."""
@@ -163,7 +174,7 @@ class Shown:
     def goes_with(self, suspect: str, lie: Lie) -> bool:
         """Whether a suspect's own message says what a lie says."""
         everybody = self._hearing.everybody
-        said = everybody.likelihood(lie.place[None])[everybody.agents.index(suspect), 0]
+        said = float(self._hearing.said(lie.place[None])[everybody.agents.index(suspect), 0])
         return bool(said <= DENIES if lie.kind == "gone" else said >= SUPPORTS)
 
     @cached_property
@@ -202,12 +213,28 @@ class Shown:
         """All that may be wrong."""
         found = [Lie("ghost", box[:2]) for box in self.boxes[self.ghosts]]
         found += [Lie("moved", box[:2]) for box in self.boxes[self.displaced]]
-        return found + [Lie("gone", place) for place in self.holes]
+        found += [Lie("gone", place) for place in self.holes]
+        if found:
+            self._hearing.said(np.stack([lie.place for lie in found]))  # of all at once: some of it is asked for soon
+        return found
+
+    def overlap(self, other: Shown) -> FloatArray:
+        """IoU (n, m) of its boxes with those of another fusion of the frame."""
+        known = self._overlaps.get(other)
+        if known is None:
+            known = self._overlaps[other] = pairwise_iou(self.boxes, other.boxes)
+        return known
+
+    @cached_property
+    def odds(self) -> FloatArray:
+        """Logarithm of the odds (n,) of the best box at the place of each of its own."""
+        return self.odds_at(self.boxes[:, :2])
 
     def odds_at(self, places: FloatArray) -> FloatArray:
         """Logarithm of the odds (n,) of the best box at each place (n, 2)."""
         score = np.maximum(self.boxes[:, 5], _LOWEST)
-        near = np.hypot(*np.moveaxis(places[:, None] - self.boxes[None, :, :2], -1, 0)) <= REACH_M
+        x, y = places[:, :1] - self.boxes[:, 0], places[:, 1:] - self.boxes[:, 1]
+        near = np.hypot(x, y) <= REACH_M
         best = np.where(near, score, _LOWEST).max(axis=1, initial=_LOWEST)
         best = np.minimum(best, 1 - 1e-6)
         odds: FloatArray = np.log(best / (1 - best))
@@ -216,9 +243,9 @@ class Shown:
     def _covered(self, places: FloatArray) -> BoolArray:
         """Whether places (n, 2) lie in boxes, or at their rims."""
         boxes = self.boxes[self.boxes[:, 5] >= THERE_SCORE]
-        off = places[:, None] - boxes[None, :, :2]
+        x, y = places[:, :1] - boxes[:, 0], places[:, 1:] - boxes[:, 1]
         cos, sin = np.cos(boxes[:, 4]), np.sin(boxes[:, 4])
-        along, across = off[..., 0] * cos + off[..., 1] * sin, off[..., 1] * cos - off[..., 0] * sin
+        along, across = x * cos + y * sin, y * cos - x * sin
         inside = (np.abs(along) <= boxes[:, 2] / 2 + RIM_M) & (np.abs(across) <= boxes[:, 3] / 2 + RIM_M)
         covered: BoolArray = np.atleast_1d(inside.any(axis=1))
         return covered
@@ -242,7 +269,7 @@ def effects(joined: Shown, without: Shown, suspects: Sequence[str]) -> list[Lie]
     found += [Lie("gone", lost[i, :2], bool(own[i] >= SUPPORTS)) for i in taken]
     away, aside, other = joined.away(suspects), joined.away(suspects, across=True), without.away(suspects)
     for index in np.flatnonzero((away >= AWAY) & (joined.boxes[:, 5] >= PLACED_SCORE) & ~ghosts):
-        same = _at(without, joined.boxes[index])
+        same = _at(without.overlap(joined)[:, index])
         if same is not None and 0.0 < other[same] <= away[index] - AWAY_EFFECT:
             found.append(Lie("moved", joined.boxes[index, :2], along=bool(aside[index] < AWAY)))
     return found
@@ -273,19 +300,18 @@ def gone(joined: Shown, without: Shown, suspects: Collection[str] = ()) -> IntAr
     others = np.array([name not in suspects for name in claims.witnesses])
     supported = two_witnesses(claims.supporting & others[:, None])
     supported &= claims.likelihood[others].sum(axis=0) >= WEIGHTY
-    there = joined.boxes[joined.boxes[:, 5] >= THERE_SCORE]
-    overlap = pairwise_iou(without.boxes, there).max(axis=1, initial=0.0)
-    rise = without.odds_at(without.boxes[:, :2]) - joined.odds_at(without.boxes[:, :2])
+    there = joined.boxes[:, 5] >= THERE_SCORE
+    overlap = without.overlap(joined)[:, there].max(axis=1, initial=0.0)
+    rise = without.odds - joined.odds_at(without.boxes[:, :2])
     lost: IntArray = np.flatnonzero(
         supported & (overlap < 0.05) & (without.boxes[:, 5] >= SHOWN_SCORE) & (rise >= EFFECT)
     )
     return lost
 
 
-def _at(shown: Shown, box: FloatArray) -> int | None:
-    """The box of a fusion that overlaps another one most."""
-    if not len(shown.boxes):
+def _at(overlap: FloatArray) -> int | None:
+    """The box of a fusion that overlaps another one most, by the IoU (n,) of each with that."""
+    if not len(overlap):
         return None
-    overlap = pairwise_iou(box[None], shown.boxes)[0]
     best = int(overlap.argmax())
     return best if overlap[best] > 0.05 else None
