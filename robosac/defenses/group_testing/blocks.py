@@ -25,6 +25,12 @@ class Block:
         """Probability (1 + K, 3 ** n), given the kind, that no state is above given ones."""
         return sets.at_most(self.table)
 
+    @cached_property
+    def clean(self) -> FloatArray:
+        """Probability (1 + K, 2 ** n), given the kind, that nobody of each subset attacks, by its bits."""
+        codes = sets.codes(len(self))
+        return self.below[:, 2 * codes[-1] - codes]
+
     def __len__(self) -> int:
         return len(self.names)
 

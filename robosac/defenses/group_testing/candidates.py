@@ -26,6 +26,7 @@ MOST_WITNESSES = 6
 WORTH_WITNESSES = 0.1
 """Bits that some group must be in doubt for answers to be kept small enough to be witnesses."""
 _CERTAIN = 1e-12
+_DIGITS = 9
 
 
 def candidates(posterior: Posterior, present: BoolArray, decoded: BoolArray) -> BoolArray:
@@ -41,7 +42,12 @@ def candidates(posterior: Posterior, present: BoolArray, decoded: BoolArray) -> 
     decoded : (m, S) bool ndarray
     """
     here = np.flatnonzero(present)
-    found = _all_of(here, len(present)) if len(here) <= EXACT else _some_of(posterior, here, decoded)
+    if len(here) <= EXACT:
+        found = _all_of(tuple(here.tolist()), len(present))
+        left = np.ones(1 + len(found), dtype=bool)
+        left[decoded[:, here] @ (1 << np.arange(len(here)))] = False
+        return found[left[1:]]
+    found = _some_of(posterior, here, decoded)
     unique = {row.tobytes(): index for index, row in reversed(list(enumerate(np.packbits(found, axis=1))))}
     for row in np.packbits(decoded, axis=1):
         unique.pop(row.tobytes(), None)
@@ -59,11 +65,13 @@ def cleared(suspicion: FloatArray) -> BoolArray:
     return suspicion < UNRESOLVED[0]
 
 
-def _all_of(members: IntArray, size: int) -> BoolArray:
-    """All subsets but the empty one of these members, (2 ** m - 1, size)."""
+@lru_cache(maxsize=64)
+def _all_of(members: tuple[int, ...], size: int) -> BoolArray:
+    """All subsets but the empty one of these members, (2 ** m - 1, size), by their bits; nobody may write to them."""
     codes = np.arange(1, 1 << len(members))
     rows = np.zeros((len(codes), size), dtype=bool)
     rows[:, members] = (codes[:, None] >> np.arange(len(members))) & 1
+    rows.flags.writeable = False
     return rows
 
 
@@ -74,7 +82,7 @@ def _some_of(posterior: Posterior, here: IntArray, decoded: BoolArray) -> BoolAr
     """
     suspicion = posterior.marginals()
     good = cleared(suspicion)
-    ranked = here[np.argsort(suspicion[here], kind="stable")]
+    ranked = here[_ascending(suspicion[here])]
     doubtful = np.zeros(len(suspicion), dtype=bool)
     doubtful[here] = unresolved(suspicion)[here]
     groups, doubt = _groups(posterior, doubtful)
@@ -100,7 +108,7 @@ def _groups(posterior: Posterior, doubtful: BoolArray) -> tuple[BoolArray, float
     clean = [posterior.clean_within(b)[masks] for b, masks in within]
     p = np.clip(np.concatenate(clean), _CERTAIN, 1 - _CERTAIN)
     entropy = -(p * np.log2(p) + (1 - p) * np.log2(1 - p))
-    best = np.argsort(-entropy, kind="stable")[:GROUPS]
+    best = _ascending(-entropy)[:GROUPS]
     blocks = np.repeat([b for b, _ in within], [len(masks) for _, masks in within])
     rows = posterior.rows(blocks[best], np.concatenate([masks for _, masks in within])[best])
     return rows, float(entropy.max())
@@ -115,8 +123,13 @@ def _small_groups(suspects: int) -> IntArray:
     return groups
 
 
+def _ascending(values: FloatArray) -> IntArray:
+    """Places of the values (n,), the least first; what differs by rounding only stays in order."""
+    return np.argsort(values.round(_DIGITS), kind="stable")
+
+
 def _answer_sizes(ascending: FloatArray) -> IntArray:
     """How many of the least suspected make the best answers, as if teammates were independent."""
     clean = np.cumprod(1.0 - ascending)
     worth = clean * gain(np.arange(1, len(clean) + 1)) - (1.0 - clean) * HARM
-    return np.argsort(-worth, kind="stable")[:ANSWERS] + 1
+    return _ascending(-worth)[:ANSWERS] + 1

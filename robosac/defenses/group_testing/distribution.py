@@ -16,6 +16,8 @@ from robosac.defenses.group_testing.sets import ATTACKS, BENIGN, PLAIN
 BoolArray = np.ndarray[tuple[Any, ...], np.dtype[np.bool_]]
 _LIMITS = ((BENIGN, BENIGN), (BENIGN, ATTACKS), (ATTACKS, BENIGN), (PLAIN, PLAIN), (PLAIN, BENIGN), (BENIGN, PLAIN))
 
+_OF_A, _OF_D = 2 - np.array(_LIMITS).T[:, :, None]
+
 
 class Distribution:
     """Probabilities over kinds of attack k and states z of the teammates.
@@ -36,6 +38,8 @@ class Distribution:
 
     def __init__(self, weights: FloatArray, team: Sequence[Block]) -> None:
         self._kinds = len(weights) - 1
+        self.version = 0
+        """Grows whenever it stands for something else."""
         self._marginals: FloatArray | None = None
         self._powers: FloatArray | None = None
         self._hold(weights, team)
@@ -63,8 +67,7 @@ class Distribution:
 
     def clean_within(self, block: int) -> FloatArray:
         """Probability (2 ** n,) that nobody of each subset of a block attacks, by its mask there."""
-        codes = sets.codes(len(self._blocks[block]))
-        return self._weights @ self._blocks[block].below[:, 2 * codes[-1] - codes]
+        return self._weights @ self._blocks[block].clean
 
     def masks(self, subsets: BoolArray) -> IntArray:
         """Subsets (n, S), in the order of `members`, as masks (B, n): block by block, bit by bit."""
@@ -85,7 +88,13 @@ class Distribution:
 
     def unattacked(self, masks: IntArray) -> FloatArray:
         """Probability (n,) that nobody of each subset attacks."""
-        return self._weights @ self._at_most(masks, np.zeros_like(masks), ((BENIGN, ATTACKS),))[:, 0]
+        touched = np.flatnonzero(masks.any(axis=1)).tolist() or [0]
+        if len(touched) == 1:
+            return self.clean_within(touched[0])[masks[touched[0]]]
+        clean = self._blocks[touched[0]].clean.take(masks[touched[0]], axis=1)
+        for b in touched[1:]:
+            clean *= self._blocks[b].clean.take(masks[b], axis=1)
+        return self._weights @ clean
 
     def cells(self, a: IntArray, d: IntArray) -> FloatArray:
         """Joint probabilities (n, CLEAN + 3 K) of what pairs of disjoint subsets hold, by rows of an `EvidenceModel`.
@@ -94,29 +103,31 @@ class Distribution:
         attackers in d only, in a only, in both.
         """
         q = self._weights
-        below = self._at_most(a, d, _LIMITS)
+        below = self._at_most(a, d)
         both, in_a, in_d = below[:, 0], below[:, 1], below[:, 2]
-        benign, neither, only_d, only_a = np.tensordot(q, below[:, (0, 3, 4, 5)], 1)
+        benign, _, _, neither, only_d, only_a = (q @ below.reshape(len(q), -1)).reshape(below.shape[1:])
         only_d, only_a = only_d - neither, only_a - neither
         cells = np.empty((a.shape[1], CLEAN + CELLS * self._kinds))
         cells[:, 0], cells[:, 1], cells[:, 2] = neither, only_d, only_a
         cells[:, 3] = benign - neither - only_d - only_a
         for cell, chance in enumerate((in_a - both, in_d - both, 1 - in_a - in_d + both)):
-            cells[:, CLEAN + cell :: CELLS] = (chance[1:] * q[1:, None]).T
+            np.multiply(chance[1:].T, q[1:], out=cells[:, CLEAN + cell :: CELLS])
         return np.maximum(cells, 0.0)
 
-    def _at_most(self, a: IntArray, d: IntArray, limits: Sequence[tuple[int, int]]) -> FloatArray:
-        """Probability (1 + K, L, n), given the kind, that no state in subsets ``a`` is above the first of each pair of
-        limits (L,), and none in ``d`` above the second.
+    def _at_most(self, a: IntArray, d: IntArray) -> FloatArray:
+        """Probability (1 + K, L, n), given the kind, that no state in subsets ``a`` is above the first of each of
+        `_LIMITS` (L,), and none in ``d`` above the second.
         """
-        of_a, of_d = 2 - np.array(limits).T[:, :, None]
-        product = np.ones((1 + self._kinds, len(limits), a.shape[1]))
+        product = None
         for b in np.flatnonzero((a | d).any(axis=1)).tolist():
             codes = sets.codes(len(self._blocks[b]))
-            product *= self._blocks[b].below.take(2 * codes[-1] - of_a * codes[a[b]] - of_d * codes[d[b]], axis=1)
-        return product
+            limits = 2 * codes[-1] - _OF_A * codes[a[b]] - _OF_D * codes[d[b]]
+            part = self._blocks[b].below.take(limits, axis=1)
+            product = part if product is None else np.multiply(product, part, out=product)
+        return np.ones((1 + self._kinds, len(_LIMITS), a.shape[1])) if product is None else product
 
     def _hold(self, weights: FloatArray, team: Sequence[Block]) -> None:
         """Stand for this from now on."""
         self._weights, self._blocks = weights, list(team)
         self._marginals = self._powers = None
+        self.version += 1

@@ -11,11 +11,11 @@ import numpy as np
 
 from robosac.boxes import FloatArray
 from robosac.defenses.group_testing import geometry
-from robosac.defenses.group_testing.choice import DEPENDENCE, dilution
+from robosac.defenses.group_testing.choice import DEPENDENCE, UNDILUTED_SIZE
 from robosac.defenses.group_testing.distribution import BoolArray
 from robosac.defenses.group_testing.geometry import MIN_WITNESSES, PairMeasure, crowd
 from robosac.defenses.group_testing.knowledge import Knowledge
-from robosac.defenses.group_testing.memory import CHANGE_REPEAT, EGO_REPEAT, PAIR_REPEAT, WORTH_KEEPING, keys
+from robosac.defenses.group_testing.memory import CHANGE_REPEAT, EGO_REPEAT, PAIR_REPEAT, WORTH_KEEPING, key
 from robosac.defenses.group_testing.model import CELLS, CLEAN, LIE
 from robosac.defenses.group_testing.objects import Shown
 from robosac.defenses.protocol import Hypothesis, Outcome
@@ -106,9 +106,9 @@ class Evidence:
         singles = {}
         for outcome in self.outcomes:
             if len(outcome.teammates) == 1:
-                (key,) = self._known.keys(self._known.rows([outcome.teammates])).tolist()
-                if key in before and key in now:
-                    singles[outcome.teammates[0]] = self._flicker(before[key], now[key])
+                subset = self._known.key(outcome.teammates)
+                if subset in before and subset in now:
+                    singles[outcome.teammates[0]] = self._flicker(before[subset], now[subset])
         self._known.memory.steadiness.learn(singles)
 
     def _begin(self, first: Outcome) -> None:
@@ -145,9 +145,9 @@ class Evidence:
     def _changes(self, outcome: Outcome) -> list[_Finding]:
         if not self._compare_frames or outcome.boxes is None or outcome.pose is None:
             return []
-        (key,) = self._known.keys(self._known.rows([outcome.teammates])).tolist()
-        self.shown[key] = now = self.followed(outcome.boxes, outcome.pose)
-        before = self._known.memory.shown.get(key)
+        subset = self._known.key(outcome.teammates)
+        self.shown[subset] = now = self.followed(outcome.boxes, outcome.pose)
+        before = self._known.memory.shown.get(subset)
         if before is None or max(crowd(before), crowd(now)) < MIN_WITNESSES:
             return []
         boxes, shown, pose = crowd(now), self._checked[outcome.teammates], outcome.pose
@@ -169,14 +169,14 @@ class Evidence:
 
     def _apply(self, finding: _Finding) -> None:
         posterior = self._known.posterior
-        rows = self._known.rows([finding.a, finding.d])
         before = posterior.marginals()
-        cells = posterior.cells(*posterior.masks(rows)[:, :, None].swapaxes(0, 1))[0]
+        masks = posterior.masks(self._known.rows([finding.a, finding.d]))
+        cells = posterior.cells(masks[:, :1], masks[:, 1:])[0]
         strangeness = self._known.memory.strangeness
         likelihood = self._neutral(strangeness.weights @ finding.likelihood, cells)
-        weight = self._weight(finding, rows, cells, likelihood)
+        weight = self._weight(finding, cells, likelihood)
         strangeness.learn(finding.likelihood, cells, weight)
-        posterior.update(rows[0], rows[1], weight * np.log(likelihood))
+        posterior.learn(*masks.T.tolist(), weight * np.log(likelihood))
         self._keep(finding, _log_odds(posterior.marginals()) - _log_odds(before))
 
     def _neutral(self, likelihood: FloatArray, cells: FloatArray) -> FloatArray:
@@ -189,19 +189,19 @@ class Evidence:
             likelihood[first : first + CELLS] = float(cells[:CLEAN] @ likelihood[:CLEAN]) / clean
         return likelihood
 
-    def _weight(self, finding: _Finding, rows: BoolArray, cells: FloatArray, likelihood: FloatArray) -> float:
+    def _weight(self, finding: _Finding, cells: FloatArray, likelihood: FloatArray) -> float:
         """What a finding counts: a repetition little, and one of a large subset less."""
         memory = self._known.memory
         clean, attacked = (
             float(cells[part] @ likelihood[part]) / max(float(cells[part].sum()), _TINY)
             for part in (slice(CLEAN), slice(CLEAN, None))
         )
-        of_a, of_d = self._known.keys(rows)[:, None]
-        (key,) = (keys(of_d, of_a) if finding.test == "change" else keys(of_a, of_d)).tolist()
+        of_a, of_d = self._known.key(finding.a), self._known.key(finding.d)
+        test = key(of_d, of_a) if finding.test == "change" else key(of_a, of_d)
         against = attacked > clean
-        weight = finding.weight * float(dilution(np.array([len(finding.a) + len(finding.d)]))[0])
+        weight = finding.weight * min(1.0, UNDILUTED_SIZE / (len(finding.a) + len(finding.d)))
         weight *= memory.steadiness.trust if against else 1.0
-        return weight * memory.weigh(key, _REPEATS[finding.test], 1 if against else -1)
+        return weight * memory.weigh(test, _REPEATS[finding.test], 1 if against else -1)
 
     def _keep(self, finding: _Finding, ratios: FloatArray) -> None:
         """Keep a finding as evidence on those (S,) whose log-odds it moved by these ratios."""

@@ -30,6 +30,7 @@ SUBSETS_TO_NAME = 2
 WORTH_WAITING = 0.34
 """Bits that a test must promise for a larger team's answer to wait for it."""
 _TIE = 1e-9
+_DIGITS = 9
 
 
 class JudgedFrame:
@@ -51,6 +52,7 @@ class JudgedFrame:
         self._evidence = evidence
         self._team = team
         self._trusted = trusted
+        self._best: tuple[tuple[int, int], tuple[Hypothesis, float, Source]] | None = None
 
     def next_test(self, rng: np.random.Generator, passes: int) -> Hypothesis | None:
         """The subset most worth decoding, ties broken at random; None if none is worth its pass.
@@ -120,10 +122,16 @@ class JudgedFrame:
 
     def _best_answer(self) -> tuple[Hypothesis, float, Source]:
         """Of the decoded subsets that may be answered, the most useful; the ego alone if none is of use."""
+        known = self._known.posterior.version, len(self._evidence.outcomes)
+        if self._best is None or self._best[0] != known:
+            self._best = known, self._choose_answer()
+        return self._best[1]
+
+    def _choose_answer(self) -> tuple[Hypothesis, float, Source]:
         allowed = [o for o in self._evidence.outcomes if self._verified(o) or self._trusted.issuperset(o.teammates)]
         if allowed:
             worth = choice.utility(self._known.posterior, self._known.rows([o.teammates for o in allowed]))
-            best = int(np.argmax(worth))
+            best = int(np.argmax(worth.round(_DIGITS)))
             if worth[best] > 0:
                 source = Source.CONSENSUS if self._verified(allowed[best]) else Source.TRUSTED
                 return allowed[best].teammates, float(worth[best]), source

@@ -76,7 +76,7 @@ class Inspection:
         """
         posterior, suspicion = self._found.known.posterior, self._found.known.suspicion()
         left = [name for name in self._found.team if name not in answer and name not in self._found.named]
-        left.sort(key=lambda name: suspicion[name])
+        left.sort(key=lambda name: round(suspicion[name], 9))
         suspects = [name for name in left if suspicion[name] > SUSPECT or self._found.lies.worst(name)]
         doubtful = [name for name in left if name not in suspects]
         groups = [self._with(answer, doubtful[:count]) for count in range(len(doubtful), 0, -1)]

@@ -27,13 +27,14 @@ class Knowledge:
     def __post_init__(self) -> None:
         self.members = self.posterior.members
         self._index = {name: i for i, name in enumerate(self.members)}
-        self._identities = np.array([identity(name) for name in self.members], dtype=np.uint64)
+        self._numbers = {name: identity(name) for name in self.members}
+        self._identities = np.array(list(self._numbers.values()), dtype=np.uint64)
 
     def rows(self, subsets: Sequence[Hypothesis]) -> BoolArray:
         """Subsets as rows (n, S) of booleans over the members."""
         rows = np.zeros((len(subsets), len(self.members)), dtype=bool)
-        for row, subset in zip(rows, subsets, strict=True):
-            row[[self._index[name] for name in subset]] = True
+        for row, subset in enumerate(subsets):
+            rows[row, [self._index[name] for name in subset]] = True
         return rows
 
     def names(self, row: BoolArray, team: Hypothesis) -> Hypothesis:
@@ -43,6 +44,10 @@ class Knowledge:
     def keys(self, rows: BoolArray) -> KeyArray:
         """Subsets (n, S) as memory knows them (n,); nobody is 0."""
         return rows @ self._identities
+
+    def key(self, subset: Hypothesis) -> int:
+        """As `keys`, of one subset."""
+        return sum(self._numbers[name] for name in subset) % 2**64
 
     def suspicion(self) -> dict[str, float]:
         """Probability that each member attacks."""

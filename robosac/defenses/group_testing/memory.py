@@ -32,12 +32,18 @@ FORGETTING_FRAMES = 1500.0
 MAX_LEFT = 256
 """Teammates remembered after they left, the latest."""
 KeyArray = np.ndarray[tuple[Any, ...], np.dtype[np.uint64]]
-_SPREAD = np.uint64(0x9E3779B97F4A7C15)
+_SPREAD_BY = 0x9E3779B97F4A7C15
+_SPREAD = np.uint64(_SPREAD_BY)
 
 
 def identity(name: str) -> int:
     """A teammate as 64 bits; a subset is the sum of its members, modulo 2 ** 64."""
     return int.from_bytes(hashlib.blake2b(name.encode(), digest_size=8).digest(), "little")
+
+
+def key(a: int, d: int) -> int:
+    """As `keys`, of one test."""
+    return (a * _SPREAD_BY + d) % 2**64
 
 
 def keys(a: KeyArray, d: KeyArray) -> KeyArray:

@@ -165,7 +165,7 @@ class EvidenceModel:
         """Likelihoods (worlds, CLEAN + 3 K) of what a pair of these sizes shows, d at least 1, in each of
         `STRETCHES`.
         """
-        (row,) = size_row(np.array([a]), np.array([d])).tolist()
+        row = SIZES.index((min(a, len(JOINING_SIZES) - 1), min(d, JOINING_SIZES[min(a, len(JOINING_SIZES) - 1)])))
         return self._stretched_pairs[:, :, row, pair_bin(measured)]
 
     def change(self, size: int, boxes: int, changes: int) -> FloatArray:
@@ -183,7 +183,7 @@ class EvidenceModel:
         clean, attacked = cells[:, :CLEAN].sum(axis=1), cells[:, CLEAN::CELLS]
         shown = np.stack([clean[:, None] * tables[0], np.einsum("nk,knc->nc", attacked, tables[1:])], axis=1)
         bits = _entropy(np.stack([clean, attacked.sum(axis=1)], axis=1))
-        bits += _entropy(shown.sum(axis=1)) - _entropy(shown).sum(axis=1)
+        bits += _entropy(shown.sum(axis=1)) - _entropy(shown.reshape(len(shown), -1))
         return np.maximum(bits, 0.0)
 
     def information(self, a: IntArray, d: IntArray, cells: FloatArray) -> FloatArray:
@@ -199,15 +199,16 @@ class EvidenceModel:
             Probability of what is true.
         """
         which = size_row(a, d)
-        bits = _entropy(cells @ self._parts)
-        for index in np.unique(which).tolist():
+        shown = np.empty((len(which), self._by_part.shape[2]))
+        for index in set(which.tolist()):
             rows = np.flatnonzero(which == index)
-            shown = (cells[rows] @ self._by_part[index]).reshape(len(rows), 1 + CELLS, -1)
-            bits[rows] += _entropy(shown.sum(axis=1)) - _entropy(shown).sum(axis=1)
+            shown[rows] = cells[rows] @ self._by_part[index]
+        by_part = shown.reshape(len(which), 1 + CELLS, -1)
+        bits = _entropy(cells @ self._parts) + _entropy(by_part.sum(axis=1)) - _entropy(shown)
         return np.maximum(bits, 0.0)
 
 
 def _entropy(p: FloatArray) -> FloatArray:
     """Sum of -p log2 p over the last axis."""
-    bits: FloatArray = -np.einsum("...i,...i", p, np.log2(np.maximum(p, _TINY)))
+    bits: FloatArray = -np.vecdot(p, np.log2(np.maximum(p, _TINY)))
     return bits

@@ -89,13 +89,16 @@ class Posterior(Distribution):
         log_likelihood : (CLEAN + 3 K,) ndarray
             Of the outcome, by columns of `cells`.
         """
+        self.learn(*self.masks(np.stack([a, d])).T.tolist(), log_likelihood)
+
+    def learn(self, of_a: Sequence[int], of_d: Sequence[int], log_likelihood: FloatArray) -> None:
+        """As `update`, of subsets as masks, block by block."""
         likelihood = np.exp(log_likelihood - log_likelihood.max())
         by_kind = likelihood[CLEAN:].reshape(self._kinds, CELLS)
         by_level = np.empty((1 + self._kinds, sets.STATES, sets.STATES))  # the greatest states in a and in d
         by_level[:, :2, :2] = likelihood[:CLEAN].reshape(2, 2)
         by_level[0, 2], by_level[0, :, 2] = 0.0, 0.0
         by_level[1:, :2, 2], by_level[1:, 2, :2], by_level[1:, 2, 2] = by_kind[:, :1], by_kind[:, 1:2], by_kind[:, 2]
-        of_a, of_d = self.masks(np.stack([a, d])).T.tolist()
         touched = [b for b, (x, y) in enumerate(zip(of_a, of_d, strict=True)) if x | y]
         if len(touched) > 1:
             expected = self._expected(by_level, [(b, of_a[b], of_d[b]) for b in touched])

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import math
 from collections.abc import Sequence
 from functools import lru_cache
 
@@ -86,7 +87,7 @@ def prior(n: int, attacker_prior: float) -> FloatArray:
 
 def members(table: FloatArray) -> int:
     """n of a table (K, 3 ** n)."""
-    return round(float(np.log(table.shape[1]) / np.log(STATES)))
+    return round(math.log(table.shape[1], STATES))
 
 
 def through(table: FloatArray, kernel: FloatArray) -> FloatArray:
@@ -102,8 +103,7 @@ def at_most(table: FloatArray) -> FloatArray:
     total = table.copy()
     for member in range(members(table)):
         view = total.reshape(len(table), -1, STATES, STATES**member)
-        view[:, :, 1] += view[:, :, 0]
-        view[:, :, 2] += view[:, :, 1]
+        np.add.accumulate(view, axis=2, out=view)
     return total
 
 
