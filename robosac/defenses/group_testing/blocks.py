@@ -4,7 +4,7 @@ from __future__ import annotations
 
 from collections.abc import Sequence
 from dataclasses import dataclass
-from functools import cached_property, reduce
+from functools import reduce
 
 from robosac.boxes import FloatArray
 from robosac.defenses.group_testing import sets
@@ -19,17 +19,6 @@ class Block:
     """(1 + K, 3 ** n): probability of their states (see `sets`), given each kind of attack; "nobody attacks" is the
     first.
     """
-
-    @cached_property
-    def below(self) -> FloatArray:
-        """Probability (1 + K, 3 ** n), given the kind, that no state is above given ones."""
-        return sets.at_most(self.table)
-
-    @cached_property
-    def clean(self) -> FloatArray:
-        """Probability (1 + K, 2 ** n), given the kind, that nobody of each subset attacks, by its bits."""
-        codes = sets.codes(len(self))
-        return self.below[:, 2 * codes[-1] - codes]
 
     def __len__(self) -> int:
         return len(self.names)

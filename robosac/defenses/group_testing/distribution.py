@@ -26,7 +26,8 @@ class Distribution:
     not), or attacking.
 
     ``P(z, k) = q_k * prod over blocks b of P_b(z within b | k)``: inside a block all states are held, between blocks
-    (given the kind) independence is assumed.
+    (given the kind) independence is assumed. All tables have the size of the largest block's: a smaller block is filled
+    up with members that are plain for certain.
 
     Parameters
     ----------
@@ -37,11 +38,9 @@ class Distribution:
     """
 
     def __init__(self, weights: FloatArray, team: Sequence[Block]) -> None:
-        self._kinds = len(weights) - 1
         self.version = 0
         """Grows whenever it stands for something else."""
-        self._marginals: FloatArray | None = None
-        self._powers: FloatArray | None = None
+        self._kinds = len(weights) - 1
         self._hold(weights, team)
 
     @property
@@ -56,45 +55,44 @@ class Distribution:
 
     def blocks(self) -> list[list[str]]:
         """The team as it is cut into blocks."""
-        return [list(block.names) for block in self._blocks]
+        return [list(names) for names in self._names]
+
+    @property
+    def _blocks(self) -> list[Block]:
+        """The blocks one by one."""
+        return [
+            Block(names, table[:, : sets.STATES ** len(names)])
+            for names, table in zip(self._names, self._tables, strict=True)
+        ]
 
     def marginals(self) -> FloatArray:
         """Probability (S,) of each member to attack."""
         if self._marginals is None:
-            attacking = [sets.attacking(len(block)) @ (self._weights[1:] @ block.table[1:]) for block in self._blocks]
-            self._marginals = np.minimum(np.maximum(np.concatenate(attacking), 0.0), 1.0)
+            entries = (self._weights[1:] @ self._tables[:, 1:]) @ sets.attacking(self._width).T
+            self._marginals = np.minimum(np.maximum(entries[self._inside], 0.0), 1.0)
         return self._marginals
 
     def clean_within(self, block: int) -> FloatArray:
         """Probability (2 ** n,) that nobody of each subset of a block attacks, by its mask there."""
-        return self._weights @ self._blocks[block].clean
+        within: FloatArray = (self._weights @ self._clean)[block, : 1 << len(self._names[block])]
+        return within
 
     def masks(self, subsets: BoolArray) -> IntArray:
         """Subsets (n, S), in the order of `members`, as masks (B, n): block by block, bit by bit."""
-        if self._powers is None:  # of two, exact as floats, whose products are the fast ones
-            starts = np.cumsum([0, *map(len, self._blocks)])
-            place = np.arange(starts[-1])[:, None] - starts[:-1]
-            inside = (place >= 0) & (place < np.diff(starts))
-            self._powers = inside * 2.0 ** (place * inside)
         return (subsets.astype(np.float64) @ self._powers).astype(np.int64).T
 
     def rows(self, which: IntArray, masks: IntArray) -> BoolArray:
         """Subsets (n, S), each within one block: which block (n,), and its mask there (n,)."""
-        starts = np.cumsum([0, *map(len, self._blocks)])
+        starts = np.cumsum([0, *self._sizes])
         place = np.arange(starts[-1]) - starts[which, None]
-        inside = (place >= 0) & (place < max(map(len, self._blocks)))
+        inside = (place >= 0) & (place < self._width)
         rows: BoolArray = inside & ((masks[:, None] >> np.where(inside, place, 0)) & 1).astype(bool)
         return rows
 
     def unattacked(self, masks: IntArray) -> FloatArray:
         """Probability (n,) that nobody of each subset attacks."""
-        touched = np.flatnonzero(masks.any(axis=1)).tolist() or [0]
-        if len(touched) == 1:
-            return self.clean_within(touched[0])[masks[touched[0]]]
-        clean = self._blocks[touched[0]].clean.take(masks[touched[0]], axis=1)
-        for b in touched[1:]:
-            clean *= self._blocks[b].clean.take(masks[b], axis=1)
-        return self._weights @ clean
+        clean = self._clean[np.arange(len(masks))[:, None], :, masks]  # (B, n, 1 + K)
+        return np.multiply.reduce(clean, axis=0) @ self._weights
 
     def cells(self, a: IntArray, d: IntArray) -> FloatArray:
         """Joint probabilities (n, CLEAN + 3 K) of what pairs of disjoint subsets hold, by rows of an `EvidenceModel`.
@@ -118,16 +116,48 @@ class Distribution:
         """Probability (1 + K, L, n), given the kind, that no state in subsets ``a`` is above the first of each of
         `_LIMITS` (L,), and none in ``d`` above the second.
         """
-        product = None
-        for b in np.flatnonzero((a | d).any(axis=1)).tolist():
-            codes = sets.codes(len(self._blocks[b]))
-            limits = 2 * codes[-1] - _OF_A * codes[a[b]] - _OF_D * codes[d[b]]
-            part = self._blocks[b].below.take(limits, axis=1)
+        codes = sets.codes(self._width)
+        touched = np.flatnonzero((a | d).any(axis=1)).tolist() or [0]
+        product: FloatArray | None = None
+        for b in touched:
+            part = self._below[b].take(2 * codes[-1] - _OF_A * codes[a[b]] - _OF_D * codes[d[b]], axis=1)
             product = part if product is None else np.multiply(product, part, out=product)
-        return np.ones((1 + self._kinds, len(_LIMITS), a.shape[1])) if product is None else product
+        assert product is not None
+        return product
+
+    @property
+    def _below(self) -> FloatArray:
+        """Probability (B, 1 + K, 3 ** n), given the kind, that no state of each block is above given ones."""
+        if self._known_below is None:
+            self._known_below = sets.at_most(self._tables)
+        return self._known_below
+
+    @property
+    def _clean(self) -> FloatArray:
+        """Probability (B, 1 + K, 2 ** n), given the kind, that nobody of each subset of each block attacks."""
+        if self._known_clean is None:
+            codes = sets.codes(self._width)
+            self._known_clean = self._below.take(2 * codes[-1] - codes, axis=2)
+        return self._known_clean
 
     def _hold(self, weights: FloatArray, team: Sequence[Block]) -> None:
-        """Stand for this from now on."""
-        self._weights, self._blocks = weights, list(team)
-        self._marginals = self._powers = None
+        """Stand for these blocks from now on."""
+        self._names = [block.names for block in team]
+        self._sizes = np.array([len(block) for block in team])
+        self._width = int(self._sizes.max())
+        self._inside = np.arange(self._width) < self._sizes[:, None]
+        start, powers = 0, np.zeros((int(self._sizes.sum()), len(team)))
+        for b, size in enumerate(self._sizes.tolist()):  # of two, exact as floats, whose products are the fast ones
+            powers[start : start + size, b] = 2.0 ** np.arange(size)
+            start += size
+        self._powers = powers
+        tables = np.zeros((len(team), len(weights), sets.STATES**self._width))
+        for padded, block in zip(tables, team, strict=True):
+            padded[:, : block.table.shape[1]] = block.table
+        self._replace(weights, tables)
+
+    def _replace(self, weights: FloatArray, tables: FloatArray, below: FloatArray | None = None) -> None:
+        """The same blocks with other tables (B, 1 + K, 3 ** n), and weights that need not sum to 1."""
+        self._weights, self._tables = weights / weights.sum(), tables
+        self._known_below, self._known_clean, self._marginals = below, None, None
         self.version += 1

@@ -100,50 +100,56 @@ class Posterior(Distribution):
         by_level[0, 2], by_level[0, :, 2] = 0.0, 0.0
         by_level[1:, :2, 2], by_level[1:, 2, :2], by_level[1:, 2, 2] = by_kind[:, :1], by_kind[:, 1:2], by_kind[:, 2]
         touched = [b for b, (x, y) in enumerate(zip(of_a, of_d, strict=True)) if x | y]
+        if not touched:
+            return
         if len(touched) > 1:
-            expected = self._expected(by_level, [(b, of_a[b], of_d[b]) for b in touched])
+            expected = self._expected(by_level, touched, [of_a[b] for b in touched], [of_d[b] for b in touched])
         else:
             expected = by_level.reshape(1, 1 + self._kinds, -1)
-        evidence = np.ones(1 + self._kinds)
-        tables = [block.table for block in self._blocks]
-        for b, likely in zip(touched, expected, strict=True):
-            where = sets.levels(len(self._blocks[b]), of_a[b], of_d[b])
-            updated = tables[b] * likely.take(where, axis=1)
-            evidence = updated.sum(axis=1)
-            tables[b] = updated / np.maximum(evidence, _TINY)[:, None]
-        self._replace(self._weights * evidence, tables)
+        where = np.stack([sets.levels(self._width, of_a[b], of_d[b]) for b in touched])
+        updated = self._tables[touched] * np.take_along_axis(expected, where[:, None], axis=2)
+        evidence = updated.sum(axis=2)
+        updated /= np.maximum(evidence, _TINY)[:, :, None]
+        tables, below = self._tables.copy(), self._below
+        tables[touched] = updated
+        if len(touched) < len(tables):
+            below = below.copy()
+            below[touched] = sets.at_most(updated)
+        else:
+            below = sets.at_most(tables)
+        self._replace(self._weights * evidence[-1], tables, below)
 
-    def _expected(self, by_level: FloatArray, touched: Sequence[tuple[int, int, int]]) -> FloatArray:
-        """For each touched block (number, mask of a, mask of d), the likelihood (1 + K, 9) by the levels in it alone,
+    def _expected(
+        self, by_level: FloatArray, touched: Sequence[int], a: Sequence[int], d: Sequence[int]
+    ) -> FloatArray:
+        """For each touched block, with its masks of a and d, the likelihood (1 + K, 9) by the levels in it alone,
         expected over what the other blocks hold.
         """
-        each = np.empty((len(touched), *by_level.shape))
-        for known, (b, a, d) in zip(each, touched, strict=True):
-            codes = sets.codes(len(self._blocks[b]))
-            limits = 2 * codes[-1] - (2 - _LEVELS[:, None]) * codes[a] - (2 - _LEVELS) * codes[d]
-            self._blocks[b].below.take(limits, axis=1, out=known)
-        chance = sets.products_but(each)
+        codes, which = sets.codes(self._width), np.array(touched)
+        of_a, of_d = codes[list(a)][:, None, None], codes[list(d)][:, None, None]
+        limits = 2 * codes[-1] - (2 - _LEVELS[:, None]) * of_a - (2 - _LEVELS) * of_d  # (touched, 3, 3)
+        each = self._below[which[:, None, None], :, limits]
+        chance = sets.products_but(np.ascontiguousarray(np.moveaxis(each, -1, 1)))
         chance[..., 1:, :] -= chance[..., :-1, :].copy()
         chance[..., 1:] -= chance[..., :-1].copy()
         greater = by_level[:, _GREATER[:, None, :, None], _GREATER[None, :, None, :]]
-        expected: FloatArray = np.einsum("kopxy,tkxy->tkop", greater, chance)
-        return expected.reshape(len(touched), len(by_level), -1)
+        flat = greater.reshape(len(by_level), sets.STATES**2, sets.STATES**2)
+        return (flat @ chance.reshape(*chance.shape[:2], -1, 1))[..., 0]
 
     def step(self, hazards: Hazards) -> None:
         """Go to the next frame: teammates are hijacked or recover, and the kind of attack may change."""
         kernel = sets.transition(hazards.hijack, hazards.recovery)
-        team = len(self.members)
-        awakened, after = self._parted()
-        after = [sets.through(table, kernel) for table in after]
-        awakened = [sets.awakened(table, team, hazards.hijack, self._attacker_prior) for table in awakened]
-        self._mix(after, awakened)
+        team = int(self._sizes.sum())
+        nobody, after = self._tables[:, :1], self._tables[:, 1:]
+        after = sets.through(after, kernel, self._sizes)
+        self._mix(after, sets.awakened(nobody, team, hazards.hijack, self._attacker_prior, self._sizes))
         change = hazards.change if self._kinds > 1 else 0.0
-        attacked = self._weights[1:]
-        tables = []
-        for nobody, table in zip(*self._parted(), strict=True):
-            flow = (1 - change) * attacked[:, None] * table + change * (attacked @ table)[None] / self._kinds
-            flow = np.concatenate([nobody, flow / np.maximum(flow.sum(axis=1), _TINY)[:, None]])
-            tables.append((1 - VIEWS_CHANGE) * flow + VIEWS_CHANGE * sets.forgotten_views(flow))
+        attacked, under_attack = self._weights[1:], self._tables[:, 1:]
+        flow = (1 - change) * attacked[:, None] * under_attack
+        flow += change * (attacked @ under_attack)[:, None] / self._kinds
+        flow /= np.maximum(flow.sum(axis=2, keepdims=True), _TINY)
+        flow = np.concatenate([self._tables[:, :1], flow], axis=1)
+        tables = (1 - VIEWS_CHANGE) * flow + VIEWS_CHANGE * sets.forgotten_views(flow, self._sizes)
         kinds = (1 - change) * attacked + change * attacked.mean()
         self._replace(np.concatenate([self._weights[:1], kinds]), tables)
 
@@ -159,22 +165,27 @@ class Posterior(Distribution):
         among_attackers = self._attacker_prior if suspicion is None else suspicion
         alone = self._attack_prior * self._attacker_prior if suspicion is None else suspicion
         limit = self._exact if len(self.members) < self._exact else self._most
-        self._blocks = blocks.halved(self._blocks, limit)
-        if min(map(len, self._blocks)) >= limit:
-            self._blocks.append(Block((), np.ones((1 + self._kinds, 1))))
-        awakened, after = self._parted()
-        b = min(range(len(self._blocks)), key=lambda b: len(self._blocks[b]))
-        benign = sets.joint(awakened[b], sets.prior(1, 0.0))
-        after[b] = sets.joint(after[b], np.repeat(sets.prior(1, among_attackers), self._kinds, axis=0))
-        awakened[b] = sets.joint(awakened[b], sets.prior(1, alone))
-        self._blocks[b] = Block([*self._blocks[b].names, name], np.concatenate([benign, after[b]]))
-        self._mix(after, awakened)
+        team = blocks.halved(self._blocks, limit)
+        if min(map(len, team)) >= limit:
+            team.append(Block((), np.ones((1 + self._kinds, 1))))
+        b = min(range(len(team)), key=lambda b: len(team[b]))
+        old = team[b]
+        benign = sets.joint(old.table[:1], sets.prior(1, 0.0))
+        after = sets.joint(old.table[1:], np.repeat(sets.prior(1, among_attackers), self._kinds, axis=0))
+        awakened = [block.table[:1] for block in team]
+        awakened[b] = sets.joint(old.table[:1], sets.prior(1, alone))
+        team[b] = Block([*old.names, name], np.concatenate([benign, after]))
+        self._hold(self._weights, team)
+        padded = np.zeros((len(team), 1, self._tables.shape[2]))
+        for one, table in zip(padded, awakened, strict=True):
+            one[:, : table.shape[1]] = table
+        self._mix(self._tables[:, 1:], padded)
 
     def remove(self, name: str) -> None:
         """Let a teammate leave: what is known of the others stays."""
         left = blocks.without(self._blocks, name)
         few = sum(map(len, left)) <= self._exact
-        self._blocks = [blocks.together(left)] if few and len(left) > 1 else left
+        self._hold(self._weights, [blocks.together(left)] if few and len(left) > 1 else left)
         self._settle()
 
     def regroup(self, together: BoolArray) -> None:
@@ -186,7 +197,7 @@ class Posterior(Distribution):
         masks = self.masks(together[None])[:, 0].tolist()
         regrouped = blocks.regrouped(self._blocks, masks, self._most)
         if regrouped is not None:
-            self._blocks = regrouped
+            self._hold(self._weights, regrouped)
             self._settle()
 
     def to_state(self) -> dict[str, Any]:
@@ -212,46 +223,29 @@ class Posterior(Distribution):
         posterior._hold(weights / weights.sum(), team)
         return posterior
 
-    def _parted(self) -> tuple[list[FloatArray], list[FloatArray]]:
-        """Of each block what holds if nobody attacks (1, 3 ** n), and under each kind of attack (K, 3 ** n)."""
-        return [block.table[:1] for block in self._blocks], [block.table[1:] for block in self._blocks]
-
-    def _mix(self, after: list[FloatArray], awakened: list[FloatArray]) -> None:
-        """Let attacked teams go on as in ``after`` (K, 3 ** n), and a benign team as in ``awakened`` (1, 3 ** n), in
-        which attackers may have awoken or not.
+    def _mix(self, after: FloatArray, awakened: FloatArray) -> None:
+        """Let attacked teams go on as in ``after`` (B, K, 3 ** n), and a benign team as in ``awakened`` (B, 1, 3 ** n),
+        in which attackers may have awoken or not.
         """
         new = self._weights[0] / self._kinds
         old = self._weights[1:]
         total = np.maximum(old + new, _TINY)[:, None]
-        tables = [
-            np.concatenate([block.table[:1], (old[:, None] * t + new * w) / total])
-            for block, t, w in zip(self._blocks, after, awakened, strict=True)
-        ]
+        mixed = (old[:, None] * after + new * awakened) / total
+        tables = np.concatenate([self._tables[:, :1], mixed], axis=1)
         self._replace(np.concatenate([[0.0], old + new]), tables)
         self._settle()
 
     def _settle(self) -> None:
         """An attack without attackers is none: move that probability to "nobody". To be called once blocks changed."""
-        without = [sets.unattacked(len(block)) for block in self._blocks]
-        quiet = [block.table[1:] @ still for block, still in zip(self._blocks, without, strict=True)]
-        none = np.prod(quiet, axis=0)
+        still, tables = sets.unattacked(self._width), self._tables
+        quiet = tables[:, 1:] @ still  # (B, K)
+        none = quiet.prod(axis=0)
         moved = self._weights[1:] * none
         nobody = self._weights[0] + moved.sum()
-        tables = []
-        for block, still, chance in zip(self._blocks, without, quiet, strict=True):
-            table = block.table
-            share = 1.0 / np.maximum(chance, _TINY)
-            lost = 1.0 - np.maximum(chance - none, 0.0) * share
-            kept = np.empty_like(table)
-            kept[0] = self._weights[0] * table[0] + ((moved * share) @ table[1:]) * still
-            kept[1:] = table[1:] * (1.0 - lost[:, None] * still)
-            tables.append(kept / np.maximum(kept.sum(axis=1, keepdims=True), _TINY))
-        self._replace(np.concatenate([[nobody], self._weights[1:] - moved]), tables)
-
-    def _replace(self, weights: FloatArray, tables: Sequence[FloatArray]) -> None:
-        """The same blocks with other tables, and weights that need not sum to 1."""
-        team = [
-            block if table is block.table else Block(block.names, table)
-            for block, table in zip(self._blocks, tables, strict=True)
-        ]
-        self._hold(weights / weights.sum(), team)
+        share = 1.0 / np.maximum(quiet, _TINY)
+        lost = 1.0 - np.maximum(quiet - none, 0.0) * share
+        kept = np.empty_like(tables)
+        kept[:, 0] = self._weights[0] * tables[:, 0] + ((moved * share)[:, None] @ tables[:, 1:])[:, 0] * still
+        kept[:, 1:] = tables[:, 1:] * (1.0 - lost[:, :, None] * still)
+        kept /= np.maximum(kept.sum(axis=2, keepdims=True), _TINY)
+        self._replace(np.concatenate([[nobody], self._weights[1:] - moved]), kept)

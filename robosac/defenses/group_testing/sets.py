@@ -71,10 +71,19 @@ def views(n: int) -> FloatArray:
     return prior
 
 
-def forgotten_views(table: FloatArray) -> FloatArray:
-    """Tables (K, 3 ** n) after what was known of who is complementary is forgotten."""
+def forgotten_views(table: FloatArray, sizes: IntArray | None = None) -> FloatArray:
+    """Tables (B, K, 3 ** n) after what was known of who is complementary is forgotten; sizes as of `through`."""
     n = members(table)
-    return (table @ _by_attackers(n))[:, _attackers(n)] * views(n)
+    prior = views(n) if sizes is None else np.stack([_padded_views(n, size) for size in sizes.tolist()])[:, None]
+    return (table @ _by_attackers(n))[..., _attackers(n)] * prior
+
+
+@lru_cache(maxsize=64)
+def _padded_views(n: int, size: int) -> FloatArray:
+    """`views` (3 ** n,) of so many members, filled up with members that are plain."""
+    padded = np.zeros(STATES**n)
+    padded[: STATES**size] = views(size)
+    return padded
 
 
 @lru_cache(maxsize=16)
@@ -86,24 +95,30 @@ def prior(n: int, attacker_prior: float) -> FloatArray:
 
 
 def members(table: FloatArray) -> int:
-    """n of a table (K, 3 ** n)."""
-    return round(math.log(table.shape[1], STATES))
+    """n of a table (..., 3 ** n)."""
+    return round(math.log(table.shape[-1], STATES))
 
 
-def through(table: FloatArray, kernel: FloatArray) -> FloatArray:
-    """Tables (K, 3 ** n) after each member went through a transition kernel (3, 3)."""
-    for member in range(members(table)):
-        view = table.reshape(len(table), -1, STATES, STATES**member)
-        table = (kernel.T @ view).reshape(len(table), -1)
+def through(table: FloatArray, kernel: FloatArray, sizes: IntArray | None = None) -> FloatArray:
+    """Tables (B, K, 3 ** n) after each member went through a transition kernel (3, 3).
+
+    Of each block only the first members do, as many as its size (B,) says; by default all.
+    """
+    n, table = members(table), table.copy()
+    for member in range(n):
+        moving = slice(None) if sizes is None else np.flatnonzero(sizes > member)
+        view = table[moving].reshape(-1, STATES, STATES**member)
+        table[moving] = (kernel.T @ view).reshape(-1, *table.shape[1:])
     return table
 
 
 def at_most(table: FloatArray) -> FloatArray:
-    """Tables (K, 3 ** n) of the probability that no member's state is above its state in the entry."""
+    """Tables (..., 3 ** n) of the probability that no member's state is above its state in the entry."""
     total = table.copy()
     for member in range(members(table)):
-        view = total.reshape(len(table), -1, STATES, STATES**member)
-        np.add.accumulate(view, axis=2, out=view)
+        view = total.reshape(-1, STATES, STATES**member)
+        view[:, 1] += view[:, 0]
+        view[:, 2] += view[:, 1]
     return total
 
 
@@ -134,15 +149,17 @@ def transition(hijack: float, recovery: float) -> FloatArray:
     return np.array([[1 - hijack, 0, hijack], [0, 1 - hijack, hijack], [recovery, 0, 1 - recovery]])
 
 
-def awakened(table: FloatArray, team: int, hijack: float, attacker_prior: float) -> FloatArray:
-    """Tables (B, 3 ** n) of members of a team that was benign, after attackers may have awoken.
+def awakened(
+    table: FloatArray, team: int, hijack: float, attacker_prior: float, sizes: IntArray | None = None
+) -> FloatArray:
+    """Tables (B, K, 3 ** n) of members of a team that was benign, after attackers may have awoken.
 
     Each teammate is hijacked by itself; or, at the same chance that anybody is, all that attack awake together, as they
     would have been drawn beforehand. Either story has half the probability.
 
     Parameters
     ----------
-    table : (B, 3 ** n) ndarray
+    table : (B, K, 3 ** n) ndarray
         Of the benign team.
     team : int
         Members of the whole team.
@@ -150,10 +167,12 @@ def awakened(table: FloatArray, team: int, hijack: float, attacker_prior: float)
         Probability that a benign member turns into an attacker.
     attacker_prior : float
         Probability of each teammate to attack if anybody does.
+    sizes : (B,) int ndarray, optional
+        As of `through`.
     """
     benign, nobody = (1 - hijack) ** team, (1 - attacker_prior) ** team
-    alone = through(table, transition(hijack, 0.0))
-    drawn = through(table, transition(attacker_prior, 0.0))
+    alone = through(table, transition(hijack, 0.0), sizes)
+    drawn = through(table, transition(attacker_prior, 0.0), sizes)
     together = (1 - benign) * (drawn - nobody * table) / (1 - nobody) + benign * table
     return (alone + together) / 2
 
