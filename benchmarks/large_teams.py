@@ -69,7 +69,7 @@ class World:
         """Evidence that is drawn here instead of measured."""
         return type("Drawn", (Evidence,), {name: staticmethod(getattr(self, name)) for name in DRAWN})
 
-    def measure(self, smaller: _Subset, larger: _Subset) -> PairMeasure:
+    def measure(self, smaller: _Subset, larger: _Subset, *_: object) -> PairMeasure:
         a, d = smaller.members, larger.members - smaller.members
         cell = 2 * (not self.attackers.isdisjoint(a)) + (not self.attackers.isdisjoint(d))
         row = likelihoods.CLEAN + likelihoods.CELLS * self.kind + cell - 1 if cell else 0
@@ -82,7 +82,7 @@ class World:
         shown.members = boxes.members
         return shown
 
-    def changes(self, before: np.ndarray, now: _Subset) -> int:  # noqa: ARG002
+    def changes(self, before: np.ndarray, now: _Subset, *_: object) -> int:  # noqa: ARG002
         row = 0 if self.attackers.isdisjoint(now.members) else 1 + self.kind
         size = min(len(now.members), likelihoods.CHANGE_SIZES)
         table = self.model.changes[row, size - 1, likelihoods.crowd_bin(len(SHOWN))]

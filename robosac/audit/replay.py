@@ -10,7 +10,7 @@ from typing import Any
 
 import numpy as np
 
-from robosac import wire
+from robosac import decimals, wire
 from robosac.answers import ContradictedBox, Support, TestedHypothesis
 from robosac.audit.decisions import LoggedDecision, ReplayError, find
 from robosac.audit.events import FrameAnswered
@@ -261,6 +261,10 @@ def _agree(now: Any, then: Any) -> bool:
         return len(now) == len(then) and all(_agree(a, b) for a, b in zip(now, then, strict=True))
     if isinstance(now, float) and isinstance(then, int | float):
         return math.isclose(now, then, rel_tol=STATE_TOLERANCE, abs_tol=STATE_TOLERANCE)
+    if decimals.is_text(now) and decimals.is_text(then):
+        ours, logged = decimals.from_text(now), decimals.from_text(then)
+        near = {"rtol": STATE_TOLERANCE, "atol": STATE_TOLERANCE}
+        return ours.shape == logged.shape and np.allclose(ours, logged, **near)
     return bool(now == then)
 
 

@@ -10,6 +10,7 @@ from typing import Any
 
 import numpy as np
 
+from robosac import decimals
 from robosac.boxes import FloatArray
 from robosac.defenses.group_testing.lies import Lies
 from robosac.defenses.group_testing.steadiness import Steadiness
@@ -50,6 +51,11 @@ def keys(a: KeyArray, d: KeyArray) -> KeyArray:
     """Keys (n,) of tests of subsets ``a`` beside which ``d`` joined (``a`` 0: the ego alone); all uint64."""
     with np.errstate(over="ignore"):
         return a * _SPREAD + d
+
+
+def _boxes(kept: Any) -> FloatArray:
+    """Boxes (n, 4) as they are kept; older versions kept lists of numbers."""
+    return (decimals.from_text(kept) if isinstance(kept, str) else np.asarray(kept, dtype=np.float64)).reshape(-1, 4)
 
 
 @dataclass
@@ -138,7 +144,7 @@ class Memory:
             "tests": {f"{k:016x}": [f, s] for k, (f, s) in self.tests.items() if self.frame - f <= REPEAT_MEMORY},
             "evidence": self.evidence,
             "left": {name: [p, f] for name, (p, f) in self.left.items()},
-            "shown": {f"{key:016x}": boxes.tolist() for key, boxes in self.shown.items()},
+            "shown": {f"{key:016x}": decimals.as_text(boxes.ravel(), 6) for key, boxes in self.shown.items()},
             "shown_in": self.shown_in,
             "lies": self.lies.to_state(),
             "steadiness": self.steadiness.to_state(),
@@ -154,7 +160,7 @@ class Memory:
             evidence={name: [dict(item) for item in items] for name, items in state["evidence"].items()},
             left={name: (float(p), int(f)) for name, (p, f) in state["left"].items()},
             # neither is in the states of older versions
-            shown={int(key, 16): np.reshape(boxes, (-1, 4)) for key, boxes in state.get("shown", {}).items()},
+            shown={int(key, 16): _boxes(kept) for key, kept in state.get("shown", {}).items()},
             shown_in=int(state.get("shown_in", 0)),
             lies=Lies.from_state(state["lies"]) if "lies" in state else Lies(),
             steadiness=Steadiness.from_state(state["steadiness"]) if "steadiness" in state else Steadiness(),

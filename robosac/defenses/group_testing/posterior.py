@@ -55,6 +55,8 @@ class Posterior(Distribution):
     team : sequence of str
     limits : (int, int)
         Teammates up to which a team is one block; most of a block in larger teams.
+    known : ((1 + K,) ndarray, sequence of Block), optional
+        Weights of the kinds and blocks to go on from, instead of the prior of a team.
     """
 
     def __init__(
@@ -64,10 +66,14 @@ class Posterior(Distribution):
         attacker_prior: float,
         team: Sequence[str] = (),
         limits: tuple[int, int] = (EXACT, BLOCK),
+        known: tuple[FloatArray, Sequence[Block]] | None = None,
     ) -> None:
         self._attack_prior = attack_prior
         self._attacker_prior = attacker_prior
         self._exact, self._most = limits
+        if known is not None:
+            super().__init__(*known)
+            return
         prior = np.array([1 - attack_prior, *[attack_prior / kinds] * kinds])
         parts, count = [], 1 if len(team) <= self._exact else -(-len(team) // self._most)
         for part in np.array_split(np.arange(len(team)), count):
@@ -213,15 +219,13 @@ class Posterior(Distribution):
     def from_state(cls, state: Mapping[str, Any], attack_prior: float, attacker_prior: float) -> Posterior:
         """What `to_state` wrote."""
         weights = np.array(state["weights"], dtype=np.float64)
-        posterior = cls(len(weights) - 1, attack_prior, attacker_prior)
         team = []
         for block in state["blocks"]:
             table = sets.long(block["table"], len(weights) * sets.STATES ** len(block["members"]))
             table = table.reshape(len(weights), -1)
             table /= np.maximum(table.sum(axis=1, keepdims=True), _TINY)
             team.append(Block(block["members"], table))
-        posterior._hold(weights / weights.sum(), team)
-        return posterior
+        return cls(len(weights) - 1, attack_prior, attacker_prior, known=(weights, team))
 
     def _mix(self, after: FloatArray, awakened: FloatArray) -> None:
         """Let attacked teams go on as in ``after`` (B, K, 3 ** n), and a benign team as in ``awakened`` (B, 1, 3 ** n),

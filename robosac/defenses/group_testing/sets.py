@@ -8,6 +8,7 @@ from functools import lru_cache
 
 import numpy as np
 
+from robosac import decimals
 from robosac.boxes import FloatArray, IntArray
 
 PLAIN, COMPLEMENTARY, ATTACKS = range(3)
@@ -186,18 +187,21 @@ def products_but(each: FloatArray) -> FloatArray:
     return product
 
 
-def short(values: FloatArray) -> list[list[float]]:
-    """The places of the values (n,) that are not 0 to seven decimals, and those values so rounded.
+def short(values: FloatArray) -> str:
+    """The values (n,) in [0, 1] to seven decimals.
 
     Nothing is lost by it: in the next frame the hazards make more likely than that what is rounded away.
     """
-    rounded = values.round(7)
-    where = np.flatnonzero(rounded)
-    return [where.tolist(), rounded[where].tolist()]
+    return decimals.as_text(values, 7)
 
 
-def long(kept: Sequence[Sequence[float]], size: int) -> FloatArray:
-    """The array (size,) that `short` was given, but for its rounding."""
+def long(kept: str | Sequence[Sequence[float]], size: int) -> FloatArray:
+    """The array (size,) that `short` was given, but for its rounding.
+
+    States of older versions hold the places of those that are not 0, and these.
+    """
+    if isinstance(kept, str):
+        return decimals.from_text(kept)
     values = np.zeros(size)
     values[np.asarray(kept[0], dtype=np.int64)] = kept[1]
     return values
