@@ -138,7 +138,8 @@ def _paired_iou(a: FloatArray, b: FloatArray) -> FloatArray:
     total = a[:, 2] * a[:, 3] + b[:, 2] * b[:, 3] - area
     iou = np.zeros_like(area)
     np.divide(area, total, out=iou, where=total > 0)
-    return np.minimum(np.maximum(iou, 0.0), 1.0)
+    bounded: FloatArray = np.minimum(np.maximum(iou, 0.0), 1.0)
+    return bounded
 
 
 def _outline(boxes: FloatArray) -> tuple[FloatArray, FloatArray]:

@@ -7,6 +7,7 @@ from __future__ import annotations
 
 import base64
 import binascii
+from collections.abc import Mapping
 from typing import Any
 
 import numpy as np
@@ -14,15 +15,15 @@ import numpy as np
 from robosac.boxes import FloatArray
 
 _HEAD = "decimals"
-_TYPES = {"i4": np.dtype("<i4"), "i8": np.dtype("<i8")}
+_TYPES: Mapping[str, np.dtype[np.signedinteger[Any]]] = {"i4": np.dtype("<i4"), "i8": np.dtype("<i8")}
 _MOST_DIGITS = 9
 
 
 def as_text(values: FloatArray, digits: int) -> str:
     """Finite numbers (n,), each rounded to so many decimals and at most 9e18 in that unit, as text.
 
-    ``decimals:DIGITS:TYPE:`` and then, in base64, the whole numbers of that unit: TYPE is ``i4`` for 32 bits, ``i8`` for
-    64, little-endian.
+    ``decimals:DIGITS:TYPE:`` and then, in base64, the whole numbers of that unit, little-endian: TYPE is ``i4`` for 32
+    bits, ``i8`` for 64.
     """
     whole = np.rint(values * 10.0**digits)
     kind = "i4" if len(whole) == 0 or np.abs(whole).max() < 2**31 else "i8"
@@ -52,4 +53,4 @@ def from_text(text: Any) -> FloatArray:
 
 def is_text(value: Any) -> bool:
     """Whether a JSON value says that it is what `as_text` writes."""
-    return isinstance(value, str) and value.startswith(f"{_HEAD}:") and value.count(":") == 3  # noqa: PLR2004
+    return isinstance(value, str) and value.startswith(f"{_HEAD}:") and value.count(":") == 3

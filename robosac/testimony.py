@@ -65,7 +65,9 @@ class Testimony:
     def likelihood(self, points: FloatArray) -> FloatArray:
         """L at places (n, 2), ego frame: (agents, n), bilinear, within +- `MOST`, 0 outside a map."""
         turn, move = self._to_cells
-        place = (turn @ points.T).reshape(2, len(self.agents), len(points)) + move  # rows and columns of the padded maps
+        place = (turn @ points.T).reshape(
+            2, len(self.agents), len(points)
+        ) + move  # rows and columns of the padded maps
         first = np.minimum(np.maximum(np.floor(place), 0.0), self._last)
         y, x = np.minimum(np.maximum(place - first, 0.0), 1.0)
         padded, (row, column) = self._padded, first.astype(np.int64)
@@ -96,7 +98,8 @@ class Testimony:
     @cached_property
     def _starts(self) -> IntArray:
         """The first row (agents, 1) of each of the padded maps, one below the other."""
-        return np.arange(len(self.agents))[:, None] * self._padded.shape[1]
+        starts: IntArray = np.arange(len(self.agents))[:, None] * self._padded.shape[1]
+        return starts
 
     @cached_property
     def _padded(self) -> FloatArray:

@@ -263,8 +263,7 @@ def _agree(now: Any, then: Any) -> bool:
         return math.isclose(now, then, rel_tol=STATE_TOLERANCE, abs_tol=STATE_TOLERANCE)
     if decimals.is_text(now) and decimals.is_text(then):
         ours, logged = decimals.from_text(now), decimals.from_text(then)
-        near = {"rtol": STATE_TOLERANCE, "atol": STATE_TOLERANCE}
-        return ours.shape == logged.shape and np.allclose(ours, logged, **near)
+        return ours.shape == logged.shape and np.allclose(ours, logged, rtol=STATE_TOLERANCE, atol=STATE_TOLERANCE)
     return bool(now == then)
 
 

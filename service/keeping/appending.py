@@ -11,28 +11,32 @@ from sqlalchemy import Connection, insert
 from robosac.audit import Unsealed, digest
 from service.errors import SessionChanged, SessionOver
 from service.keeping.record import SessionRecord
-from service.keeping.rows import CHANGE, GET_TO_CHANGE, columns, read_row
+from service.keeping.rows import CHANGE, GET_BUT_STATE, GET_TO_CHANGE, columns, read_row
 from service.keeping.tables import audit_lines
 
 Change = Callable[[SessionRecord], Mapping[str, Any]]
 """Of a session as it is, the fields that change."""
 
 
-def append(
+def append(  # a transaction's work, and what was made ready for it
     connection: Connection,
     session_id: str,
     said: Unsealed,
     change: Change,
     check_room: Callable[[SessionRecord], None],
+    state: str | None = None,
 ) -> SessionRecord:
     """Change a session and append to its log; what it is then.
+
+    ``state`` is the text of the state that the change is to: then nothing long is read or written as JSON here, where
+    others wait.
 
     Raises
     ------
     SessionOver
         If there is no such session, or it has ended.
     """
-    row = connection.execute(GET_TO_CHANGE, {"this": session_id}).first()
+    row = connection.execute(GET_TO_CHANGE if state is None else GET_BUT_STATE, {"this": session_id}).first()
     if row is None or row.ended_at is not None:
         raise SessionOver
     record = read_row(row)
@@ -47,7 +51,7 @@ def append(
         audit_head=digest(line),
         revision=record.revision + bool(changes),
     )
-    changed = columns(after, *changes, "audit_seq", "audit_head", "revision")
+    changed = columns(after, *changes, "audit_seq", "audit_head", "revision", state=state)
     connection.execute(CHANGE.values(changed), {"this": session_id})
     connection.execute(insert(audit_lines), {"session_id": session_id, "seq": after.audit_seq, "line": line})
     return after

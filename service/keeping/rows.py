@@ -19,19 +19,20 @@ OPEN = sessions.c.ended_at.is_(None)
 ENDED = sessions.c.ended_at.is_not(None)
 GET = select(*(sessions.c[name] for name in FIELDS)).where(THIS)
 GET_TO_CHANGE = GET.with_for_update()  # SQLite, which knows no such clause, has locked everything by then
+GET_BUT_STATE = select(*(sessions.c[name] for name in FIELDS if name != "state")).where(THIS).with_for_update()
 CHANGE = update(sessions).where(THIS)
 NO_CHANGE = update(sessions).where(false()).values(ended_at=None)
 """A database that takes no changes refuses it all the same; PostgreSQL is asked nothing before the first statement."""
 
 
 def read_row(row: Row[Any]) -> SessionRecord:
-    """The session of a row of `FIELDS`."""
+    """The session of a row of `FIELDS`; without its state, where that is not in the row."""
     values = {name: json.loads(value) if name in _JSON else value for name, value in row._mapping.items()}
     return SessionRecord(**{**values, "teammates": tuple(values["teammates"])})
 
 
-def columns(record: SessionRecord, *names: str) -> dict[str, Any]:
-    """Columns of these fields, as touched now."""
-    values = {name: getattr(record, name) for name in names}
+def columns(record: SessionRecord, *names: str, state: str | None = None) -> dict[str, Any]:
+    """Columns of these fields, as touched now; ``state`` is the text of the one that is called so, if it is at hand."""
+    values = {name: getattr(record, name) for name in names if state is None or name != "state"}
     written = {name: json.dumps(value) if name in _JSON else value for name, value in values.items()}
-    return {**written, "touched_at": time.time()}
+    return {**written, **({} if state is None else {"state": state}), "touched_at": time.time()}

@@ -3,10 +3,21 @@
 from __future__ import annotations
 
 import asyncio
+import json
 from collections import OrderedDict
+from typing import NamedTuple
 
 from robosac.audit import Unsealed, Writer, compact
 from robosac.audit.events import Event, FrameAnswered
+
+
+class Ready(NamedTuple):
+    """A decision, ready to be kept."""
+
+    said: Unsealed
+    following: Writer
+    state: str
+    """What the defence remembers after it, as text."""
 
 
 async def unsealed(event: Event) -> Unsealed:
@@ -30,16 +41,16 @@ class Sealing:
         self._remembered = remembered
         self._writers: OrderedDict[str, Writer] = OrderedDict()
 
-    async def decision(self, session_id: str, event: FrameAnswered, follows: int | None) -> tuple[Unsealed, Writer]:
+    async def decision(self, session_id: str, event: FrameAnswered, follows: int | None) -> Ready:
         """As `unsealed`, and what to `follow` once it is kept; ``follows`` is the latest frame before.
 
         Until then nothing is remembered of the session: what may not be in the log must not be taken for said.
         """
         writer = self._writers.pop(session_id, None) or Writer(self._full_every)
 
-        def work() -> tuple[Unsealed, Writer]:
+        def work() -> Ready:
             record, following = writer.record(event, follows)
-            return Unsealed(record), following
+            return Ready(Unsealed(record), following, json.dumps(event.state))
 
         return await asyncio.to_thread(work)
 

@@ -8,7 +8,7 @@ from typing import Any
 
 from sqlalchemy import Connection, Delete, Select, Update, func, insert, select
 
-from robosac.audit import FULL_EVERY, Unsealed, digest
+from robosac.audit import FULL_EVERY, digest
 from robosac.audit.events import DetectorChanged, Event, FrameAnswered, SessionEnded, TeamChanged, TokenRenewed
 from service.errors import AuditFull, FrameDecided, SessionChanged
 from service.keeping import migrations, once
@@ -18,7 +18,7 @@ from service.keeping.patience import Patience
 from service.keeping.purging import locked, older_messages, parts
 from service.keeping.record import SessionRecord
 from service.keeping.rows import ENDED, FIELDS, GET, NO_CHANGE, OPEN, columns, read_row
-from service.keeping.sealing import Sealing, unsealed
+from service.keeping.sealing import Ready, Sealing, unsealed
 from service.keeping.seen import Seen
 from service.keeping.tables import audit_lines, kept_messages, sessions
 
@@ -151,9 +151,9 @@ class Store:
                     connection.execute(older_messages(record.session_id, event.frame - keep_frames + 1))
             patience.commit()
 
-        said, following = await self._sealing.decision(record.session_id, event, record.last_frame)
-        kept = await self._append(record.session_id, event, change, keep, said)
-        self._sealing.follow(record.session_id, following)
+        ready = await self._sealing.decision(record.session_id, event, record.last_frame)
+        kept = await self._append(record.session_id, event, change, keep, ready)
+        self._sealing.follow(record.session_id, ready.following)
         return kept
 
     async def change_team(self, record: SessionRecord, event: TeamChanged, token_ids: Mapping[str, str]) -> None:
@@ -277,13 +277,13 @@ class Store:
         event: Event,
         change: Change,
         keep: Callable[[Connection], None] = lambda _: None,
-        written: Unsealed | None = None,
+        ready: Ready | None = None,
     ) -> SessionRecord:
         """Change a session and append to its log, in one transaction; what takes long is done before it."""
-        said = await unsealed(event) if written is None else written
+        said, state = (await unsealed(event), None) if ready is None else (ready.said, ready.state)
 
         def work(connection: Connection) -> SessionRecord:
-            after = append(connection, session_id, said, change, self.check_room)
+            after = append(connection, session_id, said, change, self.check_room, state)
             keep(connection)
             return after
 

@@ -41,6 +41,9 @@ class Distribution:
         self.version = 0
         """Grows whenever it stands for something else."""
         self._kinds = len(weights) - 1
+        self._marginals: FloatArray | None = None
+        self._known_below: FloatArray | None = None
+        self._known_clean: FloatArray | None = None
         self._hold(weights, team)
 
     @property
@@ -74,8 +77,8 @@ class Distribution:
 
     def clean_within(self, block: int) -> FloatArray:
         """Probability (2 ** n,) that nobody of each subset of a block attacks, by its mask there."""
-        within: FloatArray = (self._weights @ self._clean)[block, : 1 << len(self._names[block])]
-        return within
+        within: FloatArray = self._weights @ self._clean[block]
+        return within[: 1 << len(self._names[block])]
 
     def masks(self, subsets: BoolArray) -> IntArray:
         """Subsets (n, S), in the order of `members`, as masks (B, n): block by block, bit by bit."""
@@ -92,7 +95,8 @@ class Distribution:
     def unattacked(self, masks: IntArray) -> FloatArray:
         """Probability (n,) that nobody of each subset attacks."""
         clean = self._clean[np.arange(len(masks))[:, None], :, masks]  # (B, n, 1 + K)
-        return np.multiply.reduce(clean, axis=0) @ self._weights
+        unattacked: FloatArray = clean.prod(axis=0) @ self._weights
+        return unattacked
 
     def cells(self, a: IntArray, d: IntArray) -> FloatArray:
         """Joint probabilities (n, CLEAN + 3 K) of what pairs of disjoint subsets hold, by rows of an `EvidenceModel`.

@@ -176,7 +176,7 @@ class Evidence:
         likelihood = self._neutral(strangeness.weights @ finding.likelihood, cells)
         weight = self._weight(finding, cells, likelihood)
         strangeness.learn(finding.likelihood, cells, weight)
-        posterior.learn(*masks.T.tolist(), weight * np.log(likelihood))
+        posterior.learn(masks, weight * np.log(likelihood))
         self._keep(finding, _log_odds(posterior.marginals()) - _log_odds(before))
 
     def _neutral(self, likelihood: FloatArray, cells: FloatArray) -> FloatArray:

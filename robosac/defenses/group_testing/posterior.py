@@ -8,7 +8,7 @@ from typing import Any
 
 import numpy as np
 
-from robosac.boxes import FloatArray
+from robosac.boxes import FloatArray, IntArray
 from robosac.defenses.group_testing import blocks, sets
 from robosac.defenses.group_testing.blocks import Block
 from robosac.defenses.group_testing.distribution import BoolArray, Distribution
@@ -95,10 +95,11 @@ class Posterior(Distribution):
         log_likelihood : (CLEAN + 3 K,) ndarray
             Of the outcome, by columns of `cells`.
         """
-        self.learn(*self.masks(np.stack([a, d])).T.tolist(), log_likelihood)
+        self.learn(self.masks(np.stack([a, d])), log_likelihood)
 
-    def learn(self, of_a: Sequence[int], of_d: Sequence[int], log_likelihood: FloatArray) -> None:
-        """As `update`, of subsets as masks, block by block."""
+    def learn(self, masks: IntArray, log_likelihood: FloatArray) -> None:
+        """As `update`, of subsets as `masks` (B, 2)."""
+        of_a, of_d = masks.T.tolist()
         likelihood = np.exp(log_likelihood - log_likelihood.max())
         by_kind = likelihood[CLEAN:].reshape(self._kinds, CELLS)
         by_level = np.empty((1 + self._kinds, sets.STATES, sets.STATES))  # the greatest states in a and in d
@@ -125,9 +126,7 @@ class Posterior(Distribution):
             below = sets.at_most(tables)
         self._replace(self._weights * evidence[-1], tables, below)
 
-    def _expected(
-        self, by_level: FloatArray, touched: Sequence[int], a: Sequence[int], d: Sequence[int]
-    ) -> FloatArray:
+    def _expected(self, by_level: FloatArray, touched: Sequence[int], a: Sequence[int], d: Sequence[int]) -> FloatArray:
         """For each touched block, with its masks of a and d, the likelihood (1 + K, 9) by the levels in it alone,
         expected over what the other blocks hold.
         """
