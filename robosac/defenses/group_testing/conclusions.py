@@ -137,8 +137,8 @@ def _clear(found: Findings) -> None:
     """Where nothing is wrong with any object, whoever is fused is less likely to lie: the most of them that were
     fused so. Holes count only where vehicles were taken away.
     """
-    clean = [subset for subset, shown in found.shown.items() if not _wrong(found, shown)]
-    best = max(clean, key=len, default=())
+    largest_first = sorted(found.shown, key=len, reverse=True)
+    best = next((subset for subset in largest_first if not _wrong(found, found.shown[subset])), ())
     cleared = tuple(name for name in best if not found.lies.worst(name))
     if not cleared:
         return

@@ -55,6 +55,7 @@ class Findings:
         self.decoded: set[Hypothesis] = set()
         self.hearing: Hearing | None = None
         self.pose: FloatArray = np.eye(4)
+        self._gone: dict[tuple[Hypothesis, Hypothesis], FloatArray] = {}
         self._effects: dict[tuple[Hypothesis, Hypothesis, Hypothesis], list[Lie]] = {}
 
     def learn(self, outcome: Outcome) -> Shown | None:
@@ -94,6 +95,14 @@ class Findings:
             self._effects[asked] = effects(self.shown[joined], self.shown[without], suspects)
         return self._effects[asked]
 
+    def gone(self, joined: Hypothesis, without: Hypothesis) -> FloatArray:
+        """Boxes (n, 6) that one decoded fusion shows and another has lost although others support them."""
+        asked = joined, without
+        if asked not in self._gone:
+            part = self.shown[without]
+            self._gone[asked] = part.boxes[gone(self.shown[joined], part)]
+        return self._gone[asked]
+
     def vouching(self, fused: Hypothesis, lie: Lie) -> Hypothesis:
         """Those fused whose own messages go with a ghost or a hole, if they are several and not all."""
         shown = self.shown[fused]
@@ -116,8 +125,7 @@ class Findings:
         """Whether those who support a vehicle in a hole show it without the others: else nobody has taken it away."""
         if witnesses not in self.shown:
             return False
-        part = self.shown[witnesses]
-        found = part.boxes[gone(self.shown[answer], part)]
+        found = self.gone(answer, witnesses)
         return bool(len(found)) and bool(np.hypot(*(found[:, :2] - hole.place).T).min() <= REACH_M)
 
     def said(self) -> Testimony:

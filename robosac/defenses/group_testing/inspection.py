@@ -79,20 +79,22 @@ class Inspection:
         left.sort(key=lambda name: round(suspicion[name], 9))
         suspects = [name for name in left if suspicion[name] > SUSPECT or self._found.lies.worst(name)]
         doubtful = [name for name in left if name not in suspects]
-        groups = [self._with(answer, doubtful[:count]) for count in range(len(doubtful), 0, -1)]
-        asked = groups[-1:]
+        asked = [self._with(answer, doubtful[:1])] if doubtful else []
         # every other frame, or a liar among them would spoil every test
         turn = self._found.hearing is None or self._found.known.memory.frame % 2 == 0
-        if len(groups) > 1 and turn:
-            honest = posterior.unattacked(posterior.masks(self._found.known.rows(groups))) >= SUSPECT
-            asked = [groups[int(honest.argmax())]] if honest.any() else asked
+        if len(doubtful) > 1 and turn:
+            groups = [doubtful[:count] for count in range(len(doubtful), 0, -1)]
+            rows = self._found.known.rows([(*answer, *group) for group in groups])
+            honest = posterior.unattacked(posterior.masks(rows)) >= SUSPECT
+            asked = [self._with(answer, groups[int(honest.argmax())])] if honest.any() else asked
         for suspect in suspects[-2:][::-1]:
             asked += [(suspect,), self._with(answer, [suspect])]
         return asked
 
     def _with(self, answer: Hypothesis, others: Collection[str]) -> Hypothesis:
         """The answer and others, in the order of the team."""
-        return tuple(name for name in self._found.team if name in answer or name in others)
+        together = {*answer, *others}
+        return tuple(name for name in self._found.team if name in together)
 
     def _hardly_explained(self, answer: Hypothesis) -> list[Lie]:
         """What is wrong in the answer, and explained, while only one of those fused was left out: what two do together

@@ -74,6 +74,8 @@ class Lies:
 
     def add(self, teammate: str, counts: Mapping[str, int]) -> float:
         """Take in the lies of a frame by kind; what new levels add to the teammate's suspicion."""
+        if teammate not in self.levels and not any(counts.values()):
+            return 0.0
         known = self.levels.setdefault(teammate, {})
         weight = 0.0
         for kind, rule in RULES.items():
