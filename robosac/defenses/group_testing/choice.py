@@ -23,6 +23,7 @@ DEPENDENCE = 0.85
 """Weight of a comparison within a frame: what makes one outcome odd, a crossing or a crowd, makes others odd too."""
 UNDILUTED_SIZE = 8
 """Largest subset whose evidence counts in full."""
+_CERTAIN = 1e-12
 
 
 def gain(sizes: FloatArray | IntArray) -> FloatArray:
@@ -65,6 +66,18 @@ def expected_information(known: Knowledge, subsets: BoolArray, decoded: BoolArra
         told = known.model.change_information(sizes[again], boxes, alone[again])
         bits[again] += once * told * dilution(sizes[again])
     return (bits + _of_pairs(known, subsets, decoded)) * memory.steadiness.trust
+
+
+def most_information(known: Knowledge, subsets: BoolArray) -> FloatArray:
+    """Bits (n,) that `expected_information` does not exceed before anything is decoded: neither comparison tells more
+    than is open, the entropy of whether a subset is attacked.
+    """
+    posterior, memory = known.posterior, known.memory
+    p = np.minimum(np.maximum(posterior.unattacked(posterior.masks(subsets)), _CERTAIN), 1.0 - _CERTAIN)
+    doubt = -(p * np.log2(p) + (1.0 - p) * np.log2(1.0 - p))
+    again = [key in memory.shown for key in known.keys(subsets).tolist()]
+    most: FloatArray = doubt * (DEPENDENCE + np.array(again)) * memory.steadiness.trust
+    return most
 
 
 def _of_pairs(known: Knowledge, subsets: BoolArray, decoded: BoolArray) -> FloatArray:

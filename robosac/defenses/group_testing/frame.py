@@ -73,10 +73,16 @@ class JudgedFrame:
         options = candidates(known.posterior, known.rows([self._team])[0], decoded)
         if not len(options):
             return None
-        bits = choice.expected_information(known, options, decoded, ego_sees=self._evidence.ego_witnesses)
-        worth = choice.utility(known.posterior, options) - max(0.0, self._best_answer()[1])
-        value = np.maximum(0.0, worth) + choice.INFORMATION_VALUE * bits - choice.TEST_COST
-        if len(self._team) > EXACT and not outcomes and passes > 1:
+        ego_sees = self._evidence.ego_witnesses
+        gained = np.maximum(0.0, choice.utility(known.posterior, options) - max(0.0, self._best_answer()[1]))
+        may_wait = len(self._team) > EXACT and not outcomes and passes > 1
+        if not outcomes and not may_wait:  # what cannot be the best is not worth reckoning
+            most = choice.INFORMATION_VALUE * choice.most_information(known, options)
+            likely = gained + most >= gained.max() - 2 * _TIE
+            options, gained = options[likely], gained[likely]
+        bits = choice.expected_information(known, options, decoded, ego_sees=ego_sees)
+        value = gained + choice.INFORMATION_VALUE * bits - choice.TEST_COST
+        if may_wait:
             beside = (options & cleared(known.posterior.marginals())).sum(axis=1) >= WITNESSES
             if (beside & (bits >= WORTH_WAITING)).any():
                 value = np.where(beside, bits, 0.0)

@@ -105,9 +105,11 @@ def changes(before: FloatArray, now: FloatArray, real: Callable[[FloatArray], Bo
 
 def _nowhere(boxes: FloatArray, others: FloatArray) -> FloatArray:
     """Those boxes that are none of the others."""
-    x, y = np.moveaxis(boxes[:, None, :2] - others[None, :, :2], -1, 0)
-    cos, sin = np.cos(boxes[:, 2, None]), np.sin(boxes[:, 2, None])
-    turned = np.abs((boxes[:, 2, None] - others[None, :, 2] + np.pi / 2) % np.pi - np.pi / 2)
-    same = (np.abs(cos * x + sin * y) < ALONG_M) & (np.abs(cos * y - sin * x) < ACROSS_M) & (turned < TURN_RAD)
-    nowhere: FloatArray = boxes[~same.any(axis=1)]
+    x, y = boxes[:, :1] - others[:, 0], boxes[:, 1:2] - others[:, 1]
+    cos, sin = np.cos(boxes[:, 2:3]), np.sin(boxes[:, 2:3])
+    one, other = np.nonzero((np.abs(cos * x + sin * y) < ALONG_M) & (np.abs(cos * y - sin * x) < ACROSS_M))
+    turned = np.abs((boxes[one, 2] - others[other, 2] + np.pi / 2) % np.pi - np.pi / 2)
+    alone = np.ones(len(boxes), dtype=bool)
+    alone[one[turned < TURN_RAD]] = False
+    nowhere: FloatArray = boxes[alone]
     return nowhere

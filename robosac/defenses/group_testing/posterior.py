@@ -113,17 +113,14 @@ class Posterior(Distribution):
             expected = self._expected(by_level, touched, [of_a[b] for b in touched], [of_d[b] for b in touched])
         else:
             expected = by_level.reshape(1, 1 + self._kinds, -1)
-        where = np.stack([sets.levels(self._width, of_a[b], of_d[b]) for b in touched])
-        updated = self._tables[touched] * np.take_along_axis(expected, where[:, None], axis=2)
+        updated = expected @ np.stack([sets.by_level(self._width, of_a[b], of_d[b]) for b in touched])
+        updated *= self._tables[touched]
         evidence = updated.sum(axis=2)
         updated /= np.maximum(evidence, _TINY)[:, :, None]
-        tables, below = self._tables.copy(), self._below
-        tables[touched] = updated
-        if len(touched) < len(tables):
-            below = below.copy()
-            below[touched] = sets.at_most(updated)
-        else:
-            below = sets.at_most(tables)
+        tables, below = updated, None
+        if len(touched) < len(self._tables):
+            tables, below = self._tables.copy(), self._below.copy()
+            tables[touched], below[touched] = updated, sets.at_most(updated)
         self._replace(self._weights * evidence[-1], tables, below)
 
     def _expected(self, by_level: FloatArray, touched: Sequence[int], a: Sequence[int], d: Sequence[int]) -> FloatArray:

@@ -137,6 +137,11 @@ def marginal(table: FloatArray, kept: Sequence[int]) -> FloatArray:
 
 
 @lru_cache(maxsize=1024)
+def by_level(n: int, a: int, d: int) -> FloatArray:
+    """Matrix (9, 3 ** n) that gives each entry what belongs to its `levels`."""
+    return np.eye(STATES**2)[:, levels(n, a, d)]
+
+
 def levels(n: int, a: int, d: int) -> IntArray:
     """Of each entry (3 ** n,), the greatest states in subsets ``a`` and ``d`` (their bits): ``3 * in_a + in_d``."""
     bits = 1 << np.arange(n)[:, None]
