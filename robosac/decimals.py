@@ -40,7 +40,7 @@ def from_text(text: Any) -> FloatArray:
     """
     if not is_text(text):
         raise ValueError("no text of decimals")
-    _, digits, kind, content = text.split(":", 3)
+    _, digits, kind, content = [*text.split(":", 3), "", ""][:4]
     if not digits.isdecimal() or int(digits) > _MOST_DIGITS or kind not in _TYPES:
         raise ValueError(f"decimals of an unknown form: {digits[:8]}, {kind[:8]}")
     try:
@@ -53,4 +53,4 @@ def from_text(text: Any) -> FloatArray:
 
 def is_text(value: Any) -> bool:
     """Whether a JSON value says that it is what `as_text` writes."""
-    return isinstance(value, str) and value.startswith(f"{_HEAD}:") and value.count(":") == 3
+    return isinstance(value, str) and value.startswith(f"{_HEAD}:")

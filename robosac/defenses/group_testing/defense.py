@@ -96,7 +96,7 @@ class GroupTestingSettings(DefenseSettings):
             raise CalibrationError("group_testing needs the calibration of a detector")
         decided = self.at_calibration(calibration)
         model = calibration.at(decided.pose_error_m or 0.0)
-        return GroupTesting(model.with_lies() if calibration.witnessed and decided.judge_objects else model, decided)
+        return GroupTesting(model.with_lies if calibration.witnessed and decided.judge_objects else model, decided)
 
 
 @dataclass(frozen=True)

@@ -26,15 +26,20 @@ class Knowledge:
 
     def __post_init__(self) -> None:
         self.members = self.posterior.members
+        self._rows: dict[Hypothesis, BoolArray] = {}
         self._index = {name: i for i, name in enumerate(self.members)}
         self._numbers = {name: identity(name) for name in self.members}
         self._identities = np.array(list(self._numbers.values()), dtype=np.uint64)
 
     def rows(self, subsets: Sequence[Hypothesis]) -> BoolArray:
         """Subsets as rows (n, S) of booleans over the members."""
-        rows = np.zeros((len(subsets), len(self.members)), dtype=bool)
+        rows = np.empty((len(subsets), len(self.members)), dtype=bool)
         for row, subset in enumerate(subsets):
-            rows[row, [self._index[name] for name in subset]] = True
+            known = self._rows.get(subset)
+            if known is None:
+                known = self._rows[subset] = np.zeros(len(self.members), dtype=bool)
+                known[[self._index[name] for name in subset]] = True
+            rows[row] = known
         return rows
 
     def names(self, row: BoolArray, team: Hypothesis) -> Hypothesis:

@@ -106,6 +106,7 @@ class EvidenceModel:
             if not (table > 0).all() or abs(table.sum(axis=-1) - 1).max() > _TOLERANCE:
                 raise CalibrationError(f"{name} must hold positive probabilities that sum to 1")
 
+    @cached_property
     def with_lies(self) -> EvidenceModel:
         """The same likelihoods, and those of the kind `LIE`, which are the unattacked ones."""
         pairs = np.concatenate([self.pairs, np.repeat(self.pairs[:1], CELLS, axis=0)])
@@ -181,7 +182,8 @@ class EvidenceModel:
         """
         tables = self.changes[:, np.minimum(sizes, CHANGE_SIZES) - 1, np.searchsorted(CROWD_EDGES, boxes, side="right")]
         clean, attacked = cells[:, :CLEAN].sum(axis=1), cells[:, CLEAN::CELLS]
-        shown = np.stack([clean[:, None] * tables[0], np.einsum("nk,knc->nc", attacked, tables[1:])], axis=1)
+        by_kind = (attacked[:, None] @ tables[1:].swapaxes(0, 1))[:, 0]
+        shown = np.stack([clean[:, None] * tables[0], by_kind], axis=1)
         bits = _entropy(np.stack([clean, attacked.sum(axis=1)], axis=1))
         bits += _entropy(shown.sum(axis=1)) - _entropy(shown.reshape(len(shown), -1))
         return np.maximum(bits, 0.0)

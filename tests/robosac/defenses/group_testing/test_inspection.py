@@ -11,7 +11,7 @@ from robosac.defenses.group_testing import GroupTesting, GroupTestingSettings
 from tests.robosac.defenses.group_testing.conversing import TEAM, make_model, run_frame
 from tests.robosac.testifying import saying
 
-MODEL = make_model().with_lies()
+MODEL = make_model().with_lies
 DEFENSE = GroupTesting(MODEL)
 SEEN = np.array([[x, y, 4.5, 1.9, 0.0, 0.9] for x in (-22.4, -7.4, 7.6, 22.6) for y in (-12.3, 12.7)])
 """What everybody sees."""

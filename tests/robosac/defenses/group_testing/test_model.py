@@ -99,7 +99,7 @@ def test_what_changes_promise_is_the_mutual_information(model, rng):
 
 def test_lies_look_like_nobody_attacks(model, rng):
     """Whatever a whole fusion shows, it says nothing of lies: for the other kinds all is as before."""
-    lying = model.with_lies()
+    lying = model.with_lies
     assert lying.kinds == (*model.kinds, LIE)
     a, d = rng.integers(0, 9, 12), rng.integers(1, 9, 12)
     tables = lying.tables(a, d)
@@ -112,7 +112,7 @@ def test_lies_look_like_nobody_attacks(model, rng):
 
 def test_honest_looks_clear_nobody_of_lies():
     """They raise the odds of "clean" and of a lie alike, and lower those of the other kinds."""
-    model = make_model().with_lies()
+    model = make_model().with_lies
     posterior = Posterior(len(model.kinds), 0.5, 0.25, ["a", "b"])
     rows = np.array([[False, False], [True, False]])
 

@@ -10,7 +10,7 @@ from robosac.defenses.group_testing.model import CHANGE_EDGES, CLEAN, LOSS_EDGES
 from robosac.defenses.group_testing.strangeness import PRIOR, STRETCHES, Strangeness, stretched
 from tests.robosac.defenses.group_testing.conversing import make_model
 
-MODEL = make_model().with_lies()
+MODEL = make_model().with_lies
 LIES = slice(-3, None)
 
 
