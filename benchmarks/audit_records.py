@@ -6,7 +6,7 @@ import json
 import secrets
 import time
 from collections import Counter
-from collections.abc import Iterator
+from collections.abc import Iterator, Mapping
 
 import numpy as np
 import torch
@@ -17,6 +17,7 @@ from robosac.audit import FULL_EVERY, GENESIS, Unsealed, Writer, commitment
 from robosac.audit.events import FrameAnswered, Proof
 from robosac.detectors import Message, load
 from robosac.evaluation.frames import Sensed, under_attack
+from robosac.fusion import FusionResult
 from robosac.scenes import IntersectionScene
 from robosac.session import Session
 
@@ -68,26 +69,38 @@ def events(teammates: int, attackers: int, frames: int, seed: int, signed: bool)
         sent = {name: met.teammates.get(name) or like(honest[i % len(honest)], rng) for i, name in enumerate(team)}
         before = session.previous
         result = session.answer(frame, met.ego, sent)
-        seed_text, said = secrets.token_hex(32), {EGO: met.ego, **sent}
-        proofs = {
-            name: Proof(
-                digest=wire.content_digest(frame, name, message),
-                signature=secrets.token_bytes(64) if signed else None,
-            )
-            for name, message in said.items()
-        }
-        spent = {**result.timings_ms, "receive": 2.125, "gather": 0.017, "queue": 0.125, "total": 61.25}
-        yield FrameAnswered(
-            **dict(result.answer(frame, {}, spent, EGO)),
-            seed=seed_text,
-            ego_pose=met.ego.pose,
-            messages=proofs,
-            previous_frame=None if before is None else before.frame,
-            out_of_time=result.out_of_time,
-            fault=result.fault,
-            state=dict(result.state),
-            next_seed_commitment=commitment(seed_text),
+        yield event(result, frame, met.ego, sent, None if before is None else before.frame, signed)
+
+
+def event(  # all that an event says
+    result: FusionResult,
+    frame: int,
+    ego: Message,
+    sent: Mapping[str, Message],
+    previous_frame: int | None,
+    signed: bool,
+) -> FrameAnswered:
+    """What a gateway puts on record of a frame."""
+    seed_text, said = secrets.token_hex(32), {EGO: ego, **sent}
+    proofs = {
+        name: Proof(
+            digest=wire.content_digest(frame, name, message),
+            signature=secrets.token_bytes(64) if signed else None,
         )
+        for name, message in said.items()
+    }
+    spent = {**result.timings_ms, "receive": 2.125, "gather": 0.017, "queue": 0.125, "total": 61.25}
+    return FrameAnswered(
+        **dict(result.answer(frame, {}, spent, EGO)),
+        seed=seed_text,
+        ego_pose=ego.pose,
+        messages=proofs,
+        previous_frame=previous_frame,
+        out_of_time=result.out_of_time,
+        fault=result.fault,
+        state=dict(result.state),
+        next_seed_commitment=commitment(seed_text),
+    )
 
 
 def like(message: Message, rng: np.random.Generator) -> Message:
