@@ -8,6 +8,7 @@ from __future__ import annotations
 
 from collections.abc import Collection
 from dataclasses import dataclass
+from functools import cached_property
 
 import numpy as np
 
@@ -63,7 +64,7 @@ class Claims:
         """Some of the boxes (n,)."""
         return Claims(self.boxes[which], self.witnesses, self.likelihood[:, which])
 
-    @property
+    @cached_property
     def supporting(self) -> BoolArray:
         """Who (witnesses, n) supports which box."""
         return self.likelihood >= SUPPORTS

@@ -205,7 +205,9 @@ class Shown:
 
     def vouched(self, joining: Hypothesis) -> BoolArray:
         """Which boxes (n,) somebody supports who is not among the joining: nothing that these may have made up."""
-        supported: BoolArray = np.atleast_1d(self.claims.without(joining).supporting.any(axis=0))
+        theirs = [i for i, name in enumerate(self.claims.witnesses) if name in joining]
+        supporting = self.claims.supporting
+        supported: BoolArray = supporting.sum(axis=0) > supporting[theirs].sum(axis=0)
         return supported
 
     @cached_property

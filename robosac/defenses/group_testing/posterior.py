@@ -136,7 +136,8 @@ class Posterior(Distribution):
         chance[..., 1:] -= chance[..., :-1].copy()
         greater = by_level[:, _GREATER[:, None, :, None], _GREATER[None, :, None, :]]
         flat = greater.reshape(len(by_level), sets.STATES**2, sets.STATES**2)
-        return (flat @ chance.reshape(*chance.shape[:2], -1, 1))[..., 0]
+        expected: FloatArray = (flat * chance.reshape(*chance.shape[:2], 1, -1)).sum(axis=-1)
+        return expected
 
     def step(self, hazards: Hazards) -> None:
         """Go to the next frame: teammates are hijacked or recover, and the kind of attack may change."""
