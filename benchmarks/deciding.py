@@ -1,4 +1,5 @@
-"""What a frame of group testing spends beside the decoder, in decoder passes: testimony, tests of messages, deciding, storing.
+"""What a frame of group testing spends beside the decoder, in decoder passes: testimony, tests of messages, deciding,
+storing.
 
 One thread; validation scenes, nobody attacks, after the first frames of each session. A scene has five teammates; more
 of them send what one of these sends, with noise. Storing is into a SQLite file, and ends with what is committed.

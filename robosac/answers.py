@@ -241,6 +241,9 @@ class FrameAnswer(Typed):
     alike: tuple[Likeness, ...] = Field(
         (), exclude_if=lambda value: not value, description="Maps that are strangely alike, most alike first."
     )
+    unread: tuple[str, ...] = Field(
+        (), exclude_if=lambda value: not value, description="Teammates whose testimony there was no time to read."
+    )
     deadline_met: bool
     degraded_by: Literal["deadline", "fault"] | None = Field(description="What cut the defence short, if anything.")
     timings_ms: dict[str, float]

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import math
 import time
-from collections.abc import Callable, Iterator
+from collections.abc import Callable, Collection, Iterator
 from contextlib import contextmanager
 
 SAFETY = 1.2
@@ -51,6 +51,21 @@ class Deadline:
         self._left -= fits
         return fits
 
+    def reading(self, share: float) -> Callable[[Collection[str]], bool]:
+        """Whether there is time to read the messages of some agents, to be asked of one group after another just before
+        each is read. All together get a share of the time that is left now.
+        """
+        began = before = self.clock()
+        end, dearest_s = began + share * (self._end - began), 0.0
+
+        def fits(_: Collection[str]) -> bool:
+            nonlocal before, dearest_s
+            now = self.clock()
+            before, dearest_s = now, max(dearest_s, now - before)
+            return now + SAFETY * dearest_s <= end
+
+        return fits
+
     @property
     def is_met(self) -> bool:
         """Whether there is time left for what was reserved."""
@@ -58,7 +73,14 @@ class Deadline:
 
 
 class Recorded(Deadline):
-    """One that passed after so many hypotheses, to make a decision again that time cut short."""
+    """One that passed after so many hypotheses, if it did, and without the testimony of some teammates, to make a
+    decision again that time cut short.
+    """
 
-    def __init__(self, hypotheses: int) -> None:
+    def __init__(self, hypotheses: int | None, unread: Collection[str] = ()) -> None:
         super().__init__(hypotheses=hypotheses)
+        self._unread = frozenset(unread)
+
+    def reading(self, share: float) -> Callable[[Collection[str]], bool]:  # noqa: ARG002 (it is known what was read)
+        """As it was: all but those groups in which somebody's was not read."""
+        return self._unread.isdisjoint

@@ -7,7 +7,7 @@ detector decodes them, the consensus test judges, and the defence learns, until 
 from __future__ import annotations
 
 import logging
-from collections.abc import Generator, Iterator, Mapping, Sequence
+from collections.abc import Collection, Generator, Iterator, Mapping, Sequence
 from contextlib import contextmanager
 from dataclasses import dataclass, field, fields
 from typing import Any, TypeVar
@@ -45,6 +45,8 @@ __all__ = ["FrameRun", "FusionResult", "Steps", "UnverifiedAnswer", "finished", 
 
 logger = logging.getLogger(__name__)
 
+READING_SHARE = 0.5
+"""Of the time that is left, for testimony: without it there is an answer, without time for a pass there is none."""
 T = TypeVar("T")
 Steps = Generator[None, None, T]
 """Work that pauses before each of its larger parts, so that the work of others can take turns with it."""
@@ -134,6 +136,7 @@ class FrameRun:
     outcomes: list[Outcome] = field(default_factory=list)
     boxes: dict[Hypothesis, FloatArray] = field(default_factory=dict)
     testimony: Testimony | None = None
+    unread: tuple[str, ...] = ()
     out_of_time: bool = False
     fault: str | None = None
 
@@ -155,7 +158,7 @@ class FrameRun:
             prepared = self._prepare(passed)
             if getattr(self.defense, "asks_witnesses", False):
                 yield
-                self._hear(passed)
+                self._hear(passed, trusted_in(state))
             decision = yield from self._converse(prepared, list(passed), state, rng)
             answered = yield from self._assemble(prepared, decision)
         except Exception as error:
@@ -173,6 +176,7 @@ class FrameRun:
         return FusionResult(
             **decided | answered,
             alike=screened.alike,
+            unread=self.unread,
             hypotheses=tuple(self.outcomes),
             deadline_met=self.deadline.is_met,
             out_of_time=self.out_of_time,
@@ -189,14 +193,19 @@ class FrameRun:
         with self._spending("prepare"):
             return self.detector.prepare(self.ego, teammates)
 
-    def _hear(self, teammates: Mapping[str, Message]) -> None:
-        """Ask the witness what each message says by itself."""
+    def _hear(self, teammates: Mapping[str, Message], trusted: Collection[str]) -> None:
+        """Ask the witness what each message says by itself, of as many as there is time for: the ego's first, then
+        those of teammates that are trusted.
+        """
         with self._spending("testimony"):
             if isinstance(self.detector, Testifying):
                 said = self.detector.testify(self.ego, teammates)
                 self.testimony = None if said is None else said.of({EGO, *teammates})
             elif (witness := witness_of(self.detector.info)) is not None:
-                self.testimony = witness.testify(EGO, {EGO: self.ego, **teammates})
+                fits = self.deadline.reading(READING_SHARE)
+                said = witness.testify(EGO, {EGO: self.ego, **teammates}, trusted, fits)
+                self.testimony = None if EGO in said.unread else said
+                self.unread = tuple(name for name in said.unread if name != EGO)
 
     def _converse(
         self, prepared: PreparedFrame, team: list[str], state: State, rng: np.random.Generator

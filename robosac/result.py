@@ -35,6 +35,8 @@ class FusionResult(Decision):
 
     alike: tuple[Likeness, ...] = ()
     """Maps that are strangely alike; the ego is `robosac.defenses.EGO`."""
+    unread: tuple[str, ...] = ()
+    """Teammates whose testimony there was no time to read."""
     boxes: FloatArray
     """(n, 6) float64: x, y, length, width, yaw, score; ego frame, best first."""
     contradicted_boxes: FloatArray = field(default_factory=lambda: np.zeros((0, 6)))
@@ -137,6 +139,7 @@ class FusionResult(Decision):
             attacker_ratio=self.attacker_ratio,
             suspicion=None if self.suspicion is None else dict(self.suspicion),
             alike=self.likenesses(ego_id),
+            unread=self.unread,
             deadline_met=self.deadline_met,
             degraded_by="fault" if self.fault is not None else "deadline" if self.out_of_time else None,
             timings_ms={stage: round(milliseconds, 3) for stage, milliseconds in timings_ms.items()},

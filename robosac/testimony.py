@@ -52,6 +52,8 @@ class Testimony:
     """(agents, H, W): `LIKELIHOOD` laid over the ego's map, 0 outside the sender's."""
     half_extent_m: float
     """Maps cover +- this in both directions."""
+    unread: tuple[str, ...] = ()
+    """Agents whose messages there was no time to read: they say nothing."""
 
     def ego_places(self) -> FloatArray:
         """Centres (H, W, 2) of the places of the ego's map, ego frame, metres."""
@@ -139,6 +141,7 @@ class Testimony:
             self.from_ego[kept],
             self.over_ego[kept],
             self.half_extent_m,
+            tuple(name for name in self.unread if name in agents),
         )
 
 

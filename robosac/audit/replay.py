@@ -151,7 +151,8 @@ def _fuse(
     session = Session(detector, decision.session.teammates, defense, saved, screening=_screening(decision))
     teammates = dict(messages)
     ego = teammates.pop(decision.session.ego_id)
-    deadline = Recorded(len(logged.hypotheses)) if logged.out_of_time else None
+    cut_short = logged.out_of_time or logged.unread
+    deadline = Recorded(len(logged.hypotheses) if logged.out_of_time else None, logged.unread) if cut_short else None
     return session.decide(logged.frame, ego, teammates, np.random.default_rng(int(logged.seed, 16)), deadline)
 
 
@@ -171,7 +172,7 @@ def _was_screened(decision: LoggedDecision) -> bool:
 
 def _compare_state(logged: FrameAnswered, after: State | None, made: FusionResult) -> Iterator[Difference]:
     if after is not None:
-        if not _agree(dict(made.state), dict(after)):
+        if not agree(dict(made.state), dict(after)):
             yield Difference("state", f"{_shown(dict(made.state))}, logged {_shown(dict(after))}")
     elif (digest := state_digest(made.state)) != logged.state_digest:
         yield Difference("state", f"of digest {digest}, logged {logged.state_digest}")
@@ -188,7 +189,7 @@ def _compare(logged: FrameAnswered, made: FusionResult) -> Iterator[Difference]:
     for name, why in made.rejected.items():
         compared.append(("rejected", f"{name} {why.reason.value}", f"{name} {reasons.get(name)}"))
     for what, now, then in compared:
-        if not _agree(now, then):
+        if not agree(now, then):
             yield Difference(what, f"{_shown(now)}, logged {_shown(then)}")
     yield from _compare_hypotheses(logged, made)
     if made.boxes.shape != logged.boxes.shape:
@@ -209,7 +210,7 @@ def _compare_provenance(decision: LoggedDecision, made: FusionResult) -> Iterato
     """On whose word boxes stand, which are left out, and whose maps are alike; older versions wrote none of it."""
     logged, ego_id = decision.answer, decision.session.ego_id
     alike = [[each.as_json() for each in both] for both in (made.likenesses(ego_id), logged.alike)]
-    if _was_screened(decision) and not _agree(*alike):
+    if _was_screened(decision) and not agree(*alike):
         yield Difference("alike", f"{_shown(alike[0])}, logged {_shown(alike[1])}")
     supports: list[tuple[str, Sequence[Support] | None, Sequence[Support] | None]] = [
         ("support", made.support(ego_id), logged.support),
@@ -253,12 +254,12 @@ def _told(tested: Outcome | TestedHypothesis) -> str:
     return f"{', '.join(tested.teammates)}: {tested.jaccard_index:.9g} ({tested.verdict})"
 
 
-def _agree(now: Any, then: Any) -> bool:
+def agree(now: Any, then: Any) -> bool:
     """Whether two JSON values are the same but for the rounding of their numbers."""
     if isinstance(now, Mapping) and isinstance(then, Mapping):
-        return now.keys() == then.keys() and all(_agree(now[key], then[key]) for key in now)
+        return now.keys() == then.keys() and all(agree(now[key], then[key]) for key in now)
     if isinstance(now, list | tuple) and isinstance(then, list | tuple):
-        return len(now) == len(then) and all(_agree(a, b) for a, b in zip(now, then, strict=True))
+        return len(now) == len(then) and all(agree(a, b) for a, b in zip(now, then, strict=True))
     if isinstance(now, float) and isinstance(then, int | float):
         return math.isclose(now, then, rel_tol=STATE_TOLERANCE, abs_tol=STATE_TOLERANCE)
     if decimals.is_text(now) and decimals.is_text(then):

@@ -7,8 +7,8 @@ depends on that message only, so no other agent can change it. `robosac.calibrat
 from __future__ import annotations
 
 import math
-from collections.abc import Sequence
-from dataclasses import dataclass
+from collections.abc import Callable, Collection, Sequence
+from dataclasses import dataclass, replace
 from pathlib import Path
 from typing import Any
 
@@ -33,6 +33,8 @@ is laid over the ego's map no number.
 """
 HIGHEST_M = 10.0
 """A pose whose z is not the height above ground, but above the sea, counts as this high."""
+AT_ONCE = 8
+"""Messages read together: between groups it is looked at whether there is time for another one."""
 GEOMETRY = 7
 """Where a cell is, as the network is told: x, y and r (32 m), x / r, y / r, ln r / 3, and the sensor's height (5 m)."""
 
@@ -144,7 +146,13 @@ class Witness:
         self.network = network.eval().requires_grad_(False)
         self.layout = layout
 
-    def testify(self, ego: str, messages: dict[str, Message]) -> Testimony:
+    def testify(
+        self,
+        ego: str,
+        messages: dict[str, Message],
+        first: Collection[str] = (),
+        fits: Callable[[Collection[str]], bool] = lambda _: True,
+    ) -> Testimony:
         """What each message says by itself.
 
         Parameters
@@ -152,13 +160,33 @@ class Witness:
         ego : str
             Whose frame places are asked in; among the messages.
         messages : dict of agent to Message
+            `AT_ONCE` of them are read together, the ego's in the first group.
+        first : collection of str
+            Agents whose messages are read before those of others.
+        fits : callable, optional
+            Whether there is time to read the messages of some agents (`Deadline.reading`). Once there is not, the
+            others say nothing (``Testimony.unread``).
         """
-        with torch.inference_mode():
-            heights = [float(message.pose[2, 3]) for message in messages.values()]
-            read = self.read(self.layout.maps(list(messages.values())), heights)
-            maps = torch.nan_to_num(read).clamp(-LARGEST, LARGEST).half().numpy()
+        names = list(messages)
+        order = sorted(range(len(names)), key=lambda i: (names[i] != ego, names[i] not in first))
+        size = self.layout.height * self.layout.upsampling, self.layout.width * self.layout.upsampling
+        maps, count = np.zeros((len(names), LAYERS, *size), dtype=np.float16), 0
+        while count < len(names):
+            group = sorted(order[count : count + AT_ONCE])
+            if not fits([names[i] for i in group]):
+                break
+            maps[group] = self._read([messages[names[i]] for i in group])
+            count += len(group)
         from_ego = planar(messages[ego].pose, [message.pose for message in messages.values()])
-        return as_testimony(tuple(messages), maps, from_ego, self.layout.half_extent_m)
+        said = as_testimony(tuple(names), maps, from_ego, self.layout.half_extent_m)
+        return replace(said, unread=tuple(names[i] for i in sorted(order[count:])))
+
+    def _read(self, messages: Sequence[Message]) -> Float16Array:
+        """What some messages say: (n, LAYERS, H, W)."""
+        with torch.inference_mode():
+            read = self.read(self.layout.maps(messages), [float(message.pose[2, 3]) for message in messages])
+            maps: Float16Array = torch.nan_to_num(read).clamp(-LARGEST, LARGEST).half().numpy()
+        return maps
 
     def read(self, maps: torch.Tensor, heights: Sequence[float]) -> torch.Tensor:
         """Testimony (n, LAYERS, H, W) of maps as `Layout.scaled` gives them; differentiable.

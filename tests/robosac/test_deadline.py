@@ -57,3 +57,25 @@ def test_a_pass_that_fails_teaches_nothing():
 def test_a_recorded_one_passes_after_as_many_hypotheses():
     deadline = Recorded(2)
     assert [deadline.another_fits() for _ in range(4)] == [True, True, False, False]
+
+
+def test_reading_gets_a_share_of_the_time_that_is_left():
+    clock = Clock()
+    fits = Deadline(10.0, reserve_s=2.0, clock=clock).reading(0.5)
+    assert fits(["a"])
+    clock.now = 1.5
+    assert fits(["b"])  # another 1.5 s would end in time
+    clock.now = 3.0
+    assert not fits(["c"])
+    assert Deadline().reading(0.5)(["a"])
+
+
+def test_nothing_is_read_once_it_is_late():
+    clock = Clock()
+    clock.now = 11.0
+    assert not Deadline(10.0, clock=clock).reading(0.5)(["a"])
+
+
+def test_a_recorded_one_reads_what_was_read():
+    fits = Recorded(None, ["c"]).reading(0.5)
+    assert [fits(group) for group in (["a", "b"], ["c", "d"])] == [True, False]

@@ -10,12 +10,14 @@ import numpy as np
 import pytest
 
 from robosac.calibrated import calibration_digest, calibration_of, witness_of
+from robosac.deadline import Deadline, Recorded
 from robosac.defenses import EGO
 from robosac.defenses.group_testing import GroupTestingSettings
 from robosac.defenses.group_testing.model import LIE
 from robosac.detectors import EmbeddedDetector
 from robosac.detectors.embedded import SHIPPED_WEIGHTS
 from robosac.detectors.weights_file import WeightsError
+from robosac.detectors.witness import AT_ONCE
 from robosac.fusion import fuse
 
 
@@ -96,3 +98,32 @@ def test_the_digest_of_a_calibration_covers_the_witness(copied):
     info.witness.unlink()
     assert calibration_digest(info) is None
     assert calibration_digest(replace(info, calibration=None)) is None
+
+
+def test_messages_that_there_is_no_time_to_read_are_told(detector, ego_message, benign):
+    """And the decision can be made again from what it tells."""
+    names = [f"v{i}" for i in range(AT_ONCE + 2)]
+    sent = {name: list(benign.values())[i % len(benign)] for i, name in enumerate(names)}
+    defense = GroupTestingSettings().build(calibration_of(detector.info))
+
+    def decided(deadline):
+        result = fuse(detector, defense, ego_message, sent, rng=np.random.default_rng(0), deadline=deadline)
+        assert result.fault is None
+        return result
+
+    hasty = decided(Hasty())
+    assert hasty.unread == hasty.answer(0, {}, {}).unread == tuple(names[AT_ONCE - 1 :])
+    again = decided(Recorded(None, hasty.unread))
+    assert again.unread == hasty.unread
+    assert again.state == hasty.state
+    whole = decided(None)
+    assert whole.unread == ()
+    assert "unread" not in whole.answer(0, {}, {}).as_json()
+
+
+class Hasty(Deadline):
+    """There is time to read one group of messages."""
+
+    def reading(self, share):
+        groups = iter([True, False])
+        return lambda _: next(groups)

@@ -11,7 +11,6 @@ from __future__ import annotations
 from collections.abc import Collection, Mapping, Sequence
 from dataclasses import dataclass
 from functools import cached_property
-from weakref import WeakKeyDictionary
 
 import numpy as np
 
@@ -94,13 +93,12 @@ class Hearing:
         self.heard = testimony.of([name for name in testimony.agents if name not in unheard])
         self._said: dict[bytes, FloatArray] = {}
 
-    def said(self, places: FloatArray) -> FloatArray:
-        """What everybody says of places (n, 2), heard or not: (agents, n)."""
-        new = [place for place in places if place.tobytes() not in self._said]
-        if new:
-            found = self.everybody.likelihood(np.stack(new))
-            self._said.update(zip((place.tobytes() for place in new), found.T, strict=True))
-        return np.stack([self._said[place.tobytes()] for place in places], axis=-1)
+    def said(self, place: FloatArray) -> FloatArray:
+        """What everybody says of a place (2,), heard or not: (agents,)."""
+        asked = place.tobytes()
+        if asked not in self._said:
+            self._said[asked] = self.everybody.likelihood(place[None])[:, 0]
+        return self._said[asked]
 
     @cached_property
     def standing(self) -> FloatArray:
@@ -137,7 +135,6 @@ class Shown:
         self.teammates = teammates
         self.boxes = boxes
         self._hearing = hearing
-        self._overlaps: WeakKeyDictionary[Shown, FloatArray] = WeakKeyDictionary()
         self._testimony = hearing.heard
         self.everybody = Claims.of(boxes, hearing.everybody)
         """What everybody says of the boxes, heard or not."""
@@ -174,7 +171,7 @@ class Shown:
     def goes_with(self, suspect: str, lie: Lie) -> bool:
         """Whether a suspect's own message says what a lie says."""
         everybody = self._hearing.everybody
-        said = float(self._hearing.said(lie.place[None])[everybody.agents.index(suspect), 0])
+        said = self._hearing.said(lie.place)[everybody.agents.index(suspect)]
         return bool(said <= DENIES if lie.kind == "gone" else said >= SUPPORTS)
 
     @cached_property
@@ -205,9 +202,7 @@ class Shown:
 
     def vouched(self, joining: Hypothesis) -> BoolArray:
         """Which boxes (n,) somebody supports who is not among the joining: nothing that these may have made up."""
-        theirs = [i for i, name in enumerate(self.claims.witnesses) if name in joining]
-        supporting = self.claims.supporting
-        supported: BoolArray = supporting.sum(axis=0) > supporting[theirs].sum(axis=0)
+        supported: BoolArray = np.atleast_1d(self.claims.without(joining).supporting.any(axis=0))
         return supported
 
     @cached_property
@@ -215,22 +210,7 @@ class Shown:
         """All that may be wrong."""
         found = [Lie("ghost", box[:2]) for box in self.boxes[self.ghosts]]
         found += [Lie("moved", box[:2]) for box in self.boxes[self.displaced]]
-        found += [Lie("gone", place) for place in self.holes]
-        if found:
-            self._hearing.said(np.stack([lie.place for lie in found]))  # of all at once: some of it is asked for soon
-        return found
-
-    def overlap(self, other: Shown) -> FloatArray:
-        """IoU (n, m) of its boxes with those of another fusion of the frame."""
-        known = self._overlaps.get(other)
-        if known is None:
-            known = self._overlaps[other] = pairwise_iou(self.boxes, other.boxes)
-        return known
-
-    @cached_property
-    def odds(self) -> FloatArray:
-        """Logarithm of the odds (n,) of the best box at the place of each of its own."""
-        return self.odds_at(self.boxes[:, :2])
+        return found + [Lie("gone", place) for place in self.holes]
 
     def odds_at(self, places: FloatArray) -> FloatArray:
         """Logarithm of the odds (n,) of the best box at each place (n, 2)."""
@@ -271,7 +251,7 @@ def effects(joined: Shown, without: Shown, suspects: Sequence[str]) -> list[Lie]
     found += [Lie("gone", lost[i, :2], bool(own[i] >= SUPPORTS)) for i in taken]
     away, aside, other = joined.away(suspects), joined.away(suspects, across=True), without.away(suspects)
     for index in np.flatnonzero((away >= AWAY) & (joined.boxes[:, 5] >= PLACED_SCORE) & ~ghosts):
-        same = _at(without.overlap(joined)[:, index])
+        same = _at(without, joined.boxes[index])
         if same is not None and 0.0 < other[same] <= away[index] - AWAY_EFFECT:
             found.append(Lie("moved", joined.boxes[index, :2], along=bool(aside[index] < AWAY)))
     return found
@@ -302,18 +282,19 @@ def gone(joined: Shown, without: Shown, suspects: Collection[str] = ()) -> IntAr
     others = np.array([name not in suspects for name in claims.witnesses])
     supported = two_witnesses(claims.supporting & others[:, None])
     supported &= claims.likelihood[others].sum(axis=0) >= WEIGHTY
-    there = joined.boxes[:, 5] >= THERE_SCORE
-    overlap = without.overlap(joined)[:, there].max(axis=1, initial=0.0)
-    rise = without.odds - joined.odds_at(without.boxes[:, :2])
+    there = joined.boxes[joined.boxes[:, 5] >= THERE_SCORE]
+    overlap = pairwise_iou(without.boxes, there).max(axis=1, initial=0.0)
+    rise = without.odds_at(without.boxes[:, :2]) - joined.odds_at(without.boxes[:, :2])
     lost: IntArray = np.flatnonzero(
         supported & (overlap < 0.05) & (without.boxes[:, 5] >= SHOWN_SCORE) & (rise >= EFFECT)
     )
     return lost
 
 
-def _at(overlap: FloatArray) -> int | None:
-    """The box of a fusion that overlaps another one most, by the IoU (n,) of each with that."""
-    if not len(overlap):
+def _at(shown: Shown, box: FloatArray) -> int | None:
+    """The box of a fusion that overlaps another one most."""
+    if not len(shown.boxes):
         return None
+    overlap = pairwise_iou(box[None], shown.boxes)[0]
     best = int(overlap.argmax())
     return best if overlap[best] > 0.05 else None

@@ -9,7 +9,7 @@ import torch
 from robosac.boxes import pose_matrix
 from robosac.detectors import DetectorInfo, Message, TensorSpec
 from robosac.detectors.weights_file import WeightsError
-from robosac.detectors.witness import GEOMETRY, HIGHEST_M, Layout, Witness, WitnessNetwork
+from robosac.detectors.witness import AT_ONCE, GEOMETRY, HIGHEST_M, Layout, Witness, WitnessNetwork
 from robosac.testimony import LAYERS
 
 MAP = {"other": TensorSpec("float16", (2, 8, 8)), "map": TensorSpec("float32", (4, 16, 16))}
@@ -61,6 +61,27 @@ def test_maps_mirrored_or_not_give_the_same_testimony():
     np.testing.assert_array_equal(mirrored.maps, plain.maps)
     np.testing.assert_array_equal(mirrored.over_ego, plain.over_ego)
     assert np.abs(unflipped.maps - plain.maps).max() > 0.01
+
+
+def test_what_there_is_no_time_for_says_nothing(rng):
+    """The ego's and the trusted are read first; what is read is as it would be with the others."""
+    names = ["a", "b", "c", "", *"defghijklmnopqr"]
+    sent = {name: messages(rng)["a"] for name in names}
+    whole, asked = witness().testify("", sent), []
+
+    def fits(group):
+        asked.append(list(group))
+        return len(asked) < 3
+
+    said = witness().testify("", sent, ["q", "r"], fits)
+    assert [len(group) for group in asked] == [AT_ONCE, AT_ONCE, 3]
+    assert asked[0] == ["a", "b", "c", "", "d", "e", "q", "r"]
+    assert (said.agents, said.unread) == (tuple(names), ("n", "o", "p"))
+    read = [name not in said.unread for name in names]
+    np.testing.assert_array_equal(said.maps[read], whole.maps[read])
+    assert not said.maps[~np.array(read)].any()
+    assert not said.over_ego[~np.array(read)].any()
+    assert said.of(["a", "p"]).unread == ("p",)
 
 
 def test_testimony_of_a_message_depends_on_no_other(rng):

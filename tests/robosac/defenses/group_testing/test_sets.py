@@ -91,3 +91,4 @@ def test_levels_are_the_greatest_states():
 def test_what_is_short_comes_back():
     values = np.array([0.0, 0.25, 1e-9, 0.75])
     np.testing.assert_array_equal(sets.long(sets.short(values), 4), [0, 0.25, 0, 0.75])
+    np.testing.assert_array_equal(sets.long([[1, 3], [0.25, 0.75]], 4), [0, 0.25, 0, 0.75])  # as older versions kept it
