@@ -82,7 +82,7 @@ def _some_of(posterior: Posterior, here: IntArray, decoded: BoolArray) -> BoolAr
     """
     suspicion = posterior.marginals()
     good = cleared(suspicion)
-    ranked = here[_ascending(suspicion[here])]
+    ranked = here[least_first(suspicion[here])]
     doubtful = np.zeros(len(suspicion), dtype=bool)
     doubtful[here] = unresolved(suspicion)[here]
     groups, doubt = _groups(posterior, doubtful)
@@ -108,7 +108,7 @@ def _groups(posterior: Posterior, doubtful: BoolArray) -> tuple[BoolArray, float
     clean = [posterior.clean_within(b)[masks] for b, masks in within]
     p = np.clip(np.concatenate(clean), _CERTAIN, 1 - _CERTAIN)
     entropy = -(p * np.log2(p) + (1 - p) * np.log2(1 - p))
-    best = _ascending(-entropy)[:GROUPS]
+    best = least_first(-entropy)[:GROUPS]
     blocks = np.repeat([b for b, _ in within], [len(masks) for _, masks in within])
     rows = posterior.rows(blocks[best], np.concatenate([masks for _, masks in within])[best])
     return rows, float(entropy.max())
@@ -123,7 +123,7 @@ def _small_groups(suspects: int) -> IntArray:
     return groups
 
 
-def _ascending(values: FloatArray) -> IntArray:
+def least_first(values: FloatArray) -> IntArray:
     """Places of the values (n,), the least first; what differs by rounding only stays in order."""
     return np.argsort(values.round(_DIGITS), kind="stable")
 
@@ -132,4 +132,4 @@ def _answer_sizes(ascending: FloatArray) -> IntArray:
     """How many of the least suspected make the best answers, as if teammates were independent."""
     clean = np.cumprod(1.0 - ascending)
     worth = clean * gain(np.arange(1, len(clean) + 1)) - (1.0 - clean) * HARM
-    return _ascending(-worth)[:ANSWERS] + 1
+    return least_first(-worth)[:ANSWERS] + 1

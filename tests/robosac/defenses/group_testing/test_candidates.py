@@ -7,6 +7,7 @@ from robosac.defenses.group_testing.candidates import (
     UNRESOLVED,
     WITNESSES,
     candidates,
+    least_first,
 )
 from robosac.defenses.group_testing.model import CELLS, CLEAN
 from robosac.defenses.group_testing.posterior import BLOCK, Posterior
@@ -79,3 +80,8 @@ def test_answers_are_small_while_somebody_is_in_doubt(halfway):
         learn(halfway, np.arange(20) == index, 12.0)
     good = halfway.marginals() < UNRESOLVED[0]
     assert largest_answer() > MOST_WITNESSES
+
+
+def test_what_only_rounding_tells_apart_stays_in_order():
+    values = np.array([0.3, 0.1, 0.1 - 1e-16, 0.1 + 1e-16, 0.1 - 1e-6])
+    assert least_first(values).tolist() == [4, 1, 2, 3, 0]
