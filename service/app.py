@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from service.runtime import tune_process
+from service.runtime import keep_what_is_loaded, tune_process
 
 tune_process()  # before anything imports torch
 
@@ -158,6 +158,7 @@ async def _running(gateway: Gateway, settings: Settings, tokens: Tokens, tracing
         if settings.detector not in engine.detectors:
             known = list(engine.detectors)
             raise ValueError(f"ROBOSAC_DETECTOR: unknown detector {settings.detector!r}; known: {known}")
+        keep_what_is_loaded()
         gateway.watch.start()
         sweeper = asyncio.create_task(gateway.sessions.expire_idle())
         logger.info("gateway ready", version=version("robosac"), detectors=list(engine.detectors))

@@ -1,16 +1,19 @@
-"""Process settings that have to be made before torch is imported.
+"""Settings of the process; most have to be made before torch is imported.
 
 OpenMP threads that spin while they wait make a decoder pass several times slower on a machine with few, shared cores;
 and glibc's allocator, by default, returns every body of some MiB to the system and faults it in again for the next one.
-The number of open files is often bound to 1024, which as many idle connections would use up.
+The number of open files is often bound to 1024, which as many idle connections would use up. Python looks through all
+objects now and then for garbage, and those of torch alone take longer than a frame has.
 """
 
 from __future__ import annotations
 
 import ctypes
+import gc
 import os
 import sys
 from contextlib import suppress
+from functools import cache
 
 _M_TRIM_THRESHOLD = -1
 _M_MMAP_THRESHOLD = -3
@@ -38,3 +41,10 @@ def tune_process() -> None:
         if granted != resource.RLIM_INFINITY and granted < wanted:
             with suppress(OSError, ValueError):  # some systems grant less than they say
                 resource.setrlimit(resource.RLIMIT_NOFILE, (wanted, most))
+
+
+@cache
+def keep_what_is_loaded() -> None:
+    """Look for no garbage any more among what there is by now; once a process, when all is loaded."""
+    gc.collect()
+    gc.freeze()
