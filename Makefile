@@ -8,7 +8,7 @@ PORT ?= 8000
 .PHONY: help demo serve test fuzz lint format docs bench clean
 
 help:
-	@echo "make demo    start the gateway, drive a hostile fleet through it, show what came of it"
+	@echo "make demo    start the gateway, drive a hostile fleet through it, show what came of it (WATCH=1: go on until Ctrl-C)"
 	@echo "make serve   run the gateway at http://$(HOST):$(PORT)"
 	@echo "make test    run the tests"
 	@echo "make fuzz    24,000 fuzz cases against codec and gateway, some minutes"
@@ -17,7 +17,7 @@ help:
 	@echo "make bench   measure frames per second and latency, briefly"
 
 demo: $(VENV)/.installed
-	$(BIN)/robosac demo --report $(OUT)/demo --force
+	$(BIN)/robosac demo --report $(OUT)/demo --force $(if $(WATCH),--watch)
 
 serve: $(VENV)/.installed
 	$(BIN)/robosac serve --host $(HOST) --port $(PORT)

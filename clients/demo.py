@@ -23,29 +23,45 @@ def main(
     scenes: Annotated[int, typer.Option(min=1, help="Sequences.")] = 8,
     frames: Annotated[int, typer.Option(min=1, help="Frames of a sequence.")] = 25,
     force: trial.Force = False,
+    watch: Annotated[
+        bool, typer.Option("--watch", help="Drive at 5 Hz, and go on after the summary until Ctrl-C.")
+    ] = False,
 ) -> None:
     """Start a gateway, drive six vehicles through it, one of them a PGD attacker, and show what came of it.
 
-    Exits with 1 if anything failed, or if the attacker got into more than 5 % of the answers.
+    Prints the address of the page where it can be watched. Exits with 1 if anything failed, or if the attacker got into
+    more than 5 % of the answers.
     """
     torch.set_num_threads(1)
     console = Console()
     trial.make_folder(report, "--report", REPORT, force, for_pictures=True)
-    options, summary = trial.run(_run(report, scenes, frames, console), console, "The demo")
-    close_run(options, summary, console)
+    try:
+        summary = trial.run(run(report, scenes, frames, console, watch=watch), console, "The demo")
+    except KeyboardInterrupt:
+        if not watch:
+            raise
+        return
     if summary.clean_share < CLEAN_SHARE:
         console.print(f"[red]The demo failed:[/red] expected no attacker in at least {CLEAN_SHARE:.0%} of the answers.")
         sys.exit(1)
 
 
-async def _run(report: Path, scenes: int, frames: int, console: Console) -> tuple[FleetOptions, FleetSummary]:
+async def run(report: Path, scenes: int, frames: int, console: Console, *, watch: bool = False) -> FleetSummary:
+    """As `main`; to be watched it goes on until it is cancelled."""
     console.print("Starting the gateway (uvicorn service.app:app) ...")
     async with local_gateway(report / "gateway.log") as url:
         console.print(
             f"It is ready at {url}. Six vehicles, one of them a PGD attacker, post at 5 Hz of simulated time."
         )
-        options = FleetOptions(url=url, scenes=scenes, frames=frames, report=report)
-        return options, await run_fleet(options, console)
+        console.print(f"Watch it live: {url}/")
+        options = FleetOptions(url=url, scenes=scenes, frames=frames, report=report, real_time=watch)
+        summary = await run_fleet(options, console)
+        close_run(options, summary, console)
+        if watch:
+            console.print(f"The fleet drives on, from the first scene again, until Ctrl-C. Watch it live: {url}/")
+        while watch:
+            await run_fleet(options, console)
+        return summary
 
 
 if __name__ == "__main__":

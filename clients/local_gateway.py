@@ -12,7 +12,7 @@ import subprocess
 import sys
 import tempfile
 import time
-from collections.abc import AsyncIterator, Iterator
+from collections.abc import AsyncIterator, Iterator, Mapping
 from pathlib import Path
 
 from clients.client import GatewayClient
@@ -20,7 +20,7 @@ from clients.errors import GatewayUnreachable
 
 START_TIMEOUT_S = 120.0
 STOP_TIMEOUT_S = 20.0
-KEY_SETTINGS = ("ROBOSAC_API_KEYS", "ROBOSAC_API_KEYS_FILE")
+KEY_SETTINGS = ("ROBOSAC_API_KEYS", "ROBOSAC_API_KEYS_FILE", "ROBOSAC_VIEWER_TOKENS")
 
 
 class GatewayProcess:
@@ -33,13 +33,23 @@ class GatewayProcess:
     database_url : str
     api_key : str, optional
         The one that it asks for; by default it asks for none, whatever the environment says, and serves loopback only.
+    port : int, optional
+        By default a free one.
+    settings : mapping of variable to text
+        More of its environment.
     """
 
-    def __init__(self, log: Path, database_url: str, api_key: str | None = None) -> None:
-        with socket.socket() as probe:
-            probe.bind(("127.0.0.1", 0))
-            port = probe.getsockname()[1]
-        self.url = f"http://127.0.0.1:{port}"
+    def __init__(
+        self,
+        log: Path,
+        database_url: str,
+        api_key: str | None = None,
+        *,
+        port: int | None = None,
+        settings: Mapping[str, str] | None = None,
+    ) -> None:
+        port = _free_port() if port is None else port
+        self.port, self.url = port, f"http://127.0.0.1:{port}"
         self._log = log
         command = [sys.executable, "-m", "uvicorn", "service.app:app", "--host", "127.0.0.1", "--port", str(port)]
         command += ["--http", "service.arriving.connections:BoundedHTTP"]
@@ -52,7 +62,7 @@ class GatewayProcess:
                 [*command, "--log-level", "warning", "--timeout-graceful-shutdown", "5"],
                 stdout=output,
                 stderr=subprocess.STDOUT,
-                env=environment | {"ROBOSAC_DATABASE_URL": database_url},
+                env=environment | {"ROBOSAC_DATABASE_URL": database_url, **(settings or {})},
             )
 
     async def ready(self) -> None:
@@ -81,6 +91,14 @@ class GatewayProcess:
         (line,) = [line for line in status.splitlines() if line.startswith("VmHWM")]
         return int(line.split()[1]) / 1024
 
+    def cpu_s(self) -> float:
+        """Processor time that it has used, seconds; NaN where the system does not tell."""
+        try:
+            fields = Path(f"/proc/{self._process.pid}/stat").read_text().rpartition(")")[2].split()
+        except OSError:
+            return math.nan
+        return (int(fields[11]) + int(fields[12])) / os.sysconf("SC_CLK_TCK")
+
     async def stop(self) -> bool:
         """Terminate the gateway, and kill it if it does not end; whether it ended by itself."""
         self._process.terminate()
@@ -95,6 +113,13 @@ class GatewayProcess:
         """Let the gateway end at once."""
         self._process.kill()
         await asyncio.to_thread(self._process.wait)
+
+
+def _free_port() -> int:
+    with socket.socket() as probe:
+        probe.bind(("127.0.0.1", 0))
+        port: int = probe.getsockname()[1]
+        return port
 
 
 @contextlib.asynccontextmanager

@@ -23,6 +23,7 @@ from service.alone import check_alone  # noqa: E402
 from service.arriving.arrival import Arrival  # noqa: E402
 from service.arriving.doors import Door, capacity_check, check_head, check_local, host_check  # noqa: E402
 from service.arriving.frames import Frames  # noqa: E402
+from service.arriving.hanging_up import HangingUp  # noqa: E402
 from service.arriving.limits import BodyLimit  # noqa: E402
 from service.deciding.admission import Admission  # noqa: E402
 from service.deciding.answering import Deciding  # noqa: E402
@@ -34,6 +35,7 @@ from service.keeping.gateway_keys import GatewayKeys  # noqa: E402
 from service.keeping.record import new_seed  # noqa: E402
 from service.keeping.store import Store  # noqa: E402
 from service.operations import operations  # noqa: E402
+from service.pages import api_pages, frames_event, pages  # noqa: E402
 from service.routes import v1  # noqa: E402
 from service.sessions.identity import ApiKeys, Tokens  # noqa: E402
 from service.sessions.opening import Opening  # noqa: E402
@@ -41,7 +43,10 @@ from service.sessions.possession import Possession  # noqa: E402
 from service.sessions.room import Room  # noqa: E402
 from service.sessions.sessions import Sessions  # noqa: E402
 from service.sessions.teams import Teams  # noqa: E402
+from service.sessions.viewers import ViewerTokens  # noqa: E402
 from service.settings import Settings, settings_of_environment  # noqa: E402
+from service.viewing.ending import on_stop_signal  # noqa: E402
+from service.viewing.feed import Feed  # noqa: E402
 from service.watching.logs import log_as_the_gateway, logging_to_stderr  # noqa: E402
 from service.watching.metrics import Metrics  # noqa: E402
 from service.watching.stalls import LoopWatch  # noqa: E402
@@ -79,7 +84,7 @@ def create_app(
     tokens = Tokens(settings, clock)
     tracing = Tracing(provider_from_environment() if spans is None else spans)
     gateway = _built(settings, ApiKeys(keys), tokens, seeds, tracing)
-    secrets = [*keys, *(secret.get_secret_value() for secret in settings.token_secrets)]
+    secrets = [*keys, *(s.get_secret_value() for s in (*settings.token_secrets, *settings.viewer_tokens))]
     log_as_the_gateway(settings, secrets)
 
     @contextlib.asynccontextmanager
@@ -98,9 +103,12 @@ def create_app(
         lifespan=lifespan,
         redirect_slashes=False,
         openapi_tags=TAGS,
+        docs_url=None,  # these pages load from elsewhere; `api_pages` are the same from here
+        redoc_url=None,
     )
     app.state.gateway = gateway
     problems.install(app)
+    app.add_middleware(HangingUp)
     app.add_middleware(BodyLimit, limit=settings.max_body_bytes, timeout_s=settings.body_timeout_s)
     app.add_middleware(Door, check=capacity_check(gateway.admission, gateway.sessions.in_use))
     if not keys or settings.allowed_hosts:
@@ -113,6 +121,8 @@ def create_app(
     app.add_middleware(Starting)
     app.include_router(v1)
     app.include_router(operations)
+    app.include_router(pages)
+    api_pages(app)
     return app
 
 
@@ -124,7 +134,9 @@ def _built(
     store = Store(settings.database_url, full_every=settings.audit_full_every, most_records=settings.audit_max_records)
     keys = GatewayKeys(settings.gateway_key_file)
     sessions = Sessions(settings, store, engine, metrics, tokens, keys, seeds)
-    deciding = Deciding(sessions, Keeping(sessions, store, settings.keep_frames), engine, metrics, admission, tracing)
+    feed = Feed(store.audit, settings.max_viewers, frames_event)
+    keeping = Keeping(sessions, store, settings.keep_frames)
+    deciding = Deciding(sessions, keeping, engine, metrics, admission, tracing, feed)
     of_key = settings.max_inflight_bytes_per_key if len(api_keys) > 1 else None  # one key has all to itself
     return Gateway(
         admission=admission,
@@ -140,6 +152,8 @@ def _built(
         bodies=Room(settings.max_inflight_bytes, of_key, "ROBOSAC_MAX_INFLIGHT_BYTES"),
         api_keys=api_keys,
         watch=LoopWatch(),
+        feed=feed,
+        viewer_tokens=ViewerTokens(settings, open_to_all=not api_keys),
     )
 
 
@@ -163,8 +177,10 @@ async def _running(gateway: Gateway, settings: Settings, tokens: Tokens, tracing
         sweeper = asyncio.create_task(gateway.sessions.expire_idle())
         logger.info("gateway ready", version=version("robosac"), detectors=list(engine.detectors))
         try:
-            yield
+            with on_stop_signal(gateway.feed.end):
+                yield
         finally:
+            gateway.feed.end()
             sweeper.cancel()
             gateway.watch.stop()
     finally:

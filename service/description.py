@@ -23,6 +23,7 @@ from service.schemas import (
     SessionCreated,
     SessionRequest,
     SessionState,
+    WatchableList,
 )
 
 Answers = dict[int | str, dict[str, Any]]
@@ -33,6 +34,7 @@ TAGS = [
     {"name": "frames", "description": "Feature maps in, fused boxes out. Tensors travel as msgpack."},
     {"name": "audit", "description": "What was decided, to be checked by somebody else."},
     {"name": "gateway", "description": "What the gateway serves and signs with."},
+    {"name": "live", "description": "What the gateway decides, for people who watch; the page at `/` shows it."},
     {"name": "operations", "description": "For whoever runs the gateway: no key or token is needed."},
 ]
 _SESSION, _TIME, _HASH = "Fv0Zk7mXQ2yq1Jr3", "2026-11-21T09:30:00.000Z", "3b0c44298fc1c149afbf4c8996fb9242" * 2
@@ -95,6 +97,25 @@ EXAMPLES: Mapping[type[BaseModel], dict[str, Any]] = {
         "tokens_expire_at": _TIME,
     },
     RenewedToken: {"token": _TOKEN, "expires_at": _TIME},
+    WatchableList: {
+        "sessions": [
+            {
+                "session_id": _SESSION,
+                "ego_id": "car-1",
+                "teammates": ["car-2", "car-3", "rsu"],
+                "detector": "intersection-mean",
+                "defense": "group_testing",
+                "created_at": _TIME,
+                "latency_budget_ms": 200.0,
+                "least_score": 0.25,
+                "frames": 8,
+                "frame": 7,
+                "answered_at": 1795343957.332,
+                "named": ["car-2"],
+                "viewers": 1,
+            }
+        ]
+    },
     Receipt: {"frame": 0, "vehicle_id": "car-2", "status": "accepted", "receipt": _RECEIPT},
     FrameAnswer: {
         "frame": 0,
@@ -219,4 +240,9 @@ DECIDED: Answers = {
 }
 TAKEN: Answers = {**DECIDED, 202: _negotiated(Receipt, "A teammate's message is kept for its frame.")}
 KEPT: Answers = {**_OF_EGO, 200: {"description": "The messages as a whole frame.", **_in_msgpack(_FRAME)}}
+WATCHABLE: Answers = {**documented(401), 200: _answer(WatchableList, "The sessions.")}
+WATCHED: Answers = {
+    **documented(401, 404, 422, 503),
+    **_as_text("text/event-stream", "event: end\ndata: {}\n\n", "Server-sent events, until the gateway stops."),
+}
 METRICS: Answers = _as_text("text/plain", 'robosac_frames_total{source="consensus"} 4.0\n', "In Prometheus' format.")

@@ -46,6 +46,7 @@ class Kind(StrEnum):
     TOO_MANY_PROOFS = "too-many-proofs"
     INTERNAL_ERROR = "internal-error"
     NOT_READY = "not-ready"
+    TOO_MANY_VIEWERS = "too-many-viewers"
     TOO_MANY_SESSIONS = "too-many-sessions"
     OVERLOADED = "overloaded"
     DETECTOR_UNAVAILABLE = "detector-unavailable"

@@ -15,13 +15,17 @@ from service.sessions.possession import Possession
 from service.sessions.room import Room
 from service.sessions.sessions import Sessions
 from service.sessions.teams import Teams
+from service.sessions.viewers import ViewerTokens
+from service.viewing.feed import Feed
 from service.watching.metrics import Metrics
 from service.watching.stalls import LoopWatch
 
 
 @dataclass(frozen=True)
 class Gateway:
-    """One gateway: detectors and their thread, sessions and teams, what answers frames, and who may open a session."""
+    """One gateway: detectors and their thread, sessions and teams, what answers frames, who may open a session,
+    and who may watch one.
+    """
 
     admission: Admission
     keys: GatewayKeys
@@ -36,3 +40,5 @@ class Gateway:
     bodies: Room
     api_keys: ApiKeys
     watch: LoopWatch
+    feed: Feed
+    viewer_tokens: ViewerTokens

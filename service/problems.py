@@ -65,6 +65,7 @@ ANSWERS: Mapping[Kind, tuple[int, Mapping[str, str]]] = {
     Kind.TOO_MANY_PROOFS: (429, {"Retry-After": "60"}),
     Kind.INTERNAL_ERROR: (500, {}),
     Kind.NOT_READY: (503, {"Retry-After": "5"}),
+    Kind.TOO_MANY_VIEWERS: (503, {"Retry-After": "10"}),
     Kind.TOO_MANY_SESSIONS: (503, {"Retry-After": "30"}),
     Kind.OVERLOADED: (503, {"Retry-After": "1"}),
     Kind.DETECTOR_UNAVAILABLE: (503, {}),

@@ -271,3 +271,27 @@ class Receipt(BaseModel):
     vehicle_id: str
     status: Literal["accepted"] = "accepted"
     receipt: LogReceipt = Field(description="The log's end at this moment, signed by the gateway.")
+
+
+class WatchableSession(BaseModel):
+    """A session whose latest frames can be watched."""
+
+    session_id: str
+    ego_id: str
+    teammates: list[str]
+    detector: str
+    defense: str
+    created_at: str
+    latency_budget_ms: float
+    least_score: float = Field(description="Boxes from this score on take part in the consensus test.")
+    frames: int = Field(description="Answered so far.")
+    frame: int = Field(description="Number of the latest.")
+    answered_at: float = Field(description="When, Unix seconds.")
+    named: list[str] = Field(description="Teammates held to be attackers.")
+    viewers: int
+
+
+class WatchableList(BaseModel):
+    """Sessions whose latest frames can be watched, the one that was answered last first."""
+
+    sessions: list[WatchableSession]

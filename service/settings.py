@@ -25,6 +25,7 @@ OTHERS = ("ROBOSAC_API_KEY", "ROBOSAC_FUZZ_CASES")
 _OF_KUBERNETES = re.compile(r"ROBOSAC_(SERVICE_(HOST|PORT\w*)|PORT(_\d+_\w+)?)")
 """What a pod is given where a service is called robosac."""
 _YEAR_S = 366 * 86_400.0
+_LISTS = ("extra_detectors", "extra_defenses", "api_keys", "allowed_hosts", "viewer_tokens", "token_secrets")
 
 
 class SettingsError(ValueError):
@@ -55,6 +56,10 @@ class Settings(BaseSettings):
         description="Names by which the gateway is asked for, beside loopback's, separated by commas; "
         "without any, and without an API key, only loopback's.",
     )
+    viewer_tokens: Annotated[tuple[SecretStr, ...], NoDecode] = Field(
+        (), description="Tokens of those who may watch sessions, separated by commas; see docs/live.md."
+    )
+    max_viewers: int = Field(64, ge=0, description="Who may watch sessions at a time; 0 lets nobody.")
     token_secrets: Annotated[tuple[SecretStr, ...], NoDecode] = Field(
         (), description="Secrets of tokens, separated by commas: the first signs, all verify; else the store keeps one."
     )
@@ -163,7 +168,7 @@ class Settings(BaseSettings):
                 raise ValueError("must be names or addresses, without scheme and port, an IPv6 address in brackets")
         return tuple(host.lower() for host in hosts)
 
-    @field_validator("extra_detectors", "extra_defenses", "api_keys", "allowed_hosts", "token_secrets", mode="before")
+    @field_validator(*_LISTS, mode="before")
     @classmethod
     def _split(cls, value: object) -> object:
         return tuple(part.strip() for part in value.split(",") if part.strip()) if isinstance(value, str) else value

@@ -22,6 +22,7 @@ from service.keeping.patience import GRACE_S
 from service.keeping.record import SessionRecord
 from service.sessions.gathering import Received
 from service.sessions.sessions import Sessions
+from service.viewing.feed import Feed
 from service.watching.metrics import Metrics
 from service.watching.tracing import Tracing
 
@@ -41,6 +42,7 @@ class Deciding:
     metrics: Metrics
     admission: Admission
     tracing: Tracing
+    feed: Feed
 
     async def answer(self, asked: Asked) -> Answered:
         """Decide a frame and keep the decision. The session's lock is held.
@@ -60,10 +62,13 @@ class Deciding:
         raise SessionChanged("the session keeps being changed elsewhere; try again")
 
     def tell(self, answered: Answered, answer: FrameAnswer) -> None:
-        """Count an answer as it is handed over, and log it."""
+        """Count an answer as it is handed over, log it, and let it be watched."""
         asked, session_id = answered.asked, answered.asked.caller.record.session_id
         self.metrics.frame(answer, asked.timings)
         self.tracing.frame(session_id, answer, asked.timings)
+        record, least_score = asked.caller.record, asked.caller.live.detector.info.consensus_score
+        poses = {name: asked.messages[name].message.pose for name in record.teammates if name in asked.messages}
+        self.feed.note(record, answer, answered.result, asked.ego.message.pose, poses, least_score)
         logger.log(
             logging.DEBUG if answer.degraded_by is None and answer.deadline_met else logging.WARNING,
             "frame answered",
@@ -72,7 +77,7 @@ class Deciding:
             source=answer.source.value,
             accepted=answer.accepted,
             degraded_by=answer.degraded_by,
-            fault=answered.fault,
+            fault=answered.result.fault,
             deadline_met=answer.deadline_met,
             total_ms=round(asked.timings["total"], 1),
         )
@@ -103,7 +108,7 @@ class Deciding:
         answer = answer.model_copy(update={"receipt": self.sessions.keys.receipt(kept)})
         rest_ms = asked.timings["receive"] + asked.timings["store"]
         self.admission.learn(record.session_id, decided.worked_s, rest_ms / 1e3, asked.timings["store"] / 1e3)
-        return Answered(answer, asked, result.fault)
+        return Answered(answer, asked, result)
 
     def _who_takes_part(self, asked: Asked, record: SessionRecord) -> tuple[dict[str, Received], dict[str, Rejection]]:
         """Messages of those who can be fused, and why the others of the team cannot; nothing more is taken for it."""

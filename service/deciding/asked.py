@@ -8,6 +8,7 @@ from dataclasses import dataclass, field
 
 from robosac.answers import FrameAnswer
 from robosac.defenses import Rejection
+from robosac.fusion import FusionResult
 from service.sessions.gathering import Received
 from service.sessions.live import Caller
 
@@ -52,7 +53,8 @@ class Answered:
     answer: FrameAnswer
     """With ``deadline_met`` and ``timings_ms`` as on record: what was known before it was stored."""
     asked: Asked
-    fault: str | None
+    result: FusionResult
+    """From which it was made."""
 
     @property
     def in_time(self) -> bool:

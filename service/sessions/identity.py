@@ -37,6 +37,27 @@ CLAIMS = ("iss", "aud", "sub", "sid", "role", "jti", "iat", "exp")
 _BEARER_TOKEN = re.compile(r"[A-Za-z0-9._~+/-]+=*")  # RFC 6750, section 2.1
 
 
+def check_secret(where: str, secret: str) -> None:
+    """Refuse a secret of the settings that is too short, or could not be sent; it is not shown.
+
+    Raises
+    ------
+    ValueError
+        It says ``where`` the secret stands.
+    """
+    if len(secret) < API_KEY_LENGTH:
+        raise ValueError(f"{where} has fewer than {API_KEY_LENGTH} characters")
+    if not _BEARER_TOKEN.fullmatch(secret):
+        raise ValueError(f"{where} has characters other than A-Z a-z 0-9 . _ ~ + / - and = at the end")
+
+
+def is_among(given: str | None, digests: Sequence[bytes]) -> bool:
+    """Whether a secret is one of those with these SHA-256; every one is compared, so that the time tells nothing."""
+    digest = sha256((given or "").encode()).digest()
+    matches = [hmac.compare_digest(digest, known) for known in digests]
+    return any(matches)
+
+
 class ApiKeys:
     """The keys of those who may open sessions; without any, everybody may."""
 
@@ -64,10 +85,7 @@ class ApiKeys:
                 raise ValueError(f"ROBOSAC_API_KEYS_FILE: {path} holds no key")
             named += found
         for where, key in named:
-            if len(key) < API_KEY_LENGTH:
-                raise ValueError(f"{where} has fewer than {API_KEY_LENGTH} characters")
-            if not _BEARER_TOKEN.fullmatch(key):
-                raise ValueError(f"{where} has characters other than A-Z a-z 0-9 . _ ~ + / - and = at the end")
+            check_secret(where, key)
         return [key for _, key in named]
 
     def __bool__(self) -> bool:
@@ -92,8 +110,7 @@ class ApiKeys:
         if not self:
             return ""
         given = sha256((key or "").encode()).digest()
-        matches = [hmac.compare_digest(given, digest) for digest in self._digests]
-        if not any(matches):
+        if not is_among(key, self._digests):
             raise Refused(Kind.UNAUTHENTICATED, "an API key is needed as a bearer token")
         return sha256(b"robosac key of a session\0" + given).hexdigest()[:KEY_ID_LENGTH]
 

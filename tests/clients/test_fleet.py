@@ -1,5 +1,8 @@
 import io
 import json
+import os
+import signal
+import subprocess
 import sys
 from contextlib import nullcontext
 from types import ModuleType, SimpleNamespace
@@ -143,6 +146,7 @@ def test_the_demo_shows_a_summary(tmp_path, monkeypatch):
     monkeypatch.setenv("ROBOSAC_GATHER_MS", "10000")
     result = CliRunner().invoke(command(demo_main), ["--report", str(tmp_path), "--scenes", "1", "--frames", "6"])
     assert result.exit_code == 0, result.output
+    assert "Watch it live: http://127.0.0.1:" in result.output
     assert "No attacker accepted in" in result.output
     assert "Named as attackers: 1 of 1" in result.output
     assert "Defence: group_testing, expecting positions to be wrong by 0.2 m." in result.output
@@ -152,6 +156,21 @@ def test_the_demo_shows_a_summary(tmp_path, monkeypatch):
     naming = written["naming"]
     assert (naming["attackers_named"], naming["honest_named"]) == (1, 0)
     assert (tmp_path / "example.png").exists()
+
+
+def test_a_demo_to_be_watched_drives_on_until_it_is_interrupted(tmp_path):
+    command = [sys.executable, "-m", "clients.demo", "--report", str(tmp_path), "--scenes", "1", "--frames", "1"]
+    with subprocess.Popen(
+        [*command, "--watch"], stdout=subprocess.PIPE, text=True, env={**os.environ, "COLUMNS": "200"}
+    ) as demo:
+        told = ""
+        while "until Ctrl-C" not in told:
+            told += (line := demo.stdout.readline())
+            assert line, told
+        demo.send_signal(signal.SIGINT)
+        assert demo.wait(20) == 0
+    assert "No attacker accepted in" in told
+    assert (tmp_path / "summary.json").exists()
 
 
 def test_the_demo_fails_loudly_when_the_gateway_does(tmp_path, monkeypatch):

@@ -1,5 +1,7 @@
 """The API's own description, for tools and for whoever reads it: all of it is there, and what it says is so."""
 
+import asyncio
+
 import pytest
 
 from robosac import wire
@@ -7,13 +9,19 @@ from robosac.audit.events import event_on
 from service.app import create_app
 from service.description import AUDIT_LINE, EXAMPLES, TAGS
 from service.operations import operations
+from service.pages import pages
 from service.problems import ANSWERS, TYPE_PREFIX
 from service.routes import v1
 from service.settings import Settings
 from tests.service.conftest import TEAM
 
 MSGPACK = "application/vnd.msgpack"
-ROUTES = [(method.lower(), route.path) for route in (*v1.routes, *operations.routes) for method in route.methods]
+ROUTES = [
+    (method.lower(), route.path)
+    for route in (*v1.routes, *operations.routes, *pages.routes)
+    if route.include_in_schema
+    for method in route.methods
+]
 
 
 @pytest.fixture(scope="module")
@@ -117,6 +125,12 @@ async def test_what_is_answered_is_described(served, description, ego_message, b
     assert (await call("get", f"{session}/frames/{{frame}}/messages", ego)).status_code == 404
     assert (await call("get", session)).status_code == 401
     assert (await call("post", f"{session}/token", rsu)).status_code == 201
+    await call("get", "/v1/live")
+    with_it = asyncio.create_task(call("get", "/v1/live/{sid}"))
+    while not served.gateway.feed.sessions()[0]["viewers"]:
+        await asyncio.sleep(0.001)
+    served.gateway.feed.end()
+    assert (await with_it).status_code == 200
     await call("delete", f"{session}/teammates/{{vehicle_id}}", ego)
     await call("post", f"{session}/teammates", ego, json={"teammates": ["car-9"]})
     for path in ("/v1/detectors", "/v1/keys", session, f"{session}/audit", "/healthz", "/readyz", "/metrics"):

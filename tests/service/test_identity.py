@@ -9,11 +9,15 @@ from service.settings import Settings
 from tests.service.conftest import EGO, TEAM, problem, serve
 from tests.service.credentials import KEY, OPENING, OTHER_KEY, SECRET, bearer
 
-ANYBODY, KEY_HOLDER, ANY_VEHICLE, EGO_ONLY = "anybody", "key holder", "any vehicle", "ego only"
+ANYBODY, KEY_HOLDER, ANY_VEHICLE, EGO_ONLY, VIEWER = "anybody", "key holder", "any vehicle", "ego only", "viewer"
+TOKEN = "a-viewers-token-0123"
 RULES = {
     "GET /openapi.json": ANYBODY,
     "GET /docs": ANYBODY,
-    "GET /docs/oauth2-redirect": ANYBODY,
+    "GET /": ANYBODY,
+    "GET /live/{name}": ANYBODY,
+    "GET /v1/live": VIEWER,
+    "GET /v1/live/{sid}": VIEWER,
     "GET /redoc": ANYBODY,
     "GET /healthz": ANYBODY,
     "GET /readyz": ANYBODY,
@@ -53,9 +57,9 @@ def test_every_route_has_a_rule():
 @pytest.mark.parametrize("route", RULES)
 async def test_every_route_keeps_its_rule(route):
     method, path = route.split()
-    async with serve(api_key=KEY, api_keys=KEY) as served:
+    async with serve(api_key=KEY, api_keys=KEY, viewer_tokens=TOKEN) as served:
         session, other = await served.open(), await served.open()
-        path = path.format(sid=session.session_id, vehicle_id="car-3", frame=0)
+        path = path.format(sid=session.session_id, vehicle_id="car-3", frame=0, name="live.js")
 
         async def call(credential):
             body = {"json": {"teammates": ["car-9"]}} if path.endswith("/teammates") else {}
@@ -64,7 +68,12 @@ async def test_every_route_keeps_its_rule(route):
         if RULES[route] == ANYBODY:
             assert (await call(None)).status_code == 200
             return
-        strangers = [None, "x", other.ego_token, other.teammate_tokens["car-2"]]
+        strangers = [None, "x", other.ego_token, other.teammate_tokens["car-2"], TOKEN]
+        if RULES[route] == VIEWER:
+            for credential in [*strangers[:-1], session.ego_token, KEY, TOKEN[:-1]]:
+                problem(await call(credential), 401, "unauthenticated")
+            assert (await call(TOKEN)).status_code in (200, 404)  # nothing was answered yet
+            return
         if RULES[route] == KEY_HOLDER:
             for credential in [*strangers, session.ego_token, KEY[:-1], KEY + "4", OTHER_KEY]:
                 problem(await call(credential), 401, "unauthenticated")
