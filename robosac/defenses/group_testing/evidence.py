@@ -90,7 +90,7 @@ class Evidence:
             self._begin(outcome)
         findings = self._pairs(outcome)
         if outcome.reference is not None and outcome.boxes is not None:
-            pair = self.measure(outcome.reference, outcome.boxes, self._vouched(outcome, outcome.teammates))
+            pair = self.measure(outcome.reference, outcome.boxes, *self._said(outcome, outcome.teammates))
             self.ego_witnesses = pair is not None
             if pair is not None:
                 values = {"jaccard_index": round(outcome.jaccard_index, 4)}
@@ -132,15 +132,17 @@ class Evidence:
                 continue
             if small.boxes is None or large.boxes is None:
                 continue
-            pair = self.measure(small.boxes, large.boxes, self._vouched(large, joining))
+            pair = self.measure(small.boxes, large.boxes, *self._said(large, joining))
             if pair is not None:
                 found.append((small.teammates, joining, pair))
         return [self._finding(a, d, pair, 1 / math.sqrt(len(found)), {}) for a, d, pair in found]
 
-    def _vouched(self, outcome: Outcome, joining: Hypothesis) -> BoolArray | None:
-        """Which boxes (n,) of a fusion others than the joining support; None where there is no testimony."""
+    def _said(self, outcome: Outcome, joining: Hypothesis) -> tuple[BoolArray | None, BoolArray | None]:
+        """Which boxes (n,) of a fusion others than the joining support, and see in their place; None where there is no
+        testimony.
+        """
         shown = self._checked[outcome.teammates]
-        return None if shown is None else shown.vouched(joining)
+        return (None, None) if shown is None else (shown.vouched(joining), shown.in_place(joining))
 
     def _changes(self, outcome: Outcome) -> list[_Finding]:
         if not self._compare_frames or outcome.boxes is None or outcome.pose is None:

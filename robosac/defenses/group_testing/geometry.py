@@ -22,6 +22,10 @@ KNOWN_SCORE = 0.1
 """A box of the smaller fusion from this score on counts as something there."""
 MIN_WITNESSES = 2
 """With fewer boxes to survive there is no evidence."""
+SAME_IOU = 0.5
+"""A box of the larger fusion that stands in its place by the word of others is the same vehicle from this IoU on."""
+SAME_LOSS = 0.1
+"""Such a box counts as this much lost, at most: about what a box changes between honest fusions on average."""
 
 
 ALONG_M = 4.5
@@ -40,12 +44,19 @@ class PairMeasure:
     """v, boxes that overlap nothing of before."""
 
 
-def measure(smaller: FloatArray, larger: FloatArray, vouched: BoolArray | None = None) -> PairMeasure | None:
+def measure(
+    smaller: FloatArray,
+    larger: FloatArray,
+    vouched: BoolArray | None = None,
+    in_place: BoolArray | None = None,
+) -> PairMeasure | None:
     """Compare the boxes (n, 6) of a fusion with those (m, 6) of the same fusion and more messages.
 
     ``g = 1 - mean over boxes b of the smaller, score >= .5, of max IoU(b, boxes of the larger, score >= .15)``: honest
-    messages leave others' boxes where they are. ``v`` counts boxes of the larger, score >= .3, that touch no box of the
-    smaller with score >= .1, and that nobody else has ``vouched`` for (m,).
+    messages leave others' boxes where they are. A box whose best IoU is at least .5, with one that is ``in_place`` (m,)
+    by the word of others, loses at most .1: there the detector is unsure of a vehicle's size, and nobody has moved it.
+    ``v`` counts boxes of the larger, score >= .3, that touch no box of the smaller with score >= .1, and that nobody
+    else has ``vouched`` for (m,).
 
     Returns
     -------
@@ -55,12 +66,16 @@ def measure(smaller: FloatArray, larger: FloatArray, vouched: BoolArray | None =
     witnesses = smaller[smaller[:, 5] >= WITNESS_SCORE]
     if len(witnesses) < MIN_WITNESSES:
         return None
-    survivors = larger[larger[:, 5] >= SURVIVOR_SCORE]
-    kept = pairwise_iou(witnesses, survivors).max(axis=1).mean() if len(survivors) else 0.0
+    surviving = larger[:, 5] >= SURVIVOR_SCORE
+    overlap = pairwise_iou(witnesses, larger[surviving])
+    lost = 1.0 - overlap.max(axis=1, initial=0.0)
+    if in_place is not None and surviving.any():
+        same = in_place[surviving][overlap.argmax(axis=1)] & (lost <= 1.0 - SAME_IOU)
+        lost = np.where(same, np.minimum(lost, SAME_LOSS), lost)
     claimed = larger[(larger[:, 5] >= NEW_SCORE) & (True if vouched is None else ~vouched)]
     known = smaller[smaller[:, 5] >= KNOWN_SCORE]
     overlap = pairwise_iou(claimed, known).max(axis=1, initial=0.0)
-    return PairMeasure(1.0 - float(kept), int((overlap == 0.0).sum()))
+    return PairMeasure(float(lost.mean()), int((overlap == 0.0).sum()))
 
 
 def followed(boxes: FloatArray, pose: FloatArray) -> FloatArray:

@@ -48,6 +48,9 @@ EFFECT = 1.0
 AWAY = 2.5
 """A box is out of place if it is so many times farther from where witnesses see the vehicle than they may err."""
 AWAY_EFFECT = 0.5
+IN_PLACE = 1.5
+"""A box is in its place if it is at most so many times farther from where witnesses see the vehicle than they may err.
+"""
 SLACK_ALONG_M = 0.15
 SLACK_ACROSS_M = 0.1
 """Added to what a witness says it may err: senders are not quite where they say."""
@@ -156,12 +159,25 @@ class Shown:
         """How far (n,) each box is from where witnesses see it, in either direction or ``across`` itself, the lower
         median of at least two; 0 with fewer. The suspects are no witnesses.
         """
-        others = np.array([name not in suspects for name in self.claims.witnesses])
-        away = self._away[1:, others].max(axis=0) if across else self._away[:, others].max(axis=0)
-        away = np.sort(np.where(np.isnan(away), np.inf, away), axis=0)
-        seeing = np.isfinite(away).sum(axis=0)
-        middle: FloatArray = away[np.maximum(seeing - 1, 0) // 2, np.arange(len(self.boxes))]
+        middle, seeing = self._median_away(suspects, self._away[1:] if across else self._away)
         return np.where(seeing >= 2, middle, 0.0)
+
+    def in_place(self, joining: Collection[str]) -> BoolArray:
+        """Which boxes (n,) stand where those who are not among the joining see a vehicle, by their lower median."""
+        middle, _ = self._median_away(joining, self._away)
+        placed: BoolArray = middle <= IN_PLACE
+        return placed
+
+    def _median_away(self, suspects: Collection[str], away: FloatArray) -> tuple[FloatArray, IntArray]:
+        """The lower median (n,) of all but the suspects of how far away each box is, infinite where none of them sees
+        it; and how many (n,) do.
+        """
+        others = np.array([name not in suspects for name in self.claims.witnesses])
+        away = away[:, others].max(axis=0)
+        away = np.sort(np.where(np.isnan(away), np.inf, away), axis=0)
+        seeing: IntArray = np.isfinite(away).sum(axis=0)
+        middle: FloatArray = away[np.maximum(seeing - 1, 0) // 2, np.arange(len(self.boxes))]
+        return middle, seeing
 
     def own(self, suspects: Sequence[str]) -> FloatArray:
         """What the suspects' own messages say of each box: (suspects, n)."""

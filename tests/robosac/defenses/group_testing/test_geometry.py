@@ -38,6 +38,18 @@ def test_what_somebody_else_vouches_for_is_not_new():
     assert measure(SEEN, more, vouched).loss == measure(SEEN, more).loss
 
 
+def test_a_box_that_others_see_in_its_place_is_hardly_lost():
+    """Where the detector is unsure how long a vehicle is, honest fusions differ."""
+    shorter, moved = SEEN * [1, 1, 0.6, 1, 1, 1], SEEN + [2.0, 0, 0, 0, 0, 0]
+    there, nowhere = np.ones(len(SEEN), dtype=bool), np.zeros(len(SEEN), dtype=bool)
+    assert measure(SEEN, shorter).loss == pytest.approx(0.4)
+    assert measure(SEEN, shorter, in_place=nowhere).loss == pytest.approx(0.4)
+    assert measure(SEEN, shorter, in_place=there).loss == pytest.approx(0.1)
+    assert measure(SEEN, SEEN, in_place=there).loss == pytest.approx(0.0)
+    assert measure(SEEN, moved, in_place=there).loss == pytest.approx(2 / 3)  # too far off to be the same box
+    assert measure(SEEN, SEEN[:0], in_place=there[:0]).loss == 1.0
+
+
 def test_two_few_witnesses_are_no_evidence():
     faint = SEEN * [1, 1, 1, 1, 1, 0.4]
     assert measure(SEEN[:1], SEEN) is None

@@ -145,6 +145,13 @@ def test_boxes_are_vouched_for_by_others_than_those_who_join():
     assert shown.vouched(("c", "d")).tolist() == [True, False]
 
 
+def test_boxes_are_in_place_by_the_word_of_others_than_those_who_join():
+    heard = hearing(c=YES, d=YES)
+    assert Shown(TEAM, car(off=(0.3, 0.1)), heard).in_place(("d",)).tolist() == [True]
+    assert Shown(TEAM, car(off=(0.0, 1.0)), heard).in_place(("d",)).tolist() == [False]
+    assert Shown(TEAM, car(), heard).in_place(("c", "d")).tolist() == [False]  # nobody else sees it
+
+
 def test_what_a_fusion_has_lost_is_found_by_its_part():
     heard = hearing(**SEEN)
     part = Shown(("b", "c"), np.vstack([car(), REST]), heard)
