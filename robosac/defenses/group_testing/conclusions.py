@@ -7,15 +7,20 @@ from collections.abc import Sequence
 
 import numpy as np
 
+from robosac.defenses.group_testing.differences import SAME_LIE_M, blame
 from robosac.defenses.group_testing.findings import UNHEARD, Findings
 from robosac.defenses.group_testing.model import CELLS, CLEAN, LIE
-from robosac.defenses.group_testing.objects import SAME_LIE_M, Lie, Shown, blame
+from robosac.defenses.group_testing.objects import Lie, Shown
 from robosac.defenses.protocol import Hypothesis
 
 CLEARING = 1.5
 """What a frame in which nothing is wrong takes off the logarithm of the odds that one of those fused lies."""
 CONFLICT_SCORE = 0.5
 """Conflicts are counted over boxes of this score."""
+FEWEST_BESIDE = 3
+"""Teammates beside whom another one is to blame for more than ghosts, if so many are heard: beside fewer, one honest
+message more changes much.
+"""
 LEAST_CALM = 0.5
 """Evidence on objects is worth so much, at least, however unsteady the ego is."""
 
@@ -26,14 +31,20 @@ def conclude(found: Findings, answer: Hypothesis) -> None:
         return
     blamed: dict[str, list[Lie]] = {name: [] for name in found.team}
     comparisons = _comparisons(found)
+    heard = sum(name not in found.unheard for name in found.team)
+    fewest = max(1, min(FEWEST_BESIDE, heard - 1))
     for joined, shown in found.shown.items():
         done = {
             suspect: found.effects(joined, without, (suspect,))
             for (fused, without), suspect in comparisons.items()
             if fused == joined
         }
+        enough = len(joined) > fewest
+        if enough:
+            found.lies.audited |= dict.fromkeys(done, found.known.memory.frame)
         for suspect, lies in blame(done, shown).items():
-            blamed[suspect] += [lie for lie in lies if found.calm or not lie.veiled]
+            counting = [lie for lie in lies if enough or lie.counts_as == "ghost"]
+            blamed[suspect] += [lie for lie in counting if found.calm or not lie.veiled]
     for name, lie in _together(found, answer):
         blamed[name].append(lie)
     conflicts = _conflicts(found, answer)
@@ -78,7 +89,9 @@ def _conflicts(found: Findings, answer: Hypothesis) -> dict[str, int]:
 
 
 def _leave_alone(found: Findings, answer: Hypothesis) -> None:
-    """What is wrong in the answer without anybody's doing: everybody was left out lately, or a hole is no loss."""
+    """What is wrong in the answer without anybody's doing: everybody was left out lately, or a hole is no loss. A hole
+    that nobody speaks of who is fused tells nothing.
+    """
     frame = found.known.memory.frame
     for name in answer:
         if tuple(other for other in answer if other != name) in found.decoded:
@@ -87,7 +100,9 @@ def _leave_alone(found: Findings, answer: Hypothesis) -> None:
     everybody = not lying and all(found.lies.recently_left_out(name, frame) for name in answer)
     for lie in found.unexplained(answer) if answer in found.shown else ():
         witnesses = found.supporters(answer, lie) if lie.kind == "gone" else ()
-        tested = lie.kind == "gone" and (not witnesses or witnesses in found.decoded)
+        if lie.kind == "gone" and not witnesses:
+            continue
+        tested = lie.kind == "gone" and witnesses in found.decoded
         if everybody or (tested and not found.is_real(answer, witnesses, lie)):
             found.lies.leave_alone(found.placed(lie.place), frame)
 

@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import math
-from collections.abc import Mapping
+from collections.abc import Callable, Mapping
 from dataclasses import dataclass
 from typing import Any
 
@@ -12,17 +12,23 @@ import numpy as np
 from robosac.boxes import FloatArray
 from robosac.defenses.group_testing import geometry
 from robosac.defenses.group_testing.choice import DEPENDENCE, UNDILUTED_SIZE
+from robosac.defenses.group_testing.differences import misplaced
 from robosac.defenses.group_testing.distribution import BoolArray
-from robosac.defenses.group_testing.geometry import MIN_WITNESSES, PairMeasure, crowd
+from robosac.defenses.group_testing.geometry import MIN_WITNESSES, PairMeasure, Said, crowd
 from robosac.defenses.group_testing.knowledge import Knowledge
 from robosac.defenses.group_testing.memory import CHANGE_REPEAT, EGO_REPEAT, PAIR_REPEAT, WORTH_KEEPING, key
 from robosac.defenses.group_testing.model import CELLS, CLEAN, LIE
 from robosac.defenses.group_testing.objects import Shown
 from robosac.defenses.protocol import Hypothesis, Outcome
 
+Real = Callable[[FloatArray], BoolArray]
 _REPEATS = {"ego": EGO_REPEAT, "pair": PAIR_REPEAT, "change": CHANGE_REPEAT}
 NOBODY = 0
 """The key of the ego alone."""
+MISPLACED, MISPLACED_SLOPE, MISPLACED_MOST = 0.4, 3.0, 3.0
+"""Boxes misplaced by more than this (`differences.misplaced`) speak against who joins, whatever the kind of attack: the
+logarithm of the likelihood ratio grows by the slope, up to the last.
+"""
 _CERTAIN = 1e-9
 _TINY = 1e-300
 
@@ -41,6 +47,8 @@ class _Finding:
     likelihood: FloatArray
     weight: float
     values: Mapping[str, Any]
+    misplaced: float = 0.0
+    """How far d moves boxes from where others see the vehicles, see `differences.misplaced`."""
 
 
 class Evidence:
@@ -74,6 +82,7 @@ class Evidence:
         if not compare_frames:
             known.memory.shown = {}
         self._checked: dict[Hypothesis, Shown | None] = {}
+        self._alone: Shown | None = None
         self.outcomes: list[Outcome] = []
         self.shown: dict[int, FloatArray] = {}
         self.ego_sees = self.ego_witnesses = True
@@ -90,7 +99,9 @@ class Evidence:
             self._begin(outcome)
         findings = self._pairs(outcome)
         if outcome.reference is not None and outcome.boxes is not None:
-            pair = self.measure(outcome.reference, outcome.boxes, *self._said(outcome, outcome.teammates))
+            if self._alone is None and shown is not None:
+                self._alone = shown.of_ego(outcome.reference)
+            pair = self.measure(outcome.reference, outcome.boxes, _said(self._alone, shown, outcome.teammates))
             self.ego_witnesses = pair is not None
             if pair is not None:
                 values = {"jaccard_index": round(outcome.jaccard_index, 4)}
@@ -108,7 +119,7 @@ class Evidence:
             if len(outcome.teammates) == 1:
                 subset = self._known.key(outcome.teammates)
                 if subset in before and subset in now:
-                    singles[outcome.teammates[0]] = self._flicker(before[subset], now[subset])
+                    singles[outcome.teammates[0]] = self._flicker(before[subset], now[subset], self._real(outcome))
         self._known.memory.steadiness.learn(singles)
 
     def _begin(self, first: Outcome) -> None:
@@ -119,9 +130,18 @@ class Evidence:
             alone = None if before is None else self._flicker(before, self.shown[NOBODY])
         self._known.memory.steadiness.begin(alone)
 
-    def _flicker(self, before: FloatArray, now: FloatArray) -> tuple[int, int]:
-        """Boxes of a fusion, and those that came or went."""
-        return max(crowd(before), crowd(now)), self.changes(before, now)
+    def _flicker(self, before: FloatArray, now: FloatArray, real: Real | None = None) -> tuple[int, int]:
+        """Boxes of a fusion, and those that came or went where no vehicle stands by the word of others."""
+        return max(crowd(before), crowd(now)), self.changes(before, now, real)
+
+    def _real(self, outcome: Outcome) -> Real | None:
+        """Of boxes (n, 4), as `followed` gives them, whether others say that a vehicle stands there; None where there
+        is no testimony.
+        """
+        shown, pose = self._checked[outcome.teammates], outcome.pose
+        if shown is None or pose is None:
+            return None
+        return lambda rows: shown.stands(_in_frame(rows, pose))
 
     def _pairs(self, outcome: Outcome) -> list[_Finding]:
         found = []
@@ -132,17 +152,12 @@ class Evidence:
                 continue
             if small.boxes is None or large.boxes is None:
                 continue
-            pair = self.measure(small.boxes, large.boxes, *self._said(large, joining))
+            part, whole = self._checked[small.teammates], self._checked[large.teammates]
+            pair = self.measure(small.boxes, large.boxes, _said(part, whole, joining))
             if pair is not None:
-                found.append((small.teammates, joining, pair))
-        return [self._finding(a, d, pair, 1 / math.sqrt(len(found)), {}) for a, d, pair in found]
-
-    def _said(self, outcome: Outcome, joining: Hypothesis) -> tuple[BoolArray | None, BoolArray | None]:
-        """Which boxes (n,) of a fusion others than the joining support, and see in their place; None where there is no
-        testimony.
-        """
-        shown = self._checked[outcome.teammates]
-        return (None, None) if shown is None else (shown.vouched(joining), shown.in_place(joining))
+                off = 0.0 if part is None or whole is None else misplaced(whole, part, joining)
+                found.append((small.teammates, joining, pair, off))
+        return [self._finding(a, d, pair, 1 / math.sqrt(len(found)), {}, off) for a, d, pair, off in found]
 
     def _changes(self, outcome: Outcome) -> list[_Finding]:
         if not self._compare_frames or outcome.boxes is None or outcome.pose is None:
@@ -152,22 +167,27 @@ class Evidence:
         before = self._known.memory.shown.get(subset)
         if before is None or max(crowd(before), crowd(now)) < MIN_WITNESSES:
             return []
-        boxes, shown, pose = crowd(now), self._checked[outcome.teammates], outcome.pose
-        if shown is None:
-            changed = self._known.memory.steadiness.unexpected(boxes, self.changes(before, now))
-        else:
-            changed = self.changes(before, now, lambda rows: shown.stands(_in_frame(rows, pose)))
+        boxes, real = crowd(now), self._real(outcome)
+        changed = self.changes(before, now, real)
+        if real is None:
+            changed = self._known.memory.steadiness.unexpected(boxes, changed)
         likelihood = self._known.model.change(len(outcome.teammates), boxes, changed)
         values = {"boxes": boxes, "changes": changed}
         return [_Finding("change", (), outcome.teammates, likelihood, 1.0, values)]
 
     def _finding(
-        self, a: Hypothesis, d: Hypothesis, pair: PairMeasure, weight: float, values: Mapping[str, Any]
+        self,
+        a: Hypothesis,
+        d: Hypothesis,
+        pair: PairMeasure,
+        weight: float,
+        values: Mapping[str, Any],
+        misplaced: float = 0.0,
     ) -> _Finding:
         likelihood = self._known.model.pair(len(a), len(d), pair)
         values = {**values, "loss": round(pair.loss, 4), "novelty": pair.novelty}
         weight *= DEPENDENCE
-        return _Finding("pair" if a else "ego", a, d, likelihood, weight, values)
+        return _Finding("pair" if a else "ego", a, d, likelihood, weight, values, misplaced)
 
     def _apply(self, finding: _Finding) -> None:
         posterior = self._known.posterior
@@ -176,6 +196,9 @@ class Evidence:
         cells = posterior.cells(masks[:, :1], masks[:, 1:])[0]
         strangeness = self._known.memory.strangeness
         likelihood = self._neutral(strangeness.weights @ finding.likelihood, cells)
+        if finding.misplaced > MISPLACED:
+            against = np.exp(min(MISPLACED_MOST, MISPLACED_SLOPE * (finding.misplaced - MISPLACED)))
+            likelihood[CLEAN:] *= np.tile([against, 1.0, against], len(likelihood[CLEAN:]) // CELLS)
         weight = self._weight(finding, cells, likelihood)
         strangeness.learn(finding.likelihood, cells, weight)
         posterior.learn(masks, weight * np.log(likelihood))
@@ -217,6 +240,13 @@ class Evidence:
                     item["joining"] = list(finding.d)
                 item["log_likelihood_ratio"] = round(ratio, 3)
                 memory.add_evidence(name, item)
+
+
+def _said(smaller: Shown | None, larger: Shown | None, joining: Hypothesis) -> Said | None:
+    """What others than the joining say of the boxes of two fusions; None where there is no testimony."""
+    if smaller is None or larger is None:
+        return None
+    return Said(smaller.vouched(joining), larger.vouched(joining), larger.in_place(joining))
 
 
 def _in_frame(rows: FloatArray, pose: FloatArray) -> FloatArray:

@@ -8,9 +8,10 @@ import numpy as np
 
 from robosac.boxes import FloatArray
 from robosac.defenses.group_testing.claims import SUPPORTS
+from robosac.defenses.group_testing.differences import SAME_LIE_M, effects, gone
 from robosac.defenses.group_testing.knowledge import Knowledge
 from robosac.defenses.group_testing.lies import Lies
-from robosac.defenses.group_testing.objects import REACH_M, SAME_LIE_M, Hearing, Lie, Shown, effects, gone
+from robosac.defenses.group_testing.objects import REACH_M, Hearing, Lie, Shown
 from robosac.defenses.protocol import Hypothesis, Outcome
 from robosac.testimony import Testimony
 

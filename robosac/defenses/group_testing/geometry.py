@@ -44,35 +44,44 @@ class PairMeasure:
     """v, boxes that overlap nothing of before."""
 
 
-def measure(
-    smaller: FloatArray,
-    larger: FloatArray,
-    vouched: BoolArray | None = None,
-    in_place: BoolArray | None = None,
-) -> PairMeasure | None:
+@dataclass(frozen=True)
+class Said:
+    """What others than those who join say of the boxes of a fusion (n, 6), and of the larger one with them (m, 6)."""
+
+    real: BoolArray
+    """(n,): there is a vehicle."""
+    vouched: BoolArray
+    """(m,): there is a vehicle."""
+    in_place: BoolArray
+    """(m,): the vehicle is where the box is."""
+
+
+def measure(smaller: FloatArray, larger: FloatArray, said: Said | None = None) -> PairMeasure | None:
     """Compare the boxes (n, 6) of a fusion with those (m, 6) of the same fusion and more messages.
 
     ``g = 1 - mean over boxes b of the smaller, score >= .5, of max IoU(b, boxes of the larger, score >= .15)``: honest
-    messages leave others' boxes where they are. A box whose best IoU is at least .5, with one that is ``in_place`` (m,)
-    by the word of others, loses at most .1: there the detector is unsure of a vehicle's size, and nobody has moved it.
-    ``v`` counts boxes of the larger, score >= .3, that touch no box of the smaller with score >= .1, and that nobody
-    else has ``vouched`` for (m,).
+    messages leave others' boxes where they are. ``v`` counts boxes of the larger, score >= .3, that touch no box of the
+    smaller with score >= .1.
+
+    Where others have ``said`` something, boxes of the smaller that are not real by that count for nothing, and those of
+    the larger that are vouched for are not new. A box whose best IoU is at least .5, with one that is in its place,
+    loses at most .1: there the detector is unsure of a vehicle's size, and nobody has moved it.
 
     Returns
     -------
     PairMeasure or None
         None if the smaller has fewer than two boxes to survive.
     """
-    witnesses = smaller[smaller[:, 5] >= WITNESS_SCORE]
+    witnesses = smaller[(smaller[:, 5] >= WITNESS_SCORE) & (True if said is None else said.real)]
     if len(witnesses) < MIN_WITNESSES:
         return None
     surviving = larger[:, 5] >= SURVIVOR_SCORE
     overlap = pairwise_iou(witnesses, larger[surviving])
     lost = 1.0 - overlap.max(axis=1, initial=0.0)
-    if in_place is not None and surviving.any():
-        same = in_place[surviving][overlap.argmax(axis=1)] & (lost <= 1.0 - SAME_IOU)
+    if said is not None and surviving.any():
+        same = said.in_place[surviving][overlap.argmax(axis=1)] & (lost <= 1.0 - SAME_IOU)
         lost = np.where(same, np.minimum(lost, SAME_LOSS), lost)
-    claimed = larger[(larger[:, 5] >= NEW_SCORE) & (True if vouched is None else ~vouched)]
+    claimed = larger[(larger[:, 5] >= NEW_SCORE) & (True if said is None else ~said.vouched)]
     known = smaller[smaller[:, 5] >= KNOWN_SCORE]
     overlap = pairwise_iou(claimed, known).max(axis=1, initial=0.0)
     return PairMeasure(float(lost.mean()), int((overlap == 0.0).sum()))

@@ -9,9 +9,12 @@ import numpy as np
 from robosac.defenses.group_testing.conclusions import conclude
 from robosac.defenses.group_testing.findings import Findings
 from robosac.defenses.group_testing.objects import Lie, Shown
+from robosac.defenses.group_testing.posterior import EXACT
 from robosac.defenses.group_testing.standing import Judged, judge
 from robosac.defenses.protocol import Hypothesis, Outcome
 
+AUDIT_FRAMES = 40
+"""After so many frames a teammate of the answer is left out again, to see what it does."""
 SUSPECT = 0.5
 """Who is suspected more than this, and not named, is asked again each frame, so as to be cleared or named."""
 
@@ -30,6 +33,7 @@ class Inspection:
     def __init__(self, found: Findings, keep_contradicted: bool) -> None:
         self._found = found
         self._keep_contradicted = keep_contradicted
+        self._whole: Hypothesis | None = None
 
     def learn(self, outcome: Outcome) -> Shown | None:
         """Take in a decoded subset; what it shows is given back, checked, if there is testimony to check it by."""
@@ -47,7 +51,9 @@ class Inspection:
         yield from self._again(answer)
         if answer not in self._found.shown:
             return
+        yield from (self._without(answer, name) for name in answer if self._found.lies.worst(name))
         lies = self._found.unexplained(answer) or self._hardly_explained(answer)
+        lies = [lie for lie in lies if lie.kind != "gone" or self._found.supporters(answer, lie)]
         holes = [lie for lie in lies if lie.kind == "gone"]
         if holes and len(holes) == len(lies):
             witnesses = self._found.supporters(answer, holes[0])
@@ -56,7 +62,10 @@ class Inspection:
         if lies:
             groups = [self._found.vouching(answer, lie) for lie in lies]
             for group in (*filter(None, groups), *((name,) for name in self._candidates(answer, lies))):
-                yield tuple(name for name in answer if name not in group)
+                yield self._without(answer, *group)
+        # the answer may change within a frame, and nobody would be left out of the same one
+        self._whole = answer if self._whole is None else self._whole
+        yield from (self._without(self._whole, name) for name in self._due(self._whole))
 
     def conclude(self, answer: Hypothesis) -> None:
         """Who lied in this frame; the posterior learns it, and memory keeps it."""
@@ -95,6 +104,22 @@ class Inspection:
         """The answer and others, in the order of the team."""
         together = {*answer, *others}
         return tuple(name for name in self._found.team if name in together)
+
+    @staticmethod
+    def _without(answer: Hypothesis, *group: str) -> Hypothesis:
+        return tuple(name for name in answer if name not in group)
+
+    def _due(self, whole: Hypothesis) -> list[str]:
+        """Who is to be left out although nothing seems wrong, to see what it takes away: all that never were, and one
+        in a frame of those that were long ago. In larger teams that takes too many passes.
+        """
+        if len(self._found.team) > EXACT:
+            return []
+        frame, last = self._found.known.memory.frame, self._found.lies.audited
+        never = [name for name in whole if name not in last]
+        if never or any(self._without(whole, name) in self._found.decoded for name in whole):
+            return never
+        return sorted((name for name in whole if frame - last[name] >= AUDIT_FRAMES), key=lambda name: last[name])[:1]
 
     def _hardly_explained(self, answer: Hypothesis) -> list[Lie]:
         """What is wrong in the answer, and explained, while only one of those fused was left out: what two do together

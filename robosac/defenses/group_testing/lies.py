@@ -35,6 +35,7 @@ RULES: Mapping[str, Rule] = {
     "gone": Rule(1.5, 1, 0.5, 3.0, ((1.0, 2.5), (2.0, 3.0), (3.0, 4.0))),
     "moved": Rule(1.0, 1, 0.3, 2.0, ((0.7, 2.0), (1.4, 3.0), (2.1, 4.0))),
     "late": Rule(1.0, 1, 0.3, 2.0, ((0.7, 2.0), (1.4, 3.0), (2.1, 4.0)), malice=False),
+    "alone": Rule(1.0, 1, 0.3, 2.0, ((0.7, 2.0), (1.4, 3.0), (2.1, 4.0)), malice=False),
     "veiled": Rule(1.25, 1, 0.5, 3.0, ((0.75, 2.5), (1.5, 2.5), (2.25, 4.0))),
     "conflict": Rule(1.0, 3, 0.5, 6.0, ((3.0, 2.0), (4.5, 4.0), (6.0, 4.0))),
 }
@@ -67,6 +68,8 @@ class Lies:
     """
     left_out: dict[str, int] = field(default_factory=dict)
     """By teammate: the frame of the session in which an answer was last decoded without it, to see what it does."""
+    audited: dict[str, int] = field(default_factory=dict)
+    """The same for a fusion of enough others to tell."""
 
     def recently_left_out(self, teammate: str, frame: int) -> bool:
         """Whether it was left out in this frame or one just before."""
@@ -129,6 +132,7 @@ class Lies:
         self.levels.pop(teammate, None)
         self.conflicts.pop(teammate, None)
         self.left_out.pop(teammate, None)
+        self.audited.pop(teammate, None)
 
     def to_state(self) -> dict[str, Any]:
         """JSON values that `from_state` reads."""
@@ -137,6 +141,7 @@ class Lies:
             "quiet": [list(entry) for entry in self.quiet],
             "conflicts": {name: [list(entry) for entry in of] for name, of in self.conflicts.items()},
             "left_out": self.left_out,
+            "audited": self.audited,
         }
 
     @classmethod
@@ -150,6 +155,7 @@ class Lies:
                 for name, of in state.get("conflicts", {}).items()  # not in the states of older versions
             },
             {str(name): int(frame) for name, frame in state["left_out"].items()},
+            {str(name): int(frame) for name, frame in state.get("audited", {}).items()},  # nor is this
         )
 
 

@@ -8,13 +8,13 @@ witnesses and an effect.
 
 from __future__ import annotations
 
-from collections.abc import Collection, Mapping, Sequence
+from collections.abc import Collection, Sequence
 from dataclasses import dataclass
 from functools import cached_property
 
 import numpy as np
 
-from robosac.boxes import FloatArray, IntArray, pairwise_iou
+from robosac.boxes import FloatArray, IntArray
 from robosac.defenses.group_testing.claims import DENIES, SUPPORTS, WEIGHTY, Claims, two_witnesses
 from robosac.defenses.group_testing.distribution import BoolArray
 from robosac.defenses.protocol import Hypothesis
@@ -22,13 +22,6 @@ from robosac.testimony import Testimony
 
 SHOWN_SCORE = 0.3
 """Boxes from this score on claim something."""
-CRISP_SCORE = 0.5
-OWN_DENIES = -4.0
-"""Whose own message denies a place so far is not to blame for a box there."""
-GONE_EFFECT = 1.5
-"""A box is gone by somebody's fault if it had such a score, and has so much less now: faint ones come and go."""
-BLAMED_SUM = 8.0
-"""Somebody is to blame for a crisp box that the others contradict with this sum of L: more than the word of one."""
 PLACED_SCORE = 0.4
 """Boxes from this score on have to be in their place."""
 THERE_SCORE = 0.15
@@ -37,17 +30,12 @@ STANDING_SUM = 10.0
 """A vehicle stands where the sum of L is so much."""
 CERTAIN = 4.0
 """From this L on, two teammates or the ego know that a vehicle stands in a place."""
-SAME_LIE_M = 3.0
-"""Lies so near each other are about one object."""
 REACH_M = 2.2
 """A box is at a place if it is centred so near."""
 RIM_M = 1.2
 """A place so near a box belongs to it."""
-EFFECT = 1.0
-"""Logarithm of the odds of a box by which it has to grow or shrink."""
 AWAY = 2.5
 """A box is out of place if it is so many times farther from where witnesses see the vehicle than they may err."""
-AWAY_EFFECT = 0.5
 IN_PLACE = 1.5
 """A box is in its place if it is at most so many times farther from where witnesses see the vehicle than they may err.
 """
@@ -71,13 +59,17 @@ class Lie:
     """
 
     along: bool = False
-    """Whether a vehicle is moved along itself only, as by a message that is late."""
+    """Whether a vehicle is moved along itself only, or many are a little, as by a message that is late."""
+    alone: bool = False
+    """Whether a single witness supports the vehicle that is gone: one word against one."""
 
     @property
     def counts_as(self) -> str:
         """What it is counted as, see `lies.RULES`."""
         if self.along:
             return "late"
+        if self.alone:
+            return "alone"
         return "veiled" if self.veiled else self.kind
 
 
@@ -142,6 +134,10 @@ class Shown:
         self.everybody = Claims.of(boxes, hearing.everybody)
         """What everybody says of the boxes, heard or not."""
         self.claims = self.everybody.without(set(hearing.everybody.agents) - set(hearing.heard.agents))
+
+    def of_ego(self, boxes: FloatArray) -> Shown:
+        """What the ego alone shows in the same frame, checked."""
+        return Shown((), boxes, self._hearing)
 
     @cached_property
     def _away(self) -> FloatArray:
@@ -211,15 +207,12 @@ class Shown:
         return np.array(found).reshape(-1, 2)
 
     def stands(self, places: FloatArray) -> BoolArray:
-        """Whether somebody supports a vehicle at places (n, 2) who is not among those fused."""
-        others = [i for i, name in enumerate(self._testimony.agents) if name not in self.teammates]
-        supported: BoolArray = np.atleast_1d((self._testimony.likelihood(places)[others] >= SUPPORTS).any(axis=0))
-        return supported
+        """Whether a vehicle stands at places (n, 2) by the word of somebody who is not among those fused, or of two."""
+        return _vouched(self._testimony.likelihood(places) >= SUPPORTS, self._testimony.agents, self.teammates)
 
     def vouched(self, joining: Hypothesis) -> BoolArray:
-        """Which boxes (n,) somebody supports who is not among the joining: nothing that these may have made up."""
-        supported: BoolArray = np.atleast_1d(self.claims.without(joining).supporting.any(axis=0))
-        return supported
+        """Which boxes (n,) somebody supports who is not among the joining, or two: nothing that one has made up."""
+        return _vouched(self.claims.supporting, self.claims.witnesses, joining)
 
     @cached_property
     def lies(self) -> list[Lie]:
@@ -249,68 +242,8 @@ class Shown:
         return covered
 
 
-def effects(joined: Shown, without: Shown, suspects: Sequence[str]) -> list[Lie]:
-    """What is wrong in a fusion, and is not in the same fusion without the suspects.
-
-    - ``ghost``: a contradicted box whose odds without them are less by a factor of e;
-    - ``gone``: a box without them where the others support a vehicle, and nothing is shown with them;
-    - ``moved``: a box that is out of place, and without them less so. If it is so along itself only, it may be late.
-    """
-    ghosts = joined.claims.contradicted(suspects, BLAMED_SUM) & (joined.boxes[:, 5] >= CRISP_SCORE)
-    grown, own = joined.boxes[ghosts], joined.own(suspects)[:, ghosts].max(axis=0)
-    drop = joined.odds_at(grown[:, :2]) - without.odds_at(grown[:, :2])
-    found = [Lie("ghost", grown[i, :2], bool(own[i] <= OWN_DENIES)) for i in np.flatnonzero(drop >= EFFECT)]
-    which = gone(joined, without, suspects)
-    lost, own = without.boxes[which], without.own(suspects)[:, which].min(axis=0)
-    drop = without.odds_at(lost[:, :2]) - joined.odds_at(lost[:, :2])
-    taken = np.flatnonzero((lost[:, 5] >= CRISP_SCORE) & (drop >= GONE_EFFECT))
-    found += [Lie("gone", lost[i, :2], bool(own[i] >= SUPPORTS)) for i in taken]
-    away, aside, other = joined.away(suspects), joined.away(suspects, across=True), without.away(suspects)
-    for index in np.flatnonzero((away >= AWAY) & (joined.boxes[:, 5] >= PLACED_SCORE) & ~ghosts):
-        same = _at(without, joined.boxes[index])
-        if same is not None and 0.0 < other[same] <= away[index] - AWAY_EFFECT:
-            found.append(Lie("moved", joined.boxes[index, :2], along=bool(aside[index] < AWAY)))
-    return found
-
-
-def blame(found: Mapping[str, Sequence[Lie]], joined: Shown) -> dict[str, list[Lie]]:
-    """Who is to blame for what is wrong in a fusion, of what is not so without each suspect.
-
-    What is explained by several may be the doing of one of them, who makes it show only beside another. Then those are
-    to blame whose own message goes with the lie, and if nobody's does, nobody is.
-    """
-    blamed: dict[str, list[Lie]] = {name: [] for name in found}
-    for name, lies in found.items():
-        for lie in lies:
-            others = [
-                other
-                for other, theirs in found.items()
-                if other != name and any(np.hypot(*(each.place - lie.place)) <= SAME_LIE_M for each in theirs)
-            ]
-            if not others or joined.goes_with(name, lie):
-                blamed[name].append(lie)
-    return blamed
-
-
-def gone(joined: Shown, without: Shown, suspects: Collection[str] = ()) -> IntArray:
-    """Boxes, by their places in ``without``, that are gone in ``joined`` although others support them."""
-    claims = without.claims
-    others = np.array([name not in suspects for name in claims.witnesses])
-    supported = two_witnesses(claims.supporting & others[:, None])
-    supported &= claims.likelihood[others].sum(axis=0) >= WEIGHTY
-    there = joined.boxes[joined.boxes[:, 5] >= THERE_SCORE]
-    overlap = pairwise_iou(without.boxes, there).max(axis=1, initial=0.0)
-    rise = without.odds_at(without.boxes[:, :2]) - joined.odds_at(without.boxes[:, :2])
-    lost: IntArray = np.flatnonzero(
-        supported & (overlap < 0.05) & (without.boxes[:, 5] >= SHOWN_SCORE) & (rise >= EFFECT)
-    )
-    return lost
-
-
-def _at(shown: Shown, box: FloatArray) -> int | None:
-    """The box of a fusion that overlaps another one most."""
-    if not len(shown.boxes):
-        return None
-    overlap = pairwise_iou(box[None], shown.boxes)[0]
-    best = int(overlap.argmax())
-    return best if overlap[best] > 0.05 else None
+def _vouched(supporting: BoolArray, agents: Sequence[str], suspects: Collection[str]) -> BoolArray:
+    """Which places (n,) one of the agents supports, ``supporting`` (agents, n), who is no suspect, or two."""
+    others = np.array([name not in suspects for name in agents])
+    vouched: BoolArray = supporting[others].any(axis=0) | (supporting.sum(axis=0) >= 2)
+    return vouched

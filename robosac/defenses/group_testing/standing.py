@@ -9,7 +9,8 @@ import numpy as np
 from robosac.answers import Standing, Support
 from robosac.boxes import FloatArray
 from robosac.defenses.group_testing.claims import DENIES, SUPPORTS
-from robosac.defenses.group_testing.objects import AWAY_EFFECT, Shown, gone
+from robosac.defenses.group_testing.differences import AWAY_EFFECT, gone, gone_alone
+from robosac.defenses.group_testing.objects import Shown
 from robosac.defenses.protocol import EGO, JudgedBox
 
 SAME_M = 2.5
@@ -24,7 +25,7 @@ def judge(answer: Shown, decoded: Sequence[Shown]) -> Judged:
     1. A contradicted box is left out.
     2. A box that is out of place is taken from the part of the answer that has it nearest to its place.
     3. A vehicle that a part of the answer shows, and the answer has lost although it stands by testimony, is taken from
-       there.
+       there. Of the answer without one teammate the word of one witness is enough, if nobody else denies it.
     4. Any other box is ``confirmed`` by the ego, or by two teammates whom nobody denies; ``disputed`` if somebody
        denies it; else ``single_witness``.
 
@@ -54,7 +55,9 @@ def judge(answer: Shown, decoded: Sequence[Shown]) -> Judged:
         else:
             keep(answer, index)
     for part in parts:
-        for at in gone(answer, part).tolist():
+        left = [name for name in answer.teammates if name not in part.teammates]
+        alone: list[int] = gone_alone(answer, part, left).tolist() if len(left) == 1 else []
+        for at in (*gone(answer, part).tolist(), *alone):
             place = part.boxes[at, :2]
             if all(np.hypot(*(place - other)) > SAME_M for other in repaired):
                 keep(part, at, Standing.REPAIRED)

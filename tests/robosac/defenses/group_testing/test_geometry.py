@@ -2,8 +2,18 @@ import numpy as np
 import pytest
 
 from robosac.boxes import pose_matrix
-from robosac.defenses.group_testing.geometry import changes, crowd, followed, measure
+from robosac.defenses.group_testing.geometry import Said, changes, crowd, followed, measure
 from tests.robosac.defenses.group_testing.conversing import SEEN
+
+
+def said(larger, real=None, vouched=None, in_place=None):
+    """What others say of `SEEN`, and of a larger fusion; by default all of `SEEN` is real, and no more is said."""
+    nothing = np.zeros(len(larger), dtype=bool)
+    return Said(
+        np.ones(len(SEEN), dtype=bool) if real is None else real,
+        nothing if vouched is None else vouched,
+        nothing if in_place is None else in_place,
+    )
 
 
 def test_what_stays_is_no_loss_and_nothing_new():
@@ -31,23 +41,30 @@ def test_what_was_nowhere_is_new_if_it_is_claimed_with_confidence():
 
 def test_what_somebody_else_vouches_for_is_not_new():
     more = np.vstack([SEEN, SEEN[:3] + [0, 30.0, 0, 0, 0, 0]])
-    vouched = np.zeros(len(more), dtype=bool)
-    assert measure(SEEN, more, vouched) == measure(SEEN, more)
-    vouched[-2:] = True
-    assert measure(SEEN, more, vouched).novelty == 1
-    assert measure(SEEN, more, vouched).loss == measure(SEEN, more).loss
+    assert measure(SEEN, more, said(more)) == measure(SEEN, more)
+    vouched = np.arange(len(more)) >= len(more) - 2
+    assert measure(SEEN, more, said(more, vouched=vouched)).novelty == 1
+    assert measure(SEEN, more, said(more, vouched=vouched)).loss == measure(SEEN, more).loss
 
 
 def test_a_box_that_others_see_in_its_place_is_hardly_lost():
     """Where the detector is unsure how long a vehicle is, honest fusions differ."""
     shorter, moved = SEEN * [1, 1, 0.6, 1, 1, 1], SEEN + [2.0, 0, 0, 0, 0, 0]
-    there, nowhere = np.ones(len(SEEN), dtype=bool), np.zeros(len(SEEN), dtype=bool)
+    there = np.ones(len(SEEN), dtype=bool)
     assert measure(SEEN, shorter).loss == pytest.approx(0.4)
-    assert measure(SEEN, shorter, in_place=nowhere).loss == pytest.approx(0.4)
-    assert measure(SEEN, shorter, in_place=there).loss == pytest.approx(0.1)
-    assert measure(SEEN, SEEN, in_place=there).loss == pytest.approx(0.0)
-    assert measure(SEEN, moved, in_place=there).loss == pytest.approx(2 / 3)  # too far off to be the same box
-    assert measure(SEEN, SEEN[:0], in_place=there[:0]).loss == 1.0
+    assert measure(SEEN, shorter, said(SEEN)).loss == pytest.approx(0.4)
+    assert measure(SEEN, shorter, said(SEEN, in_place=there)).loss == pytest.approx(0.1)
+    assert measure(SEEN, SEEN, said(SEEN, in_place=there)).loss == pytest.approx(0.0)
+    assert measure(SEEN, moved, said(SEEN, in_place=there)).loss == pytest.approx(2 / 3)  # too far to be the same box
+    assert measure(SEEN, SEEN[:0], said(SEEN[:0], in_place=there[:0])).loss == 1.0
+
+
+def test_a_box_that_nobody_else_supports_is_no_loss():
+    """A detector shows what is not there, too."""
+    real = np.arange(len(SEEN)) < 6
+    assert measure(SEEN, SEEN[:5]).loss == pytest.approx(3 / 8)
+    assert measure(SEEN, SEEN[:5], said(SEEN[:5], real=real)).loss == pytest.approx(1 / 6)
+    assert measure(SEEN, SEEN, said(SEEN, real=real & (np.arange(len(SEEN)) < 1))) is None
 
 
 def test_two_few_witnesses_are_no_evidence():

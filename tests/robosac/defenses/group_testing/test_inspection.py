@@ -1,6 +1,7 @@
 """Sessions in which one object is false: who is asked, who is blamed, and how each box stands."""
 
 import json
+from dataclasses import replace
 
 import numpy as np
 import pytest
@@ -8,6 +9,13 @@ import pytest
 from robosac.answers import Standing, Verdict
 from robosac.defenses import EGO, Outcome
 from robosac.defenses.group_testing import GroupTesting, GroupTestingSettings
+from robosac.defenses.group_testing.conclusions import conclude
+from robosac.defenses.group_testing.evidence import Evidence
+from robosac.defenses.group_testing.findings import Findings
+from robosac.defenses.group_testing.knowledge import Knowledge
+from robosac.defenses.group_testing.lies import Lies
+from robosac.defenses.group_testing.memory import Memory
+from robosac.defenses.group_testing.posterior import Posterior
 from tests.robosac.defenses.group_testing.conversing import TEAM, make_model, run_frame
 from tests.robosac.testifying import saying
 
@@ -223,6 +231,94 @@ def test_inspections_are_bounded(inspections):
     assert len(first) <= settings.first_budget + inspections
     assert all(len(tested) <= settings.budget + inspections for _, tested in later)
     assert (LIAR in later[-1][0].named) == (inspections > 1)
+
+
+ALONE = World({"car-2": YES, LIAR: NO}, lambda subset: CAR[:0] if LIAR in subset else seen_by("car-2")(subset))
+
+
+def test_what_one_sees_and_one_takes_away_is_shown_and_nobody_is_named():
+    """One word against one: whoever takes it away is left out, but may be right."""
+    met = ALONE.play(10)
+    assert {name for decision, _ in met for name in decision.named} == set()
+    assert all(there(decision, tested, decision.objects) for decision, tested in met[2:])
+    last, _ = met[-1]
+    assert LIAR not in last.accepted
+    assert "car-2" in last.accepted
+
+
+def test_everybody_is_left_out_once_although_nothing_is_wrong():
+    met = HONEST.play(4)
+    left_out = {name for _, tested in met for subset in tested if len(subset) == 4 for name in set(TEAM) - set(subset)}
+    assert left_out == set(TEAM)
+
+
+def test_who_moves_all_boxes_a_little_is_left_out():
+    """Each box is nearly in its place, and overlaps what it was."""
+    world = World({}, nothing)
+    world.judge = shifted(world.judge, 0.4)
+    met = world.play(8)
+    last, _ = met[-1]
+    assert LIAR not in last.accepted
+    assert all(p < 0.5 for name, p in last.suspicion.items() if name != LIAR)
+    assert {name for decision, _ in met for name in decision.named} == set()
+
+
+def shifted(judge, aside):
+    """The same outcomes, with boxes moved across themselves where the liar is fused."""
+
+    def moved(subset, *more):
+        outcome = judge(subset, *more)
+        off = np.array([0, aside, 0, 0, 0, 0]) if LIAR in subset else 0.0
+        return replace(outcome, boxes=outcome.boxes + off)
+
+    return moved
+
+
+def knowledge():
+    return Knowledge(MODEL, Posterior(len(MODEL.kinds), 0.5, 0.25, TEAM), Memory())
+
+
+def concluded(world, answer, *subsets):
+    """What is found out by these fusions."""
+    found = Findings(knowledge(), Lies(), tuple(TEAM), ())
+    for subset in (answer, *subsets):
+        found.learn(world.judge(subset, None, 0))
+    conclude(found, answer)
+    return found
+
+
+def test_a_hole_is_left_alone_only_after_those_who_see_a_vehicle_there_were_asked():
+    unseen = World({"car-2": YES, "car-3": YES}, nothing)
+    assert concluded(unseen, ("rsu", "car-5")).lies.quiet == []
+    assert concluded(unseen, ("car-2", "car-3", "rsu")).lies.quiet == []
+    assert len(concluded(unseen, ("car-2", "car-3", "rsu"), ("car-2", "car-3")).lies.quiet) == 1
+
+
+def test_beside_few_others_nobody_is_to_blame_for_what_is_gone():
+    few, more = ("car-2", "car-3"), ("car-2", "car-3", "rsu")
+    assert "gone" not in concluded(ERASED, (*few, LIAR), few).lies.levels.get(LIAR, {})
+    assert "gone" in concluded(ERASED, (*more, LIAR), more).lies.levels[LIAR]
+
+
+@pytest.mark.parametrize(("seen_by_others", "unsteady"), [(True, False), (False, True)])
+def test_who_flickers_where_others_see_vehicles_is_not_unsteady(seen_by_others, unsteady):
+    knowing = {EGO, *TEAM} if seen_by_others else {LIAR}
+    testimony = saying(
+        {name: [(x, y, YES) for x, y in SEEN[:, :2]] if name in knowing else [] for name in (EGO, *TEAM)}
+    )
+    found = Findings(knowledge(), Lies(), tuple(TEAM), ())
+    for frame, boxes in enumerate((SEEN, SEEN[:0])):
+        told = {"testimony": testimony, "alone": SEEN}
+        outcome = Outcome((LIAR,), 0.93, Verdict.CONSENSUS, boxes, SEEN, np.eye(4), frame, **told)
+        evidence = Evidence(found.known)
+        evidence.learn(outcome, found.learn(outcome))
+        evidence.compare_singles()
+        found.known.memory.shown, found.known.memory.shown_in = evidence.shown, frame
+    assert (LIAR in found.known.memory.steadiness.levels) == unsteady
+
+
+def test_a_ghost_is_blamed_beside_few_others_too():
+    assert "ghost" in concluded(GHOST, ("car-2", "car-3", LIAR), ("car-2", "car-3")).lies.levels[LIAR]
 
 
 VEILED = World({"car-2": NO, "car-3": NO, LIAR: NO}, with_liar(CAR, CAR[:0]))

@@ -3,7 +3,8 @@
 import numpy as np
 import pytest
 
-from robosac.defenses.group_testing.objects import Hearing, Shown, effects, gone
+from robosac.defenses.group_testing.differences import effects, gone, misplaced
+from robosac.defenses.group_testing.objects import Hearing, Shown
 from tests.robosac.testifying import saying
 
 PLACE = np.array([10.4, 4.3])
@@ -85,10 +86,41 @@ def test_a_vehicle_gone_is_blamed_on_whoever_takes_it_away():
 
 @pytest.mark.parametrize(
     ("said", "kinds"),
-    [({}, []), ({"b": YES}, []), ({"b": YES, "d": YES}, []), ({"b": YES, "c": YES, "a": NO}, []), (SEEN, ["gone"])],
+    [({}, []), ({"b": 3.5}, []), ({"d": YES}, []), ({"b": YES, "c": YES, "a": NO}, []), (SEEN, ["gone"])],
 )
 def test_a_vehicle_that_two_others_see_is_missed(said, kinds):
     assert found(hearing(**said), NOTHING, car()) == kinds
+
+
+@pytest.mark.parametrize(
+    ("said", "without", "missed"),
+    [
+        ({}, car(), 1),
+        ({"d": NO}, car(), 1),
+        ({"d": YES}, car(), 1),
+        ({"c": NO}, car(), 0),  # one more who says that it is none
+        ({}, car(score=0.45), 0),
+    ],
+)
+def test_a_vehicle_that_one_other_is_certain_of_is_missed_by_one_word_against_one(said, without, missed):
+    heard = hearing(b=YES, **said)
+    lies = effects(Shown(TEAM, REST, heard), Shown(("a", "b", "c"), np.vstack([REST, without]), heard), ["d"])
+    assert [lie.counts_as for lie in lies] == ["alone"] * missed
+    assert effects(Shown(("b", "d"), REST, heard), Shown(("b",), np.vstack([REST, without]), heard), ["d"]) == []
+
+
+@pytest.mark.parametrize(("said", "some"), [(SEEN, True), ({"b": YES}, False), ({"b": YES, "d": YES}, False)])
+def test_boxes_that_are_moved_a_little_are_misplaced_by_the_word_of_two_others(said, some):
+    heard = hearing(**said)
+    near = Shown(("a", "b", "c"), np.vstack([car(off=(0.0, 0.1)), REST]), heard)
+    aside = Shown(TEAM, np.vstack([car(off=(0.0, 0.5)), REST]), heard)
+    assert misplaced(aside, near, ["d"]) == pytest.approx(0.4 / 0.3 / np.sqrt(2) if some else 0.0, abs=0.1)
+    assert misplaced(near, aside, ["d"]) == pytest.approx(-0.4 / 0.3 / np.sqrt(2) if some else 0.0, abs=0.1)
+    far = Shown(TEAM, np.vstack([car(off=(0.0, 1.4)), REST]), heard)
+    assert misplaced(far, near, ["d"]) == pytest.approx(
+        2.0 / np.sqrt(2) if some else 0.0
+    )  # a single box counts no more
+    assert misplaced(Shown(TEAM, NOTHING, heard), near, ["d"]) == 0.0
 
 
 @pytest.mark.parametrize("off", [(0.0, 1.5), (0.0, -1.5), (1.8, 0.0)])
@@ -142,7 +174,9 @@ def test_the_word_of_those_unheard_counts_for_nothing():
 def test_boxes_are_vouched_for_by_others_than_those_who_join():
     shown = Shown(TEAM, np.vstack([REST, car()]), hearing(c=YES, d=YES))
     assert shown.vouched(("d",)).tolist() == [True, True]
-    assert shown.vouched(("c", "d")).tolist() == [True, False]
+    assert shown.vouched(("c", "d")).tolist() == [True, True]  # not both have made it up
+    alone = Shown(TEAM, np.vstack([REST, car()]), hearing(d=YES))
+    assert alone.vouched(("c", "d")).tolist() == [True, False]
 
 
 def test_boxes_are_in_place_by_the_word_of_others_than_those_who_join():

@@ -1,0 +1,154 @@
+"""What one decoded fusion does to single objects beside another one: who is to blame for what is wrong.
+
+What is wrong with an object in a fusion is blamed on a teammate only if it is not so in the same fusion without it.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Collection, Mapping, Sequence
+
+import numpy as np
+
+from robosac.boxes import FloatArray, IntArray, pairwise_iou
+from robosac.defenses.group_testing.claims import SUPPORTS, WEIGHTY, two_witnesses
+from robosac.defenses.group_testing.distribution import BoolArray
+from robosac.defenses.group_testing.objects import AWAY, CERTAIN, PLACED_SCORE, SHOWN_SCORE, THERE_SCORE, Lie, Shown
+
+OWN_DENIES = -4.0
+"""Whose own message denies a place so far is not to blame for a box there."""
+GONE_EFFECT = 1.5
+"""A box is gone by somebody's fault if it had such a score, and has so much less now: faint ones come and go."""
+BLAMED_SUM = 8.0
+"""Somebody is to blame for a crisp box that the others contradict with this sum of L: more than the word of one."""
+FEWEST_ALONE = 3
+"""Of fusions of fewer teammates one witness alone does not tell that something is gone."""
+EFFECT = 1.0
+"""Logarithm of the odds of a box by which it has to grow or shrink."""
+AWAY_EFFECT = 0.5
+MOST_AWAY = 2.0
+"""What a single box counts, at most, of how far fusions misplace boxes."""
+ADRIFT = 1.0
+"""Boxes misplaced by so much are moved by whoever joins."""
+SAME_BOX_M = 1.5
+"""Boxes of two fusions that are centred so near each other show the same vehicle."""
+SAME_LIE_M = 3.0
+"""Lies so near each other are about one object."""
+CRISP_SCORE = 0.5
+
+
+def effects(joined: Shown, without: Shown, suspects: Sequence[str]) -> list[Lie]:
+    """What is wrong in a fusion, and is not in the same fusion without the suspects.
+
+    - ``ghost``: a contradicted box whose odds without them are less by a factor of e;
+    - ``gone``: a box without them where the others support a vehicle, and nothing is shown with them;
+    - ``moved``: a box that is out of place, and without them less so. If it is so along itself only, it may be late. So
+      it may if many boxes together are `misplaced`, each a little.
+    """
+    ghosts = joined.claims.contradicted(suspects, BLAMED_SUM) & (joined.boxes[:, 5] >= CRISP_SCORE)
+    grown, own = joined.boxes[ghosts], joined.own(suspects)[:, ghosts].max(axis=0)
+    drop = joined.odds_at(grown[:, :2]) - without.odds_at(grown[:, :2])
+    found = [Lie("ghost", grown[i, :2], bool(own[i] <= OWN_DENIES)) for i in np.flatnonzero(drop >= EFFECT)]
+    which = gone(joined, without, suspects)
+    lost, own = without.boxes[which], without.own(suspects)[:, which].min(axis=0)
+    drop = without.odds_at(lost[:, :2]) - joined.odds_at(lost[:, :2])
+    taken = np.flatnonzero((lost[:, 5] >= CRISP_SCORE) & (drop >= GONE_EFFECT))
+    found += [Lie("gone", lost[i, :2], bool(own[i] >= SUPPORTS)) for i in taken]
+    found += [Lie("gone", without.boxes[i, :2], alone=True) for i in gone_alone(joined, without, suspects)]
+    away, aside, other = joined.away(suspects), joined.away(suspects, across=True), without.away(suspects)
+    for index in np.flatnonzero((away >= AWAY) & (joined.boxes[:, 5] >= PLACED_SCORE) & ~ghosts):
+        same = _at(without, joined.boxes[index])
+        if same is not None and 0.0 < other[same] <= away[index] - AWAY_EFFECT:
+            found.append(Lie("moved", joined.boxes[index, :2], along=bool(aside[index] < AWAY)))
+    if all(lie.kind != "moved" for lie in found) and misplaced(joined, without, suspects) >= ADRIFT:
+        places, grown = _grown(joined, without, suspects)
+        found.append(Lie("moved", places[grown.argmax()], along=True))
+    return found
+
+
+def blame(found: Mapping[str, Sequence[Lie]], joined: Shown) -> dict[str, list[Lie]]:
+    """Who is to blame for what is wrong in a fusion, of what is not so without each suspect.
+
+    What is explained by several may be the doing of one of them, who makes it show only beside another. Then those are
+    to blame whose own message goes with the lie, and if nobody's does, nobody is.
+    """
+    blamed: dict[str, list[Lie]] = {name: [] for name in found}
+    for name, lies in found.items():
+        for lie in lies:
+            others = [
+                other
+                for other, theirs in found.items()
+                if other != name and any(np.hypot(*(each.place - lie.place)) <= SAME_LIE_M for each in theirs)
+            ]
+            if not others or joined.goes_with(name, lie):
+                blamed[name].append(lie)
+    return blamed
+
+
+def misplaced(joined: Shown, without: Shown, joining: Collection[str]) -> float:
+    """How much farther boxes are from where others see the vehicles than they are without those who join.
+
+    The sum over boxes of what `Shown.away` grows by, at most `MOST_AWAY` each, by the square root of their number: for
+    honest messages about normal around 0. Boxes of score >= .4 count that two others see, in both fusions.
+    """
+    _, grown = _grown(joined, without, joining)
+    return float(grown.sum() / np.sqrt(max(len(grown), 1)))
+
+
+def _grown(joined: Shown, without: Shown, joining: Collection[str]) -> tuple[FloatArray, FloatArray]:
+    """Centres (k, 2) of boxes of a fusion that are in the other one, too, and how much farther (k,) each is from where
+    others see the vehicle.
+    """
+    now, before = joined.away(joining), without.away(joining)
+    placed = (joined.boxes[:, 5] >= PLACED_SCORE) & (now > 0.0)
+    known = (without.boxes[:, 5] >= PLACED_SCORE) & (before > 0.0)
+    here, there = joined.boxes[placed, :2], without.boxes[known, :2]
+    if not len(there):
+        return here[:0], now[:0]
+    apart = np.hypot(*np.moveaxis(here[:, None] - there[None], -1, 0))
+    near, same = apart.min(axis=1) <= SAME_BOX_M, apart.argmin(axis=1)
+    most = 2 * MOST_AWAY
+    grown = np.minimum(now[placed], most) - np.minimum(before[known][same], most)
+    return here[near], np.clip(grown[near], -MOST_AWAY, MOST_AWAY)
+
+
+def gone(joined: Shown, without: Shown, suspects: Collection[str] = ()) -> IntArray:
+    """Boxes, by their places in ``without``, that are gone in ``joined`` although others support them."""
+    claims = without.claims
+    others = np.array([name not in suspects for name in claims.witnesses])
+    supported = two_witnesses(claims.supporting & others[:, None])
+    supported &= claims.likelihood[others].sum(axis=0) >= WEIGHTY
+    lost, rise = _lost(joined, without)
+    found: IntArray = np.flatnonzero(supported & lost & (without.boxes[:, 5] >= SHOWN_SCORE) & (rise >= EFFECT))
+    return found
+
+
+def gone_alone(joined: Shown, without: Shown, suspects: Collection[str]) -> IntArray:
+    """Boxes, by their places in ``without``, that are gone in ``joined`` although one other teammate supports them with
+    certainty, and none but the suspects denies them. In small fusions one message more weighs too much to tell.
+    """
+    if len(without.teammates) < FEWEST_ALONE:
+        return np.zeros(0, dtype=np.int64)
+    claims = without.claims.without(suspects)
+    supported = (claims.likelihood.max(axis=0) >= CERTAIN) & ~two_witnesses(claims.supporting)
+    lost, rise = _lost(joined, without)
+    crisp = (without.boxes[:, 5] >= CRISP_SCORE) & (rise >= GONE_EFFECT)
+    found: IntArray = np.flatnonzero(supported & ~claims.denying.any(axis=0) & lost & crisp)
+    return found
+
+
+def _lost(joined: Shown, without: Shown) -> tuple[BoolArray, FloatArray]:
+    """Which boxes (n,) of the second fusion nothing in the first one overlaps, and by how much (n,) the logarithm of
+    their odds is higher there.
+    """
+    there = joined.boxes[joined.boxes[:, 5] >= THERE_SCORE]
+    lost: BoolArray = pairwise_iou(without.boxes, there).max(axis=1, initial=0.0) < 0.05
+    return lost, without.odds_at(without.boxes[:, :2]) - joined.odds_at(without.boxes[:, :2])
+
+
+def _at(shown: Shown, box: FloatArray) -> int | None:
+    """The box of a fusion that overlaps another one most."""
+    if not len(shown.boxes):
+        return None
+    overlap = pairwise_iou(box[None], shown.boxes)[0]
+    best = int(overlap.argmax())
+    return best if overlap[best] > 0.05 else None
