@@ -19,7 +19,7 @@ _OPEN_FILES = Path("/proc/self/fd")
 _HELD = (errno.EACCES, errno.EAGAIN)
 
 
-class SharedSocket(RuntimeError):
+class SharedSocket(ValueError):
     """Another gateway process accepts connections from the same socket."""
 
 

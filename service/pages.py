@@ -5,12 +5,13 @@ from __future__ import annotations
 import json
 from collections.abc import AsyncIterator, Mapping
 from importlib.resources import files
+from mimetypes import guess_type
 from pathlib import Path
 from typing import Annotated, Any
 
 from fastapi import APIRouter, Depends, FastAPI, Query, Request
 from fastapi.openapi.docs import get_redoc_html, get_swagger_ui_html
-from fastapi.responses import FileResponse, HTMLResponse, Response
+from fastapi.responses import HTMLResponse, Response
 from fastapi.security import HTTPAuthorizationCredentials, HTTPBearer
 from fastapi.sse import KEEPALIVE_COMMENT, EventSourceResponse, format_sse_event
 from fastapi.staticfiles import StaticFiles
@@ -23,7 +24,7 @@ from service.viewing.feed import Feed
 from service.viewing.viewers import Viewer
 
 STATIC = Path(__file__).parent / "viewing" / "static"
-_FILES = {path.name: path for path in STATIC.iterdir()}
+_FILES = {path.name: path.read_bytes() for path in STATIC.iterdir()}
 _COMMON = {
     "X-Content-Type-Options": "nosniff",
     "Referrer-Policy": "no-referrer",
@@ -62,18 +63,22 @@ async def _viewer(sid: str, gateway: GatewayDep, _: Annotated[None, Depends(_che
         yield viewer
 
 
+def _file(name: str) -> Response:
+    return Response(_FILES[name], media_type=guess_type(name)[0], headers=LIVE_HEADERS)
+
+
 @pages.get("/", include_in_schema=False)
-async def live_page() -> FileResponse:
+async def live_page() -> Response:
     """The page that shows what the gateway decides."""
-    return FileResponse(_FILES["index.html"], headers=LIVE_HEADERS)
+    return _file("index.html")
 
 
 @pages.get("/live/{name}", include_in_schema=False)
-async def live_file(name: str) -> FileResponse:
+async def live_file(name: str) -> Response:
     """A file of that page."""
     if name not in _FILES:
         raise HTTPException(404)
-    return FileResponse(_FILES[name], headers=LIVE_HEADERS)
+    return _file(name)
 
 
 @pages.get("/v1/live", dependencies=[Depends(_check_viewer)], responses=description.WATCHABLE)

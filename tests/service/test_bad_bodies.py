@@ -282,7 +282,7 @@ async def test_a_client_that_goes_away_in_mid_body_is_no_error_of_the_gateway(ca
             await app(scope, receive, send)
 
         body = b'{"ego_id": "a", "teammates": ["b"]}'
-        json_type = [(b"content-type", b"application/json")]
+        json_type = [(b"host", b"localhost"), (b"content-type", b"application/json")]
         await call("POST", "/v1/sessions", json_type, [{"type": "http.request", "body": body, "more_body": False}])
         import json
 
@@ -290,6 +290,7 @@ async def test_a_client_that_goes_away_in_mid_body_is_no_error_of_the_gateway(ca
         sent.clear()
         headers = [
             (b"content-type", b"application/msgpack"),
+            (b"host", b"localhost"),
             (b"authorization", b"Bearer " + session["ego_token"].encode()),
             (b"content-length", b"50000"),
         ]

@@ -52,7 +52,8 @@ async def test_strangers_are_refused_from_their_headers_alone(route, media_type)
 
 @pytest.mark.parametrize("route", [route for route, rule in RULES.items() if rule == ANYBODY])
 async def test_a_body_that_nobody_needs_is_not_read(route, served):
-    assert (await head(served, *route.split(), "application/json", Settings().max_body_bytes)).status_code == 200
+    method, path = route.format(name="live.js").split()
+    assert (await head(served, method, path, "application/json", Settings().max_body_bytes)).status_code == 200
 
 
 @pytest.mark.parametrize(
