@@ -1,3 +1,4 @@
+import gc
 import time
 from collections.abc import AsyncIterator, Callable, Iterable
 from contextlib import asynccontextmanager
@@ -101,6 +102,13 @@ async def serve(
         httpx.AsyncClient(base_url="http://gateway", transport=transport) as http,
     ):
         yield Served(app.state.gateway, client, http)
+
+
+@pytest.fixture(scope="module", autouse=True)
+def _short_searches_for_garbage():
+    """The objects of all earlier tests make a search for garbage take a second, in which no frame is answered."""
+    gc.collect()
+    gc.freeze()
 
 
 @pytest.fixture

@@ -142,8 +142,9 @@ async def test_the_bodies_before_it_do_not_count_for_a_head(port):
 async def test_the_adversary_is_hung_up_on(port):
     target = Target(f"http://127.0.0.1:{port}", "", "", b"", b"")
     answers = await asyncio.to_thread(run_attack, Attack.HEADS, target, 3 * TIMEOUT_S)
-    assert answers["408"] > 0
-    assert answers.total() > answers["408"]
+    slow = [answers[how] for how in ("408", "hung up", "ConnectionResetError")]  # its next byte may cut the answer off
+    assert sum(slow) > 0
+    assert answers["431"] > 0
 
 
 async def test_a_head_of_any_size_that_is_looked_at_is_whole(port):
