@@ -51,7 +51,7 @@ $(VENV)/.created:
 	touch $@
 
 $(VENV)/.installed: $(VENV)/.created pyproject.toml constraints.txt
-	$(BIN)/pip install --quiet --constraint constraints.txt --editable '.[plots,postgresql]'
+	$(BIN)/pip install --quiet --constraint constraints.txt --editable '.[plots,postgresql,recordings]'
 	touch $@
 
 $(VENV)/.installed-dev: $(VENV)/.installed

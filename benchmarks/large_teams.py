@@ -97,8 +97,11 @@ def main(
     frames: int = 30,
     sequences: Annotated[int, typer.Option(help="Test scenes to play with the detector; 0: draw outcomes.")] = 0,
 ) -> None:
-    """Print passes until all are named, honest teammates named, time to decide a frame, and size of the state; with the
-    detector, precision instead of the last two.
+    """Print passes until all are suspected as much as naming takes, honest teammates of whom that is ever true, time to
+    decide a frame, and size of the state; with the detector, passes until all are named, and precision instead of the
+    last two.
+
+    Nobody is named by drawn outcomes: naming takes objects or steadiness besides, and those cannot be drawn.
     """
     if sequences:
         play_scenes(teammates, attackers, kind, frames, sequences)
@@ -128,17 +131,19 @@ def draw(teammates: int, attackers: int, kind: str, runs: int, frames: int) -> N
                     spent += 1
                     tested = [world.outcome(batch[0], frame)]
             except StopIteration as stop:
-                state = stop.value.state
+                decision = stop.value
             seconds.append(deciding + time.perf_counter() - started)
+            state = decision.state
             passes.append(spent - before)
-            honest |= {(run, name) for name in state["named"] if name not in bad}
-            if done is None and bad <= set(state["named"]):
+            found = {name for name, p in decision.suspicion.items() if p > calibrated.settings.naming_bound}
+            honest |= {(run, name) for name in found - bad}
+            if done is None and bad <= found:
                 done = spent
         until_named.append(done)
         sizes.append(len(json.dumps(state)))
     print(f"{runs} runs, {teammates} teammates, {attackers} x {kind}, {frames} frames")
-    _print_named(until_named)
-    print(f"honest named: {len(honest)} of {runs * (teammates - attackers)}")
+    _print_named(until_named, "suspected")
+    print(f"honest suspected: {len(honest)} of {runs * (teammates - attackers)}")
     print(f"{np.mean(passes):.2f} passes and {1e3 * np.mean(seconds):.1f} ms of deciding a frame")
     print(f"state: {np.mean(sizes) / 1e3:.1f} kB of JSON")
 
@@ -175,7 +180,7 @@ def play_scenes(teammates: int, attackers: int, kind: str, frames: int, sequence
         until_named.append(done)
         honest += len(accused - bad)
     print(f"{sequences} scenes, {teammates} teammates, {attackers} x {kind}, {frames} frames")
-    _print_named(until_named)
+    _print_named(until_named, "named")
     print(f"honest named: {honest} of {sequences * (teammates - attackers)}")
     print(f"{np.mean(passes):.2f} passes a frame; an attacker in {sum(infiltrated)} of {len(infiltrated)} answers")
     for name, precision in (("group testing", ours), ("oracle", oracle), ("no defence", undefended)):
@@ -190,9 +195,9 @@ def _attacked(
         yield under_attack(detector, Sensed.of(detector, scene.frame(index), EGO, 0.0, rng), bad, attack, rng)
 
 
-def _print_named(until_named: Sequence[int | None]) -> None:
+def _print_named(until_named: Sequence[int | None], what: str) -> None:
     named = [n for n in until_named if n is not None]
-    print(f"all named in {len(named)} of {len(until_named)}", end="")
+    print(f"all {what} in {len(named)} of {len(until_named)}", end="")
     if named:
         print(
             f", after {np.mean(named):.1f} passes on average, median {np.median(named):.0f}, most {max(named)}", end=""

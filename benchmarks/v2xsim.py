@@ -23,7 +23,7 @@ THRESHOLD = 0.7
 def main(repeats: Annotated[int, typer.Option(min=3)] = 15) -> None:
     torch.set_num_threads(1)
     rng = np.random.default_rng(0)
-    network = V2XSimNetwork(select_published(_made_up(rng)))
+    network = V2XSimNetwork(select_published(made_up(rng)))
     fast = {precision: FastDecoder(network, precision) for precision in ("float32", "bfloat16")}
     grid = torch.from_numpy((rng.random((1, LAYERS, GRID, GRID)) < OCCUPIED).astype(np.float32))
     with torch.inference_mode():
@@ -61,7 +61,7 @@ def main(repeats: Annotated[int, typer.Option(min=3)] = 15) -> None:
         print(f"  {name:34} {middle / base:.2f} of the plain decoder ({low / base:.2f} to {high / base:.2f})")
 
 
-def _made_up(rng: np.random.Generator) -> dict[str, torch.Tensor]:
+def made_up(rng: np.random.Generator) -> dict[str, torch.Tensor]:
     """Random weights with activations of a usual size; anchors score low."""
     state = {}
     for name, shape in published_shapes().items():

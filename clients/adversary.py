@@ -3,12 +3,17 @@
 For each attack a fresh gateway is started on loopback, with one API key for the honest ego and another for the
 attacker. The ego posts frames at a fixed rate, at first alone, and then beside the attack, which runs in a process of
 its own. Whether a frame was in time is told by the ego's own clock.
+
+Attackers have machines of their own. So where there are several cores, and the system lets one choose, the gateway has
+all but the last, the ego and the attack share that one, and the ego goes first there.
 """
 
 from __future__ import annotations
 
 import asyncio
+import math
 import multiprocessing
+import os
 import sys
 import tempfile
 import time
@@ -27,6 +32,7 @@ from rich.progress import track
 
 from clients import trial
 from clients.client import GatewayClient, VehicleClient
+from clients.cores import Cores
 from clients.errors import GatewayError
 from clients.hostile import LOCKED, Attack, Target, run_attack, strange_frame
 from clients.load_test import WARM_UP_FRAMES, Bodies, new_ego, prepare
@@ -36,6 +42,8 @@ REPORT = "adversary.json"
 HONEST_HZ = 5.0
 CLOCK_MS = 5.0
 """What the ego's clock sees more than the gateway's, on one machine: the way there and back."""
+YIELDS = 5
+"""By how much the attack's process is nicer than the ego's, with which it shares a core."""
 RECOVERED_WITHIN = 2
 """Frames after a fault of the store by which an answer has to be tested and in time again."""
 
@@ -60,6 +68,8 @@ class Seen:
     """Answered within the budget, and not cut short."""
     belied: int = 0
     """Answers that call themselves in time and came too late."""
+    cores: float = math.nan
+    """Of processor time, what the gateway used meanwhile."""
     refused: Counter[str] = field(default_factory=Counter)
     outcomes: list[tuple[float, bool]] = field(default_factory=list, repr=False)
     """Of each frame when it was due, and whether it was tested in time."""
@@ -114,22 +124,29 @@ class Result:
         return not self.before.belied + self.during.belied and recovered
 
 
-async def _drive(ego: VehicleClient, bodies: Bodies, first: int, seen: Seen, seconds: float) -> int:
+async def _drive(
+    ego: VehicleClient, bodies: Bodies, first: int, seen: Seen, seconds: float, process: GatewayProcess
+) -> int:
     """Post frames at the honest rate, whatever becomes of them; the number of the next frame."""
-    started, posts = time.perf_counter(), []
+    started, posts, used_s = time.perf_counter(), [], process.cpu_s()
     for k in range(max(1, int(seconds * HONEST_HZ))):
         await asyncio.sleep(max(0.0, started + k / HONEST_HZ - time.perf_counter()))
         posts.append(asyncio.create_task(seen.post(ego, bodies.numbered(first + k))))
     await asyncio.gather(*posts)
+    seen.cores = (process.cpu_s() - used_s) / (time.perf_counter() - started)
     return first + len(posts)
 
 
-async def play(attack: Attack, plan: Plan, bodies: Bodies, strange: bytes, pool: ProcessPoolExecutor) -> Result:
+async def play(
+    attack: Attack, plan: Plan, bodies: Bodies, strange: bytes, pool: ProcessPoolExecutor, cores: Cores
+) -> Result:
     """One attack on a gateway of its own."""
-    honest_key, key = token_urlsafe(32), token_urlsafe(32)
+    honest_key, key, viewer = (token_urlsafe(32) for _ in range(3))
     with tempfile.TemporaryDirectory(prefix="robosac-") as name:
         folder = Path(name)
-        process = GatewayProcess(folder / "gateway.log", f"sqlite:///{folder}/robosac.db", f"{honest_key},{key}")
+        url, settings = f"sqlite:///{folder}/robosac.db", {"ROBOSAC_VIEWER_TOKENS": viewer}
+        with cores.of_gateways():
+            process = GatewayProcess(folder / "gateway.log", url, f"{honest_key},{key}", settings=settings)
         try:
             await process.ready()
             async with GatewayClient(process.url, honest_key) as gateway:
@@ -137,12 +154,13 @@ async def play(attack: Attack, plan: Plan, bodies: Bodies, strange: bytes, pool:
                 for frame in range(WARM_UP_FRAMES):
                     await ego.post_frame_body(bodies.numbered(frame))
                 before, during = Seen(plan.budget_ms), Seen(plan.budget_ms)
-                frame = await _drive(ego, bodies, WARM_UP_FRAMES, before, plan.seconds)
-                target = Target(process.url, key, str(folder / "robosac.db"), strange, bodies.numbered(0))
+                frame = await _drive(ego, bodies, WARM_UP_FRAMES, before, plan.seconds, process)
+                database, honest = str(folder / "robosac.db"), bodies.numbered(0)
+                target = Target(process.url, key, database, strange, honest, ego.session_id, viewer)
                 loop = asyncio.get_running_loop()
                 attacking = loop.run_in_executor(pool, run_attack, attack, target, plan.seconds)
                 ends = time.perf_counter() + LOCKED * plan.seconds
-                await _drive(ego, bodies, frame, during, plan.seconds)
+                await _drive(ego, bodies, frame, during, plan.seconds, process)
                 result = Result(attack, before, during, await attacking, process.peak_memory_mib())
                 if attack is Attack.DATABASE:
                     result.recovered_after = during.recovered_after(ends)
@@ -151,42 +169,38 @@ async def play(attack: Attack, plan: Plan, bodies: Bodies, strange: bytes, pool:
             await process.stop()
 
 
+def _as_attacker(cores: Cores) -> None:
+    cores.be_a_client()
+    os.nice(YIELDS)
+
+
 async def play_all(attacks: Sequence[Attack], plan: Plan, bodies: Bodies, console: Console) -> list[Result]:
     """One attack after another."""
-    strange = strange_frame(bodies.numbered(0))
-    with ProcessPoolExecutor(1, multiprocessing.get_context("spawn")) as pool:
+    strange, cores = strange_frame(bodies.numbered(0)), Cores()
+    spawn = multiprocessing.get_context("spawn")
+    with ProcessPoolExecutor(1, spawn, initializer=_as_attacker, initargs=(cores,)) as pool:
         await asyncio.get_running_loop().run_in_executor(pool, time.time)  # it takes seconds to start
         return [
-            await play(attack, plan, bodies, strange, pool)
+            await play(attack, plan, bodies, strange, pool, cores)
             for attack in track(attacks, "attacks", console=console, transient=True)
         ]
 
 
 def show(console: Console, results: Sequence[Result], plan: Plan) -> None:
     """Print what came of it."""
-    columns = [
-        "attack",
-        "in budget: before",
-        "during",
-        "tested: before",
-        "during",
-        "belied",
-        "refused: ego",
-        "attacker",
-    ]
     title = f"One honest ego at {HONEST_HZ:g} Hz, budget {plan.budget_ms:g} ms, by its own clock"
-    table = trial.a_table(title, [*columns, "attacker was answered", "recovered after", "MiB"])
+    columns = ["tested: before", "during", "belied", "refused", "cores: before", "during", "MiB", "recovered after"]
+    table = trial.a_table(title, ["attack", *columns])
     for result in results:
         before, during = result.before, result.during
         table.add_row(
             result.attack.value,
-            *(f"{seen.share(seen.in_budget):.0%}" for seen in (before, during)),
             *(f"{seen.share(seen.tested):.0%}" for seen in (before, during)),
             str(before.belied + during.belied),
             str(during.refused.total()),
-            ", ".join(f"{what}: {n}" for what, n in sorted(result.attacker.items())) or "-",
-            "-" if result.recovered_after is None else f"{result.recovered_after} frames",
+            *(f"{seen.cores:.2f}" for seen in (before, during)),
             f"{result.memory_mib:.0f}",
+            "-" if result.recovered_after is None else f"{result.recovered_after} frames",
         )
     console.print(table)
 
@@ -227,6 +241,7 @@ def _as_dict(result: Result) -> dict[str, Any]:
             "in_budget": seen.in_budget,
             "tested": seen.tested,
             "belied": seen.belied,
+            "cores": seen.cores,
             "refused": dict(seen.refused),
         }
         for name, seen in (("before", result.before), ("during", result.during))

@@ -2,8 +2,14 @@
 
 from __future__ import annotations
 
-from collections.abc import Mapping, Sequence
+import asyncio
+import contextlib
+import json
+import ssl
+import time
+from collections.abc import AsyncIterator, Mapping, Sequence
 from dataclasses import dataclass
+from http import HTTPStatus
 from pathlib import Path
 from types import TracebackType
 from typing import Any, TypedDict, Unpack
@@ -11,7 +17,7 @@ from typing import Any, TypedDict, Unpack
 import httpx
 from cryptography.hazmat.primitives.asymmetric.ed25519 import Ed25519PrivateKey
 
-from clients.errors import GatewayError, GatewayUnreachable, refusal
+from clients.errors import GatewayError, GatewayUnreachable, RequestRefused, refusal
 from clients.receipts import ReceiptBook
 from clients.vehicle import MSGPACK, RenewedToken, VehicleClient, bearer, told
 from robosac.answers import FrameAnswer, LogReceipt
@@ -28,6 +34,12 @@ __all__ = [
 ]
 
 DEFAULT_TIMEOUT_S = 30.0
+LIMITS = httpx.Limits(max_connections=None, max_keepalive_connections=256)
+AGAIN_FOR_S, AGAIN_FIRST_S, AGAIN_EVERY_S = 1.0, 0.02, 0.2
+"""How long a request is sent again where a gateway process ends and another takes it, and with which pauses."""
+DRAINING = "urn:robosac:problem:draining"
+SILENCE_S = 40.0
+"""A stream on which nothing came for so long is broken."""
 API_KEY_VARIABLE = "ROBOSAC_API_KEY"
 """Where the command lines look for an API key: better than an option, which every process of the machine can read."""
 
@@ -43,6 +55,7 @@ class SessionOptions(TypedDict, total=False):
     latency_budget_ms: float | None
     gather_ms: float | None
     frame_period_ms: float | None
+    record: bool | None
     public_keys: Mapping[str, str] | None
 
 
@@ -83,6 +96,8 @@ class GatewayClient:
         The gateway's public keys, base64, from a source that can be relied on; see `clients.receipts.ReceiptBook`.
     receipts : Path, optional
         File that the receipts of answers are added to.
+    tls : ssl.SSLContext, optional
+        Whose certificates are good; by default those of the well-known authorities (`certifi`).
     transport : httpx.AsyncBaseTransport, optional
         For tests: `httpx.ASGITransport` talks to an app without a socket.
 
@@ -105,11 +120,16 @@ class GatewayClient:
         *,
         gateway_keys: Sequence[str] | None = None,
         receipts: Path | None = None,
+        tls: ssl.SSLContext | None = None,
     ) -> None:
         self._opener = {} if api_key is None else bearer(api_key)
-        limits = httpx.Limits(max_connections=None, max_keepalive_connections=256)
         self._http = httpx.AsyncClient(
-            base_url=base_url, timeout=timeout_s, limits=limits, transport=transport, trust_env=False
+            base_url=base_url,
+            timeout=timeout_s,
+            limits=LIMITS,
+            transport=transport,
+            trust_env=False,
+            verify=True if tls is None else tls,
         )
         self.receipts = ReceiptBook(self.public_keys, gateway_keys, receipts)
 
@@ -156,27 +176,81 @@ class GatewayClient:
         self, session_id: str, vehicle_id: str, token: str, key: Ed25519PrivateKey | None = None
     ) -> VehicleClient:
         """The client of one vehicle in a session. With a key it signs its messages, and proves that it has the key."""
-        return VehicleClient(self._request, session_id, vehicle_id, token, key, self.receipts)
+        return VehicleClient(self._request, session_id, vehicle_id, token, key, self.receipts, self._events)
 
     async def _request(self, method: str, path: str, **options: Any) -> httpx.Response:
+        until, pause_s = time.monotonic() + AGAIN_FOR_S, AGAIN_FIRST_S
+        while True:
+            may_again = time.monotonic() + pause_s <= until
+            async with self._reached(method, path):
+                try:
+                    response = await self._http.request(method, path, **options)
+                except (httpx.ReadError, httpx.WriteError, httpx.RemoteProtocolError):
+                    if not (may_again and _counts_once(method, path)):
+                        raise
+                else:
+                    if response.is_success:
+                        return response
+                    if not (may_again and _is_to_be_sent_again(response, method, path)):
+                        raise _refusal(response)
+            await asyncio.sleep(pause_s)
+            if self._http.is_closed:
+                raise GatewayUnreachable(f"{method} {path}: the client was closed before it could be sent again")
+            pause_s = min(2 * pause_s, AGAIN_EVERY_S)
+
+    async def _events(self, path: str, headers: Mapping[str, str]) -> AsyncIterator[tuple[str, Any]]:
+        """Server-sent events, each a name and JSON, until the stream ends."""
+        timeout = httpx.Timeout(SILENCE_S, connect=self._http.timeout.connect)
+        async with (
+            self._reached("GET", path),
+            self._http.stream("GET", path, headers=headers, timeout=timeout) as response,
+        ):
+            if not response.is_success:
+                await response.aread()
+                raise _refusal(response)
+            name = ""
+            async for line in response.aiter_lines():
+                field, _, value = line.partition(": ")
+                if field == "event":
+                    name = value
+                elif field == "data":
+                    yield name, json.loads(value)
+
+    @contextlib.asynccontextmanager
+    async def _reached(self, method: str, path: str) -> AsyncIterator[None]:
         try:
-            response = await self._http.request(method, path, **options)
+            yield
         except (httpx.HTTPError, httpx.InvalidURL) as error:
             where = f"{method} {self._http.base_url.join(path)}"
             raise GatewayUnreachable(f"{where}: {type(error).__name__} {error}; is the gateway running?") from error
-        if response.is_success:
-            return response
-        try:
-            problem = response.json()
-        except ValueError:
-            problem = None
-        if not isinstance(problem, dict):
-            problem = {}
-        retry = response.headers.get("retry-after", "")
-        raise refusal(response.status_code)(
-            response.status_code,
-            str(problem.get("type", "about:blank")),
-            str(problem.get("detail", response.reason_phrase)),
-            problem.get("field"),
-            float(retry) if retry.isdecimal() else None,
-        )
+
+
+def _is_to_be_sent_again(response: httpx.Response, method: str, path: str) -> bool:
+    """Whether a gateway process that is about to end has done nothing, or a proxy lost one before its answer."""
+    if response.status_code == HTTPStatus.SERVICE_UNAVAILABLE:
+        return _refusal(response).type == DRAINING
+    return response.status_code == HTTPStatus.BAD_GATEWAY and _counts_once(method, path)
+
+
+def _counts_once(method: str, path: str) -> bool:
+    """Whether it does no harm to send a request again of which nobody knows what came of it: a message counts once."""
+    return method == "GET" or path.endswith(("/messages", "/frames"))
+
+
+def _refusal(response: httpx.Response) -> RequestRefused:
+    with contextlib.suppress(ValueError):
+        problem = response.json()
+        if isinstance(problem, dict):
+            return _told(response, problem)
+    return _told(response, {})
+
+
+def _told(response: httpx.Response, problem: Mapping[str, Any]) -> RequestRefused:
+    retry = response.headers.get("retry-after", "")
+    return refusal(response.status_code)(
+        response.status_code,
+        str(problem.get("type", "about:blank")),
+        str(problem.get("detail", response.reason_phrase)),
+        problem.get("field"),
+        float(retry) if retry.isdecimal() else None,
+    )

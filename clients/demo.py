@@ -14,6 +14,7 @@ from clients import trial
 from clients.fleet import FleetOptions, close_run, run_fleet
 from clients.local_gateway import local_gateway
 from clients.summary import REPORT, FleetSummary
+from robosac.cli import outputs
 
 CLEAN_SHARE = 0.95
 
@@ -22,6 +23,9 @@ def main(
     report: Annotated[Path, typer.Option(help="Folder for the summary, the picture and the gateway's log.")],
     scenes: Annotated[int, typer.Option(min=1, help="Sequences.")] = 8,
     frames: Annotated[int, typer.Option(min=1, help="Frames of a sequence.")] = 25,
+    record: Annotated[
+        Path | None, typer.Option(metavar="DIR", help="Folder to record the sessions to, with what is true.")
+    ] = None,
     force: trial.Force = False,
     watch: Annotated[
         bool, typer.Option("--watch", help="Drive at 5 Hz, and go on after the summary until Ctrl-C.")
@@ -35,8 +39,10 @@ def main(
     torch.set_num_threads(1)
     console = Console()
     trial.make_folder(report, "--report", REPORT, force, for_pictures=True)
+    if record is not None:
+        outputs.make_folder(record, "--record")
     try:
-        summary = trial.run(run(report, scenes, frames, console, watch=watch), console, "The demo")
+        summary = trial.run(run(report, scenes, frames, console, watch=watch, record=record), console, "The demo")
     except KeyboardInterrupt:
         if not watch:
             raise
@@ -46,22 +52,28 @@ def main(
         sys.exit(1)
 
 
-async def run(report: Path, scenes: int, frames: int, console: Console, *, watch: bool = False) -> FleetSummary:
+async def run(
+    report: Path, scenes: int, frames: int, console: Console, *, watch: bool = False, record: Path | None = None
+) -> FleetSummary:
     """As `main`; to be watched it goes on until it is cancelled."""
+    settings = {} if record is None else {"ROBOSAC_RECORD": str(record.absolute())}
     console.print("Starting the gateway (uvicorn service.app:app) ...")
-    async with local_gateway(report / "gateway.log") as url:
+    async with local_gateway(report / "gateway.log", settings=settings) as url:
         console.print(
             f"It is ready at {url}. Six vehicles, one of them a PGD attacker, post at 5 Hz of simulated time."
         )
         console.print(f"Watch it live: {url}/")
-        options = FleetOptions(url=url, scenes=scenes, frames=frames, report=report, real_time=watch)
+        told = record is not None
+        options = FleetOptions(url, scenes, frames, report=report, real_time=watch, truth=told)
         summary = await run_fleet(options, console)
         close_run(options, summary, console)
         if watch:
             console.print(f"The fleet drives on, from the first scene again, until Ctrl-C. Watch it live: {url}/")
         while watch:
             await run_fleet(options, console)
-        return summary
+    if record is not None:
+        console.print(f"Recorded: robosac record info {record}")
+    return summary
 
 
 if __name__ == "__main__":

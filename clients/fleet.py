@@ -30,6 +30,7 @@ from robosac.cli.blame import blaming
 from robosac.cli.options import check_attack, load_data, load_detector
 from robosac.detectors import DEFAULT_DETECTOR
 from robosac.evaluation.frames import another_scene
+from robosac.recording.truth import Truth
 from robosac.scenes import DATA_HELP, DEFAULT_DATA, SOURCES, first_scenes
 
 RECENT = 12
@@ -57,6 +58,7 @@ class FleetOptions:
     report: Path | None = None
     api_key: str | None = field(default=None, repr=False)
     data: str = DEFAULT_DATA
+    truth: bool = False
 
 
 class _Screen:
@@ -119,9 +121,10 @@ class _Screen:
 class _Vehicle:
     """One vehicle: its own connection to the gateway, and its place in each ego's session."""
 
-    def __init__(self, vehicle_id: str, gateway: GatewayClient) -> None:
+    def __init__(self, vehicle_id: str, gateway: GatewayClient, *, truth: bool = False) -> None:
         self.vehicle_id = vehicle_id
         self.gateway = gateway
+        self._tells = truth
         self._at: dict[str, VehicleClient] = {}
 
     def enrol(self, ego_id: str, session: OpenedSession) -> None:
@@ -143,7 +146,8 @@ class _Vehicle:
     async def ask(self, frame: EgoFrame, index: int) -> tuple[FrameAnswer, float]:
         """The answer, and after how many milliseconds it came."""
         started = time.perf_counter()
-        answer = await _patiently(lambda: self._at[frame.ego_id].ask(index, frame.message))
+        truth = Truth(frame.truth, tuple(sorted(frame.attackers))) if self._tells else None
+        answer = await _patiently(lambda: self._at[frame.ego_id].ask(index, frame.message, truth))
         return answer, (time.perf_counter() - started) * 1e3
 
 
@@ -192,7 +196,10 @@ async def run_fleet(options: FleetOptions, console: Console) -> FleetSummary:
 
 
 async def _run_scene(options: FleetOptions, fleet: Fleet, summary: FleetSummary, screen: _Screen) -> None:
-    vehicles = {name: _Vehicle(name, GatewayClient(options.url, options.api_key)) for name in fleet.scene.agents}
+    vehicles = {
+        name: _Vehicle(name, GatewayClient(options.url, options.api_key), truth=options.truth)
+        for name in fleet.scene.agents
+    }
     try:
         for ego_id in fleet.egos:
             session = await vehicles[ego_id].gateway.open_session(
@@ -253,6 +260,7 @@ def main(  # the options of a command line
     real_time: Annotated[bool, typer.Option(help="Hold frames to the clock.")] = False,
     report: Annotated[Path | None, typer.Option(help="Folder for summary.json and example.png.")] = None,
     data: Annotated[str, typer.Option(help=DATA_HELP)] = DEFAULT_DATA,
+    truth: Annotated[bool, typer.Option("--truth", help="Let egos tell what is true, for recordings.")] = False,
     api_key: trial.ApiKey = None,
     force: trial.Force = False,
 ) -> None:
@@ -282,6 +290,7 @@ def main(  # the options of a command line
         report=report,
         api_key=api_key,
         data=data,
+        truth=truth,
     )
     close_run(options, trial.run(run_fleet(options, console), console, "The fleet", ValueError), console)
 

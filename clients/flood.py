@@ -27,7 +27,8 @@ from rich.progress import track
 
 from clients import trial
 from clients.client import MSGPACK, GatewayClient
-from clients.load_test import Bodies, Figures, Load, prepare, run_load
+from clients.load_test import Bodies, prepare, run_load
+from clients.measured import Figures, Load
 from clients.raw_http import connected, post_head, read_response
 
 REPORT = "flood.json"

@@ -9,16 +9,18 @@ delayed.
 from __future__ import annotations
 
 import asyncio
+import os
 import platform
+import re
 import sys
+import tempfile
 import time
-from collections import Counter, defaultdict
 from collections.abc import Mapping, Sequence
 from contextlib import AsyncExitStack
-from dataclasses import asdict, dataclass, field
+from dataclasses import dataclass
+from pathlib import Path
 from typing import Annotated, Any
 
-import numpy as np
 import torch
 import typer
 from rich.console import Console
@@ -27,9 +29,10 @@ from rich.progress import track
 from clients import trial
 from clients.client import GatewayClient, VehicleClient
 from clients.errors import GatewayError
+from clients.measured import Figures, Load
+from clients.metering import CountingTransport, Meter
 from clients.simulation import Fleet
 from robosac import wire
-from robosac.answers import FrameAnswer
 from robosac.attacks import PGD
 from robosac.detectors import load
 from robosac.scenes import FRAME_PERIOD_S, IntersectionScene
@@ -39,74 +42,25 @@ PREPARED_FRAMES = 20
 WARM_UP_FRAMES = 3
 REFUSED_WAIT_S = 0.05
 """How long an ego waits after a frame that was refused."""
-DEFENSE = {"kind": "sample_consensus", "attacker_ratio": 0.2, "sampling_budget": 7, "collaborators": 3}
+DEFENSE: dict[str, Any] = {
+    "kind": "sample_consensus",
+    "attacker_ratio": 0.2,
+    "sampling_budget": 7,
+    "collaborators": 3,
+}
 EGO, *TEAM = IntersectionScene(0).agents
 
 
-@dataclass(frozen=True)
-class Load:
-    """One way of loading the gateway."""
-
-    loop: str
-    """``closed`` or ``open``."""
-    egos: int
-    attacked: bool
-    """Whether one of the five teammates is a PGD attacker."""
-    rate_hz: float | None = None
-    """Frames a second of each ego, open loop only."""
-
-
-@dataclass
-class Figures:
-    """What one load measured; ``budget_ms`` is the latency budget."""
-
-    load: Load
-    budget_ms: float
-    seconds: float = 0.0
-    latencies_ms: list[float] = field(default_factory=list)
-    steps: list[int] = field(default_factory=list)
-    within_budget: int = 0
-    deadline_met: int = 0
-    degraded: int = 0
-    errors: Counter[str] = field(default_factory=Counter)
-    stages: defaultdict[str, list[float]] = field(default_factory=lambda: defaultdict(list))
-
-    def add(self, answer: FrameAnswer, latency_ms: float) -> None:
-        """Count an answer."""
-        self.latencies_ms.append(latency_ms)
-        self.steps.append(answer.sampling_steps)
-        self.within_budget += latency_ms <= self.budget_ms
-        self.deadline_met += answer.deadline_met
-        self.degraded += answer.degraded_by is not None
-        for stage, milliseconds in answer.timings_ms.items():
-            self.stages[stage].append(milliseconds)
-
-    def as_dict(self) -> dict[str, Any]:
-        """Plain values for JSON; shares are of the frames sent, so a refused frame counts as not answered in time."""
-        answered = len(self.latencies_ms)
-        sent = answered + sum(self.errors.values())
-        return {
-            **asdict(self.load),
-            "seconds": self.seconds,
-            "frames": answered,
-            "fps": answered / self.seconds,
-            "latency_ms": trial.percentiles(self.latencies_ms),
-            "within_budget_share": self.within_budget / max(sent, 1),
-            "deadline_met_share": self.deadline_met / max(sent, 1),
-            "degraded": self.degraded,
-            "sampling_steps_mean": float(np.mean(self.steps)) if answered else None,
-            "errors": dict(self.errors),
-            "stages_ms": {stage: float(np.median(values)) for stage, values in self.stages.items()},
-        }
-
-
 class Bodies:
-    """Packed frames of one fleet, renumbered without packing them again."""
+    """Packed frames, or messages, of one vehicle, renumbered without packing them again; ``team`` are the ego's
+    teammates.
+    """
 
-    def __init__(self, frames: Sequence[bytes]) -> None:
-        prefix = b"\x83" + wire.pack("frame")  # a map of three entries, the frame's number first
+    def __init__(self, frames: Sequence[bytes], team: Sequence[str] = TEAM) -> None:
+        self.team = team
+        prefix = frames[0][:1] + wire.pack("frame")  # a map, the frame's number first
         if not all(body.startswith(prefix + wire.pack(0)) for body in frames):
-            raise ValueError("a packed frame must begin with its number")
+            raise ValueError("a packed frame or message must begin with its number")
         self._prefix = prefix
         tails = [body[len(prefix) + 1 :] for body in frames]
         self._tails = tails + tails[-2:0:-1]  # there and back, as no vehicle leaps from the end to the beginning
@@ -116,39 +70,69 @@ class Bodies:
         return b"".join((self._prefix, wire.pack(index), self._tails[index % len(self._tails)]))
 
 
-def prepare(attacked: bool, scene_seed: int, console: Console, frames: int = PREPARED_FRAMES) -> Bodies:
-    """Sense, attack and pack the frames of one ego and its five teammates."""
+def prepare(
+    attacked: bool, scene_seed: int, console: Console, frames: int = PREPARED_FRAMES, teammates: int = len(TEAM)
+) -> Bodies:
+    """Sense, attack and pack the frames of one ego and so many of its five teammates, the attacker among them."""
     fleet = Fleet(IntersectionScene(scene_seed), load(), 1, int(attacked), PGD(), seed=0)
+    team = sorted(TEAM, key=lambda name: name not in fleet.attackers)[:teammates]
     bodies = []
     label = f"preparing {'attacked' if attacked else 'benign'} frames"
     for index in track(range(frames), label, console=console, transient=True):
         (frame,) = fleet.sense(index)
-        bodies.append(wire.pack_frame(0, frame.message, frame.sent))
-    return Bodies(bodies)
+        bodies.append(wire.pack_frame(0, frame.message, {name: frame.sent[name] for name in team}))
+    return Bodies(bodies, team)
 
 
-async def new_ego(gateway: GatewayClient, budget_ms: float) -> VehicleClient:
-    """The ego of a new session of six vehicles."""
-    session = await gateway.open_session(EGO, TEAM, defense=DEFENSE, latency_budget_ms=budget_ms)
+async def new_ego(
+    gateway: GatewayClient, budget_ms: float, team: Sequence[str] = TEAM, defense: Mapping[str, Any] = DEFENSE
+) -> VehicleClient:
+    """The ego of a new session, of six vehicles by default."""
+    session = await gateway.open_session(EGO, team, defense=defense, latency_budget_ms=budget_ms)
     return gateway.vehicle(session.session_id, EGO, session.ego_token)
 
 
-async def run_load(gateway: GatewayClient, work: Load, bodies: Bodies, seconds: float, budget_ms: float) -> Figures:
-    """Load the gateway for a time, after a few frames that do not count."""
+async def run_load(
+    gateway: GatewayClient,
+    work: Load,
+    bodies: Bodies,
+    seconds: float,
+    budget_ms: float,
+    *,
+    defense: Mapping[str, Any] = DEFENSE,
+    meter: Meter | None = None,
+) -> Figures:
+    """Load the gateway for a time, after a few frames that do not count; with a meter also what the frames cost."""
     run = _Run(bodies, seconds, Figures(work, budget_ms))
     async with AsyncExitStack() as stack:
         egos: list[VehicleClient] = []
         while len(egos) < work.egos:
-            egos.append(await new_ego(gateway, budget_ms))
+            egos.append(await new_ego(gateway, budget_ms, bodies.team, defense))
             stack.push_async_callback(egos[-1].close)
         for index in range(WARM_UP_FRAMES):
             for ego in egos:
                 await ego.post_frame_body(bodies.numbered(index))
+        records = [await _last_record(ego) for ego in egos] if meter else []
+        before = await meter.read() if meter else None
         run.started = time.perf_counter()
         loop = run.closed if work.loop == "closed" else run.open
         await asyncio.gather(*(loop(ego, number) for number, ego in enumerate(egos)))
         run.figures.seconds = time.perf_counter() - run.started
+        if meter and before:
+            frames = len(run.figures.latencies_ms)
+            run.figures.used = (await meter.read()).since(before, frames)
+            logs = [await _log_bytes(ego, since) for ego, since in zip(egos, records, strict=True)]
+            run.figures.used["audit_bytes"] = sum(logs) / frames if frames else None
     return run.figures
+
+
+async def _last_record(ego: VehicleClient) -> int:
+    return int((await ego.state())["audit_seq"])
+
+
+async def _log_bytes(ego: VehicleClient, after: int) -> int:
+    """Of a session's log, the bytes after a record."""
+    return sum([len(line.encode()) + 1 async for line in ego.stream_audit(after)])
 
 
 @dataclass
@@ -188,22 +172,26 @@ class _Run:
 
 def show(console: Console, results: Sequence[Figures], bytes_a_frame: int, budget_ms: float) -> None:
     """Print the figures and the gateway's own timings by stage."""
-    what = ("loop", "egos", "attack")
-    title = f"Six vehicles, {bytes_a_frame / 1e3:.0f} kB a frame; latencies in ms, budget {budget_ms:.0f} ms"
-    table = trial.a_table(title, [*what, "FPS", "p50", "p95", "p99", "in time", "steps", "errors"])
+    teams = len({figures.load.teammates for figures in results}) > 1
+    what = ("loop", *(["team"] if teams else []), "egos", "attack")
+    title = (
+        f"An ego and its team, {bytes_a_frame / 1e3:.0f} kB a frame; latencies and CPU in ms, budget {budget_ms:.0f} ms"
+    )
+    table = trial.a_table(title, [*what, "FPS", "p50", "p95", "p99", "in time", "steps", "CPU", "errors"])
     names = list(dict.fromkeys(stage for figures in results for stage in figures.stages))
     headings = [_HEADINGS.get(name, name) for name in names]
     stages = trial.a_table("The gateway's own median timings, ms", [*what, *headings])
     for figures in results:
         values, work = figures.as_dict(), figures.load
         loop = work.loop if work.rate_hz is None else f"{work.loop} {work.rate_hz:g} Hz"
-        label = (loop, str(work.egos), "PGD" if work.attacked else "none")
+        label = (loop, *([str(work.teammates)] if teams else []), str(work.egos), "PGD" if work.attacked else "none")
         table.add_row(
             *label,
             f"{values['fps']:.1f}",
             *(trial.shown(value, 0) for value in values["latency_ms"].values()),
             f"{values['within_budget_share']:.1%}",
             trial.shown(values["sampling_steps_mean"], 2),
+            trial.shown(figures.used.get("gateway_cpu_ms"), 1),
             str(sum(figures.errors.values())),
         )
         stages.add_row(*label, *(trial.shown(values["stages_ms"].get(name), 1) for name in names))
@@ -216,47 +204,96 @@ _HEADINGS = {"receive": "recv", "prepare": "prep", "ego_only": "ego", "hypothese
 
 def main(  # the options of a command line
     url: trial.Url = None,
+    process: Annotated[
+        list[str] | None,
+        typer.Option(help="Behind a proxy: address of each gateway, for its metrics; give it several times."),
+    ] = None,
     seconds: trial.Seconds = 10.0,
     egos: Annotated[list[int] | None, typer.Option(min=1, help="Egos at a time; give it several times.")] = None,
+    teammates: Annotated[
+        list[int] | None,
+        typer.Option(min=1, max=len(TEAM), help="Teammates of an ego, by default all; give it several times."),
+    ] = None,
     rate: Annotated[float, typer.Option(min=0.1, help="Open loop: frames a second of each ego.")] = 5.0,
     budget_ms: trial.Budget = 200.0,
+    defense: Annotated[str, typer.Option(help="Kind of the sessions' defence.")] = str(DEFENSE["kind"]),
     scene: Annotated[int, typer.Option(min=0, help="Seed of the scene whose frames are sent.")] = 3,
     out: trial.Out = None,
     force: trial.Force = False,
     api_key: trial.ApiKey = None,
 ) -> None:
-    """Measure a gateway's capacity and latency, with and without attackers, for one ego and for several."""
+    """Measure a gateway's capacity, latency and costs, with and without attackers, for one ego and for several."""
     torch.set_num_threads(1)
     console = Console()
     trial.make_folder(out, "--out", REPORT, force)
-    bodies = {attacked: prepare(attacked, scene, console) for attacked in (False, True)}
+    teams = teammates or [len(TEAM)]
+    bodies = {(at, n): prepare(at, scene, console, teammates=n) for at in (False, True) for n in teams}
     loads = [
-        Load(loop, count, attacked, rate if loop == "open" else None)
+        Load(loop, count, attacked, rate if loop == "open" else None, team)
+        for team in teams
         for count in egos or [1, 8]
         for loop in ("closed", "open")
         for attacked in (False, True)
     ]
 
-    async def run_all() -> list[Figures]:
-        async with trial.gateway_to_try(url, api_key) as (_, gateway):
+    async def run_all(folder: str) -> list[Figures]:
+        database_url = os.environ.get("ROBOSAC_DATABASE_URL", f"sqlite:///{folder}/robosac.db")
+        transport = CountingTransport()
+        async with trial.gateway_to_try(url, api_key, database_url=database_url, transport=transport) as (at, gateway):
+            meter = Meter(process or [at], database_url, transport)
             progress = track(loads, "loads", console=console, transient=True)
-            return [await run_load(gateway, work, bodies[work.attacked], seconds, budget_ms) for work in progress]
+            return [
+                await run_load(
+                    gateway,
+                    work,
+                    bodies[work.attacked, work.teammates],
+                    seconds,
+                    budget_ms,
+                    defense=_defense(defense, work.teammates),
+                    meter=meter,
+                )
+                for work in progress
+            ]
 
-    results = trial.run(run_all(), console, "The load test")
-    size = len(bodies[False].numbered(0))
-    show(console, results, size, budget_ms)
-    machine = {"platform": platform.platform(), "processor": platform.processor(), "python": sys.version.split()[0]}
+    with tempfile.TemporaryDirectory(prefix="robosac-") as folder:
+        results = trial.run(run_all(folder), console, "The load test")
+    sizes = {team: len(bodies[False, team].numbered(0)) for team in teams}
+    show(console, results, sizes[teams[0]], budget_ms)
+    machine = {
+        "platform": platform.platform(),
+        "processor": _processor(),
+        "python": sys.version.split()[0],
+        "cores": os.cpu_count(),
+    }
     report: Mapping[str, Any] = {
         "machine": machine,
-        "bytes_a_frame": size,
+        "processes": len(process or [url]),
+        "bytes_a_frame": sizes[teams[0]],
+        "body_bytes": {str(team): size for team, size in sizes.items()},
         "budget_ms": budget_ms,
-        "defense": DEFENSE,
+        "defense": _defense(defense, teams[0]),
         "loads": [figures.as_dict() for figures in results],
     }
     trial.write(report, out, REPORT, console)
     if any(not figures.latencies_ms for figures in results):
         console.print("[red]A load got no answer at all.[/red]")
         sys.exit(1)
+
+
+def _processor() -> str:
+    """Its name, as Linux has it, or else as Python knows it."""
+    try:
+        found = re.search(r"^model name\s*: (.*)$", Path("/proc/cpuinfo").read_text(), re.MULTILINE)
+    except OSError:
+        found = None
+    return found[1] if found else platform.processor()
+
+
+def _defense(kind: str, teammates: int) -> Mapping[str, Any]:
+    """As a session asks for it: sampling as in the paper, for teams of other sizes too, or another kind as it comes."""
+    if kind != DEFENSE["kind"]:
+        return {"kind": kind}
+    return {**DEFENSE, "collaborators": max(1, DEFENSE["collaborators"] - len(TEAM) + teammates)}
 
 
 if __name__ == "__main__":

@@ -48,7 +48,7 @@ class GatewayProcess:
         port: int | None = None,
         settings: Mapping[str, str] | None = None,
     ) -> None:
-        port = _free_port() if port is None else port
+        port = free_port() if port is None else port
         self.port, self.url = port, f"http://127.0.0.1:{port}"
         self._log = log
         command = [sys.executable, "-m", "uvicorn", "service.app:app", "--host", "127.0.0.1", "--port", str(port)]
@@ -64,6 +64,11 @@ class GatewayProcess:
                 stderr=subprocess.STDOUT,
                 env=environment | {"ROBOSAC_DATABASE_URL": database_url, **(settings or {})},
             )
+
+    @property
+    def pid(self) -> int:
+        """Number of the process."""
+        return self._process.pid
 
     async def ready(self) -> None:
         """Wait until the gateway serves.
@@ -115,7 +120,8 @@ class GatewayProcess:
         await asyncio.to_thread(self._process.wait)
 
 
-def _free_port() -> int:
+def free_port() -> int:
+    """A port of loopback that nobody has just now."""
     with socket.socket() as probe:
         probe.bind(("127.0.0.1", 0))
         port: int = probe.getsockname()[1]
@@ -123,10 +129,13 @@ def _free_port() -> int:
 
 
 @contextlib.asynccontextmanager
-async def local_gateway(log: Path, api_key: str | None = None) -> AsyncIterator[str]:
-    """The URL of a gateway that runs for the length of a block, with a log and a key as `GatewayProcess`.
+async def local_gateway(
+    log: Path, api_key: str | None = None, settings: Mapping[str, str] | None = None
+) -> AsyncIterator[str]:
+    """The URL of a gateway that runs for the length of a block, with log, key and settings as `GatewayProcess`.
 
-    It keeps its sessions where ``ROBOSAC_DATABASE_URL`` says, else in a temporary folder that is removed afterwards.
+    Unless the settings say otherwise, it keeps its sessions where ``ROBOSAC_DATABASE_URL`` says, else in a temporary
+    folder that is removed afterwards.
 
     Raises
     ------
@@ -135,7 +144,7 @@ async def local_gateway(log: Path, api_key: str | None = None) -> AsyncIterator[
     """
     with tempfile.TemporaryDirectory(prefix="robosac-") as folder:
         database_url = os.environ.get("ROBOSAC_DATABASE_URL", f"sqlite:///{folder}/robosac.db")
-        process = GatewayProcess(log, database_url, api_key)
+        process = GatewayProcess(log, database_url, api_key, settings=settings)
         try:
             with _cancelled_by_sigterm():
                 await process.ready()

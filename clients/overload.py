@@ -21,7 +21,8 @@ from rich.progress import Progress
 
 from clients import trial
 from clients.client import MSGPACK, VehicleClient
-from clients.load_test import Bodies, Load, new_ego, prepare, run_load
+from clients.load_test import Bodies, new_ego, prepare, run_load
+from clients.measured import Load
 from clients.raw_http import connected, post_head, read_response
 from robosac import wire
 

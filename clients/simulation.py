@@ -11,7 +11,14 @@ from robosac.attacks import Attack, Campaign
 from robosac.attacks.situation import Lie, Past
 from robosac.boxes import FloatArray
 from robosac.detectors import Detector, Message
-from robosac.evaluation.frames import Sensed, encode_all, foreign_views, under_attack, vehicles_around
+from robosac.evaluation.frames import (
+    Sensed,
+    encode_all,
+    foreign_views,
+    hostile_in,
+    under_attack,
+    vehicles_around,
+)
 from robosac.scenes import Frame, Scene
 
 
@@ -101,7 +108,8 @@ class Fleet:
         return [self._for_ego(ego_id, frame, messages) for ego_id in self.egos if ego_id in messages]
 
     def _for_ego(self, ego_id: str, frame: Frame, messages: Mapping[str, Message]) -> EgoFrame:
-        sensed = Sensed(frame.index, ego_id, messages, frame.truth(ego_id), vehicles_around(frame, ego_id))
+        vehicles, hostile = vehicles_around(frame, ego_id), hostile_in(frame)
+        sensed = Sensed(frame.index, ego_id, messages, frame.truth(ego_id), vehicles, hostile)
         past = self._past(ego_id, frame.index)
         met = under_attack(self.detector, sensed, self.attackers, self._campaign, self._rng, past)
         number, points = self.scene.number, frame.views[ego_id].points

@@ -101,7 +101,9 @@ class FleetSummary:
         received = self.detector.prepare(frame.message, frame.sent)
         undefended = received.detect(team)
         self.ap[GATEWAY].add(answer.boxes, frame.truth)
-        self.ap["all benign"].add(self.detector.prepare(frame.message, frame.benign).detect(team), frame.truth)
+        self.ap["all benign"].add(
+            self.detector.prepare(frame.message, frame.benign).detect(list(frame.benign)), frame.truth
+        )
         self.ap["ego only"].add(received.detect(), frame.truth)
         self.ap["no defence"].add(undefended, frame.truth)
         self.latencies_ms.append(latency_ms)

@@ -11,6 +11,7 @@ from contextlib import AsyncExitStack, asynccontextmanager
 from pathlib import Path
 from typing import Annotated, Any, TypeVar
 
+import httpx
 import numpy as np
 import typer
 from rich.box import SIMPLE_HEAD
@@ -54,14 +55,22 @@ def make_folder(path: Path | None, option: str, report: str, force: bool, *, for
 
 @asynccontextmanager
 async def gateway_to_try(
-    url: str | None, api_key: str | None = None, own_key: str | None = None
+    url: str | None,
+    api_key: str | None = None,
+    own_key: str | None = None,
+    *,
+    database_url: str | None = None,
+    transport: httpx.AsyncBaseTransport | None = None,
 ) -> AsyncIterator[tuple[str, GatewayClient]]:
-    """A gateway's URL and a client of it; without a URL one is started for the block, which asks for ``own_key``."""
+    """A gateway's URL and a client of it, by this transport; without a URL one is started for the block, which asks for
+    ``own_key``.
+    """
     async with AsyncExitStack() as stack:
         if url is None:
             folder, api_key = Path(stack.enter_context(tempfile.TemporaryDirectory())), own_key
-            url = await stack.enter_async_context(local_gateway(folder / "gateway.log", own_key))
-        yield url, await stack.enter_async_context(GatewayClient(url, api_key))
+            settings = {} if database_url is None else {"ROBOSAC_DATABASE_URL": database_url}
+            url = await stack.enter_async_context(local_gateway(folder / "gateway.log", own_key, settings))
+        yield url, await stack.enter_async_context(GatewayClient(url, api_key, transport=transport))
 
 
 def run(trial: Coroutine[Any, Any, T], console: Console, what: str, *others: type[Exception]) -> T:

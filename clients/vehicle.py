@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+import asyncio
+import contextlib
 import json
 from collections.abc import AsyncIterator, Generator, Mapping, Sequence
 from dataclasses import dataclass
@@ -13,19 +15,23 @@ from pydantic import TypeAdapter, ValidationError
 
 from clients.errors import ProtocolError
 from clients.receipts import ReceiptBook
+from clients.standby import Standby
 from robosac import wire
 from robosac.answers import FrameAnswer, LogReceipt, Typed
 from robosac.detectors import Message
 from robosac.possession import HEADER, make_proof
+from robosac.recording.truth import Truth
 from robosac.signatures import sign
 
 MSGPACK = "application/vnd.msgpack"
+SESSION_HEADER = "X-Session-Id"
 AUDIT_PAGE = 1000
 """Audit records that are asked for at a time."""
 T = TypeVar("T")
 
 
 class _Accepted(Typed):
+    frame: int | None = None
     receipt: LogReceipt | None = None
 
 
@@ -68,8 +74,11 @@ class VehicleClient:
         token: str,
         key: Ed25519PrivateKey | None = None,
         receipts: ReceiptBook | None = None,
+        events: Any = None,
     ) -> None:
         self._key = key
+        self._events = events
+        self._standby: Standby | None = None
         self._receipts = receipts
         self.session_id = session_id
         self.vehicle_id = vehicle_id
@@ -79,8 +88,8 @@ class VehicleClient:
 
     @property
     def bearer(self) -> dict[str, str]:
-        """The header that says who speaks."""
-        return bearer(self.token)
+        """Headers that say who speaks, and in which session: some routers see no more than headers."""
+        return {**bearer(self.token), SESSION_HEADER: self.session_id}
 
     @property
     def _proven(self) -> dict[str, Any]:
@@ -106,18 +115,41 @@ class VehicleClient:
         """As a teammate: post the own message for a frame."""
         await self.send_body(wire.pack_message(frame, self.vehicle_id, message, self.signature(frame, message)))
 
+    @contextlib.asynccontextmanager
+    async def standing_by(self) -> AsyncIterator[Standby]:
+        """As a teammate, for the length of a block: send again what a gateway process took and could not pass on."""
+        self._standby = Standby(lambda: self._events(f"{self._path}/standby", self.bearer), self.send_body)
+        running = asyncio.create_task(self._standby.run())
+        try:
+            yield self._standby
+        finally:
+            self._standby = None
+            running.cancel()
+            with contextlib.suppress(asyncio.CancelledError):
+                await running
+
     async def send_body(self, body: bytes) -> None:
         """As `send`, with a body that is packed already."""
         content = (await self._post("messages", body)).content
         try:
-            receipt = _Accepted.model_validate(wire.unpack(content, trusted=True)).receipt
+            accepted = _Accepted.model_validate(wire.unpack(content, trusted=True))
         except (wire.WireError, ValidationError) as error:
             raise ProtocolError(f"not a receipt: {error}") from error
-        await self._keep(receipt)
+        if self._standby is not None and accepted.frame is not None:
+            self._standby.sent(accepted.frame, body)
+        await self._keep(accepted.receipt)
 
-    async def ask(self, frame: int, message: Message) -> FrameAnswer:
-        """As the ego: post the own message and get the frame's answer, once the teammates' messages are in."""
-        body = wire.pack_message(frame, self.vehicle_id, message, self.signature(frame, message))
+    async def ask(self, frame: int, message: Message, truth: Truth | None = None) -> FrameAnswer:
+        """As the ego: post the own message and get the frame's answer, once the teammates' messages are in.
+
+        What is true, where that is known, is for recordings alone.
+        """
+        told = None if truth is None else truth.as_fields()
+        signature = self.signature(frame, message)
+        return await self.ask_body(wire.pack_message(frame, self.vehicle_id, message, signature, told))
+
+    async def ask_body(self, body: bytes) -> FrameAnswer:
+        """As `ask`, with a body that is packed already."""
         return await self._answered("messages", body)
 
     async def post_frame(
@@ -126,9 +158,11 @@ class VehicleClient:
         ego: Message,
         teammates: Mapping[str, Message],
         signatures: Mapping[str, bytes] | None = None,
+        truth: Truth | None = None,
     ) -> FrameAnswer:
-        """As the ego: post a whole frame, with the signatures that the teammates gave."""
-        body = wire.pack_frame(frame, ego, teammates, self.signature(frame, ego), signatures)
+        """As the ego: post a whole frame, with the signatures that the teammates gave, and the truth as in `ask`."""
+        told = None if truth is None else truth.as_fields()
+        body = wire.pack_frame(frame, ego, teammates, self.signature(frame, ego), signatures, truth=told)
         return await self.post_frame_body(body)
 
     async def post_frame_body(self, body: bytes) -> FrameAnswer:

@@ -35,7 +35,7 @@ class Deadline:
     ) -> None:
         self.clock = clock
         self._end = at - reserve_s
-        self._dearest_s = 0.0
+        self._dearest_s = self._paused_s = 0.0
         self._left = math.inf if hypotheses is None else hypotheses
 
     @contextmanager
@@ -44,6 +44,17 @@ class Deadline:
         started = self.clock()
         yield
         self._dearest_s = max(self._dearest_s, self.clock() - started)
+
+    def expect(self, pass_s: float) -> None:
+        """A pass is known to cost so much."""
+        self._dearest_s = max(self._dearest_s, pass_s)
+
+    @contextmanager
+    def pause(self) -> Iterator[None]:
+        """Let others work for the length of a block, which is no measure of what anything costs."""
+        began = self.clock()
+        yield
+        self._paused_s += self.clock() - began
 
     def another_fits(self) -> bool:
         """Whether one more hypothesis may be tested: its pass is expected to end in time. It then counts as tested."""
@@ -55,13 +66,14 @@ class Deadline:
         """Whether there is time to read the messages of some agents, to be asked of one group after another just before
         each is read. All together get a share of the time that is left now.
         """
-        began = before = self.clock()
-        end, dearest_s = began + share * (self._end - began), 0.0
+        began = self.clock()
+        end, dearest_s, before = began + share * (self._end - began), 0.0, began - self._paused_s
 
         def fits(_: Collection[str]) -> bool:
             nonlocal before, dearest_s
             now = self.clock()
-            before, dearest_s = now, max(dearest_s, now - before)
+            worked = now - self._paused_s
+            before, dearest_s = worked, max(dearest_s, worked - before)
             return now + SAFETY * dearest_s <= end
 
         return fits

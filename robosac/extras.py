@@ -4,7 +4,15 @@ from __future__ import annotations
 
 from importlib.util import find_spec
 
-_EXTRAS = {"asyncpg": "postgresql", "matplotlib": "plots"}
+_EXTRAS = {
+    "asyncpg": "postgresql",
+    "matplotlib": "plots",
+    "mcap": "recordings",
+    "ray": "cluster",
+    "rerun": "rerun",
+    "rosbags": "recordings",
+    "simpy": "capacity",
+}
 
 
 class MissingExtra(RuntimeError):

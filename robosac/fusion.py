@@ -7,7 +7,7 @@ detector decodes them, the consensus test judges, and the defence learns, until 
 from __future__ import annotations
 
 import logging
-from collections.abc import Collection, Generator, Iterator, Mapping, Sequence
+from collections.abc import Collection, Iterator, Mapping, Sequence
 from contextlib import contextmanager
 from dataclasses import dataclass, field, fields
 from typing import Any, TypeVar
@@ -15,6 +15,7 @@ from typing import Any, TypeVar
 import numpy as np
 import rfc8785
 
+from robosac.ahead import Ahead
 from robosac.answers import Reason, Source, Verdict
 from robosac.boxes import FloatArray
 from robosac.calibrated import witness_of
@@ -39,17 +40,16 @@ from robosac.previous import PreviousAnswer
 from robosac.provenance import best_first, unfounded
 from robosac.result import FusionResult
 from robosac.screening import Screened, Screening, joined, separated
+from robosac.steps import Steps, finished
 from robosac.testimony import Testimony
 
-__all__ = ["FrameRun", "FusionResult", "Steps", "UnverifiedAnswer", "finished", "fuse"]
+__all__ = ["FrameRun", "FusionResult", "UnverifiedAnswer", "fuse"]
 
 logger = logging.getLogger(__name__)
 
 READING_SHARE = 0.5
 """Of the time that is left, for testimony: without it there is an answer, without time for a pass there is none."""
 T = TypeVar("T")
-Steps = Generator[None, None, T]
-"""Work that pauses before each of its larger parts, so that the work of others can take turns with it."""
 
 
 class UnverifiedAnswer(Exception):
@@ -107,16 +107,6 @@ def fuse(  # all that a decision follows from, so that it can be made again
     return finished(run.answer(teammates, rng, state))
 
 
-def finished(steps: Steps[T]) -> T:
-    """What work comes to that is done without a pause."""
-    try:
-        while True:
-            next(steps)
-    except StopIteration as stop:
-        result: T = stop.value
-        return result
-
-
 @dataclass
 class FrameRun:
     """The state of one call of `fuse`, whose parameters these are."""
@@ -158,7 +148,7 @@ class FrameRun:
             prepared = self._prepare(passed)
             if getattr(self.defense, "asks_witnesses", False):
                 yield
-                self._hear(passed, trusted_in(state))
+                yield from self._hear(passed, trusted_in(state))
             decision = yield from self._converse(prepared, list(passed), state, rng)
             answered = yield from self._assemble(prepared, decision)
         except Exception as error:
@@ -193,19 +183,33 @@ class FrameRun:
         with self._spending("prepare"):
             return self.detector.prepare(self.ego, teammates)
 
-    def _hear(self, teammates: Mapping[str, Message], trusted: Collection[str]) -> None:
+    def _hear(self, teammates: Mapping[str, Message], trusted: Collection[str]) -> Steps[None]:
         """Ask the witness what each message says by itself, of as many as there is time for: the ego's first, then
         those of teammates that are trusted.
         """
-        with self._spending("testimony"):
-            if isinstance(self.detector, Testifying):
+        if isinstance(self.detector, Testifying):
+            with self._spending("testimony"):
                 said = self.detector.testify(self.ego, teammates)
                 self.testimony = None if said is None else said.of({EGO, *teammates})
-            elif (witness := witness_of(self.detector.info)) is not None:
-                fits = self.deadline.reading(READING_SHARE)
-                said = witness.testify(EGO, {EGO: self.ego, **teammates}, trusted, fits)
-                self.testimony = None if EGO in said.unread else said
-                self.unread = tuple(name for name in said.unread if name != EGO)
+        elif (witness := witness_of(self.detector.info)) is not None:
+            fits = self.deadline.reading(READING_SHARE)
+            known = self.detector.said if isinstance(self.detector, Ahead) else {}
+            reading = witness.testify_in_steps(EGO, {EGO: self.ego, **teammates}, trusted, fits, known)
+            said = yield from self._paced("testimony", reading)
+            self.testimony = None if EGO in said.unread else said
+            self.unread = tuple(name for name in said.unread if name != EGO)
+
+    def _paced(self, stage: str, steps: Steps[T]) -> Steps[T]:
+        """Do a stage's work with its pauses, which do not count for what it takes."""
+        while True:
+            with self._spending(stage):
+                try:
+                    next(steps)
+                except StopIteration as stop:
+                    result: T = stop.value
+                    return result
+            with self.deadline.pause():
+                yield
 
     def _converse(
         self, prepared: PreparedFrame, team: list[str], state: State, rng: np.random.Generator

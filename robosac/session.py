@@ -7,14 +7,16 @@ from typing import Any, Literal
 
 import numpy as np
 
+from robosac.ahead import Ahead
 from robosac.calibrated import calibration_of, screening_for
 from robosac.deadline import Deadline
 from robosac.defenses import Defense, DefenseSettings, SampleConsensus, State, build
 from robosac.defenses.group_testing import GroupTestingSettings
 from robosac.detectors import Detector, DetectorInfo, Message, Preparer
-from robosac.fusion import FrameRun, FusionResult, Steps, finished
+from robosac.fusion import FrameRun, FusionResult
 from robosac.previous import PreviousAnswer
 from robosac.screening import Screening, joined, separated
+from robosac.steps import Steps, finished
 
 
 def default_defense(info: DetectorInfo) -> DefenseSettings:
@@ -122,7 +124,8 @@ class Session:
         deadline : Deadline, optional
             By default there is time for all.
         detector : Preparer, optional
-            What decodes this frame in the place of the session's detector, such as a recording.
+            What decodes this frame in the place of the session's detector, such as a recording, or a
+            `robosac.ahead.Ahead` in which the frame was begun.
         """
         result = self.decide(frame, ego, teammates, self._rng, deadline, detector)
         self.remember(result)
@@ -153,9 +156,10 @@ class Session:
         detector: Preparer | None = None,
     ) -> Steps[FusionResult]:
         """Decide as `decide` does, but pause before each pass, so that the work of others can take turns with it."""
-        run = FrameRun(
-            detector or self.detector, self.defense, ego, frame, self.previous, deadline or Deadline(), self.screening
-        )
+        deadline = deadline or Deadline()
+        if isinstance(detector, Ahead):
+            deadline.expect(detector.pass_s)
+        run = FrameRun(detector or self.detector, self.defense, ego, frame, self.previous, deadline, self.screening)
         return run.answer(teammates, rng, self.state)
 
     def remember(self, result: FusionResult) -> None:

@@ -74,9 +74,18 @@ class FrameEnvelope:
     """As `pack_frame` takes them."""
 
 
-def pack_message(frame: int, vehicle_id: str, message: Message, signature: bytes | None = None) -> bytes:
-    """The body of a vehicle's own message, with its signature where it has one (`robosac.signatures`)."""
-    return pack({"frame": frame, "vehicle_id": vehicle_id, **_message_fields(message, signature)})
+def pack_message(
+    frame: int,
+    vehicle_id: str,
+    message: Message,
+    signature: bytes | None = None,
+    truth: Mapping[str, Any] | None = None,
+) -> bytes:
+    """The body of a vehicle's own message, with its signature where it has one (`robosac.signatures`).
+
+    An ego may add what is true (`robosac.recording.truth.Truth.as_fields`).
+    """
+    return pack({"frame": frame, "vehicle_id": vehicle_id, **_message_fields(message, signature, truth)})
 
 
 def pack_frame(
@@ -86,8 +95,9 @@ def pack_frame(
     ego_signature: bytes | None = None,
     signatures: Mapping[str, bytes] | None = None,
     states: Mapping[str, bytes] | None = None,
+    truth: Mapping[str, Any] | None = None,
 ) -> bytes:
-    """The body of a whole frame, with the signatures of those teammates that sign.
+    """The body of a whole frame, with the signatures of those teammates that sign, and the truth as `pack_message`.
 
     Of a frame that is kept, ``states`` may hold what the session remembered ``before`` and ``after`` it, as text
     (`robosac.audit.packing.packed_state`).
@@ -95,7 +105,7 @@ def pack_frame(
     signed = signatures or {}
     fields = {name: _message_fields(message, signed.get(name)) for name, message in teammates.items()}
     known = {"states": dict(states)} if states else {}
-    return pack({"frame": frame, "ego": _message_fields(ego, ego_signature), "teammates": fields, **known})
+    return pack({"frame": frame, "ego": _message_fields(ego, ego_signature, truth), "teammates": fields, **known})
 
 
 def content_digest(frame: int, vehicle_id: str, message: Message) -> str:
@@ -213,13 +223,16 @@ def check_message(payload: Any, info: DetectorInfo, role: Role, path: str = "") 
     return Message(pose, {name: _tensor(_Fields(tensors.take(name), tensors.at(name)), specs[name]) for name in specs})
 
 
-def _message_fields(message: Message, signature: bytes | None) -> dict[str, Any]:
+def _message_fields(
+    message: Message, signature: bytes | None, truth: Mapping[str, Any] | None = None
+) -> dict[str, Any]:
     tensors = {
         name: {"dtype": array.dtype.name, "shape": list(array.shape), "data": _little_endian(array)}
         for name, array in message.tensors.items()
     }
     fields = {"pose": [float(value) for value in message.pose.reshape(-1)], "tensors": tensors}
-    return fields if signature is None else {**fields, "signature": signature}
+    more = {"signature": signature, "truth": truth}
+    return fields | {name: value for name, value in more.items() if value is not None}
 
 
 def _little_endian(array: np.ndarray[Any, np.dtype[Any]]) -> bytes:

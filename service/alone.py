@@ -87,5 +87,6 @@ def _advice(address: object) -> str:
     return (
         f"another worker serves {where} already, and teammates' messages wait in the memory of one process: start one "
         "worker (no --workers, no WEB_CONCURRENCY); for more, start gateways on ports of their own and one database, "
-        "behind a proxy that chooses by the session's id in the path"
+        "behind a proxy that chooses by the session's id in the path, such as HAProxy with deploy/haproxy.cfg "
+        "(docs/scaling.md)"
     )

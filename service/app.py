@@ -12,7 +12,7 @@ import sys  # noqa: E402
 import time  # noqa: E402
 from collections.abc import AsyncIterator, Callable  # noqa: E402
 from importlib.metadata import version  # noqa: E402
-from typing import TYPE_CHECKING  # noqa: E402
+from typing import TYPE_CHECKING, Any  # noqa: E402
 
 import structlog  # noqa: E402
 from fastapi import FastAPI  # noqa: E402
@@ -28,14 +28,16 @@ from service.arriving.limits import BodyLimit  # noqa: E402
 from service.deciding.admission import Admission  # noqa: E402
 from service.deciding.answering import Deciding  # noqa: E402
 from service.deciding.keeping import Keeping  # noqa: E402
-from service.description import TAGS  # noqa: E402
+from service.description import TAGS, completed  # noqa: E402
 from service.engine import Engine  # noqa: E402
 from service.gateway import Gateway  # noqa: E402
 from service.keeping.gateway_keys import GatewayKeys  # noqa: E402
+from service.keeping.limits import Limits  # noqa: E402
 from service.keeping.record import new_seed  # noqa: E402
 from service.keeping.store import Store  # noqa: E402
 from service.operations import operations  # noqa: E402
 from service.pages import api_pages, frames_event, pages  # noqa: E402
+from service.recording.recorder import Recorder  # noqa: E402
 from service.routes import v1  # noqa: E402
 from service.sessions.identity import ApiKeys, Tokens  # noqa: E402
 from service.sessions.opening import Opening  # noqa: E402
@@ -96,7 +98,7 @@ def create_app(
             async with _running(gateway, settings, tokens, tracing):
                 yield
 
-    app = FastAPI(
+    app = _App(
         title="Defense gateway for collaborative perception",
         summary="Fuses teammates' feature maps that the ego's own perception does not contradict.",
         version=version("robosac"),
@@ -126,12 +128,25 @@ def create_app(
     return app
 
 
+class _App(FastAPI):
+    """Describes bodies of tensors as those detectors want them that are loaded."""
+
+    def openapi(self) -> dict[str, Any]:
+        gateway: Gateway = self.state.gateway
+        return completed(super().openapi(), [detector.info for detector in gateway.engine.detectors.values()])
+
+
 def _built(
     settings: Settings, api_keys: ApiKeys, tokens: Tokens, seeds: Callable[[], str], tracing: Tracing
 ) -> Gateway:
     engine, metrics = Engine(settings.torch_threads, settings.extra_detectors), Metrics()
-    admission = Admission(settings.max_hypotheses)
-    store = Store(settings.database_url, full_every=settings.audit_full_every, most_records=settings.audit_max_records)
+    admission = Admission(settings.max_hypotheses, engine.lead)
+    store = Store(
+        settings.database_url,
+        full_every=settings.audit_full_every,
+        most_records=settings.audit_max_records,
+        limits=Limits(settings.database_connections, settings.database_statement_s),
+    )
     keys = GatewayKeys(settings.gateway_key_file)
     sessions = Sessions(settings, store, engine, metrics, tokens, keys, seeds)
     feed = Feed(store.audit, settings.max_viewers, frames_event)
@@ -154,6 +169,7 @@ def _built(
         watch=LoopWatch(),
         feed=feed,
         viewer_tokens=ViewerTokens(settings, open_to_all=not api_keys),
+        recorder=Recorder(settings, metrics),
     )
 
 
@@ -166,6 +182,7 @@ async def _running(gateway: Gateway, settings: Settings, tokens: Tokens, tracing
             blamed_on("ROBOSAC_DATABASE_URL", store.start()),
             blamed_on("ROBOSAC_EXTRA_DETECTORS", engine.start()),
         )
+        gateway.recorder.start()
         await tokens.start(store)
         await gateway.keys.start(store)
         gateway.metrics.sessions.set(await store.count())
@@ -175,17 +192,23 @@ async def _running(gateway: Gateway, settings: Settings, tokens: Tokens, tracing
         keep_what_is_loaded()
         gateway.watch.start()
         sweeper = asyncio.create_task(gateway.sessions.expire_idle())
-        logger.info("gateway ready", version=version("robosac"), detectors=list(engine.detectors))
+        logger.info(
+            "gateway ready",
+            version=version("robosac"),
+            detectors=list(engine.detectors),
+            gateway=gateway.sessions.moving.name,
+        )
         try:
-            with on_stop_signal(gateway.feed.end):
+            with on_stop_signal(gateway.stop):
                 yield
         finally:
-            gateway.feed.end()
+            gateway.stop()
             sweeper.cancel()
             gateway.watch.stop()
     finally:
         engine.stop()
         await gateway.frames.deciding.keeping.close()
+        await asyncio.to_thread(gateway.recorder.stop)
         await store.close()
         tracing.close()
         logger.info("gateway stopped")

@@ -19,7 +19,7 @@ _SCHEMES = ("bearer", HEADER.lower())
 _PROOF = Header(alias=HEADER, description="Proof that the vehicle's key is there, where it registered one (RFC 9449).")
 
 
-def _gateway(request: Request) -> Gateway:
+async def _gateway(request: Request) -> Gateway:  # a plain function would be called on another thread
     gateway: Gateway = request.app.state.gateway
     return gateway
 
@@ -27,7 +27,7 @@ def _gateway(request: Request) -> Gateway:
 GatewayDep = Annotated[Gateway, Depends(_gateway)]
 
 
-def _token(credentials: Annotated[HTTPAuthorizationCredentials | None, Depends(_token_scheme)]) -> str | None:
+async def _token(credentials: Annotated[HTTPAuthorizationCredentials | None, Depends(_token_scheme)]) -> str | None:
     return credentials.credentials if credentials and credentials.scheme.lower() in _SCHEMES else None
 
 

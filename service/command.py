@@ -7,6 +7,8 @@ from typing import Annotated
 import typer
 import uvicorn
 
+from robosac.extras import MissingExtra
+
 HTTP = "service.arriving.connections:BoundedHTTP"
 """By its name, so that uvicorn imports it."""
 GRACE_S = 5
@@ -18,8 +20,25 @@ FAILED_START = 3
 def main(
     host: Annotated[str, typer.Option(help="Address to listen on; other machines need an API key.")] = "127.0.0.1",
     port: Annotated[int, typer.Option(min=0, max=65535, help="Port; 0 takes a free one.")] = 8000,
+    cluster: Annotated[
+        bool, typer.Option("--cluster", help="Serve with replicas, on Ray Serve; SIGHUP restarts them in turn.")
+    ] = False,
+    replicas: Annotated[int, typer.Option(min=1, help="Of a cluster, at least.")] = 2,
+    most_replicas: Annotated[int, typer.Option(min=1, help="At most; more are started as load asks for.")] = 2,
+    vehicles: Annotated[int, typer.Option(min=1, help="Vehicles that a replica is to have before that.")] = 100,
+    address: Annotated[
+        str | None, typer.Option(help="A Ray cluster that is there; by default one is started here.")
+    ] = None,
 ) -> None:
     """Run the gateway, with the settings of the environment (ROBOSAC_...), until SIGTERM or Ctrl-C."""
+    if cluster:
+        from service import cluster as on_ray  # noqa: PLC0415 (others do without)
+
+        try:
+            on_ray.run(host, port, on_ray.Scale(replicas, max(replicas, most_replicas), vehicles), address)
+        except MissingExtra as missing:
+            raise typer.BadParameter(str(missing), param_hint="--cluster") from missing
+        return
     try:
         # as uvicorn's own command does, the working directory may hold modules of the user's own detectors
         uvicorn.run("service.app:app", host=host, port=port, http=HTTP, timeout_graceful_shutdown=GRACE_S, app_dir="")

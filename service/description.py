@@ -5,12 +5,14 @@ A test holds every example against its type, and walks all routes.
 
 from __future__ import annotations
 
-from collections.abc import Mapping
+from collections.abc import Mapping, Sequence
 from typing import Any
 
 from pydantic import BaseModel
 
 from robosac.answers import FrameAnswer
+from robosac.detectors import DetectorInfo
+from service import tensor_bodies
 from service.arriving.bodies import JSON, MSGPACK, described
 from service.problems import documented
 from service.schemas import (
@@ -40,7 +42,7 @@ TAGS = [
 _SESSION, _TIME, _HASH = "Fv0Zk7mXQ2yq1Jr3", "2026-11-21T09:30:00.000Z", "3b0c44298fc1c149afbf4c8996fb9242" * 2
 _TOKEN = "eyJhbGciOiJIUzI1NiJ9.eyJzdWIiOiJjYXItMSJ9.c2lnbmF0dXJl"
 _KEY = "MCowBQYDK2VwAyEA0Z1Jc4mXQ2yq1Jr3T4u5v6w7x8y="
-_DEFENSE = {"kind": "sample_consensus", "attacker_ratio": 0.34, "sampling_budget": 7, "collaborators": 2}
+_DEFENSE = {"kind": "sample_consensus", "attacker_ratio": 0.3, "sampling_budget": 7, "collaborators": 2}
 _TIMING = {"latency_budget_ms": 200.0, "gather_ms": 100.0, "frame_period_ms": 200.0}
 _RECEIPT = {"session": _SESSION, "seq": 2, "head": _HASH, "key_id": "5f2b8c", "signature": "c2lnbmF0dXJl"}
 _FEATURES = {"features": {"dtype": "float16", "shape": [64, 32, 32]}}
@@ -128,7 +130,7 @@ EXAMPLES: Mapping[type[BaseModel], dict[str, Any]] = {
             {"teammates": ["car-3", "rsu"], "jaccard_index": 0.81, "verdict": "consensus"},
         ],
         "sampling_steps": 2,
-        "attacker_ratio": 0.34,
+        "attacker_ratio": 0.3,
         "deadline_met": True,
         "degraded_by": None,
         "timings_ms": {"receive": 3.1, "prepare": 4.0, "total": 31.5},
@@ -141,49 +143,25 @@ AUDIT_LINE = (
     '"session_id":"' + _SESSION + '","time":"' + _TIME + '","vehicle_id":"rsu"}\n'
 )
 
-_POSE = {
-    "type": "array",
-    "items": {"type": "number"},
-    "minItems": 16,
-    "maxItems": 16,
-    "description": "world_from_sensor, 4 x 4, row-major, metres",
-}
-_TENSORS = {
-    "type": "object",
-    "description": "By name, as the detector wants them (`GET /v1/detectors`).",
-    "additionalProperties": {
-        "type": "object",
-        "required": ["dtype", "shape", "data"],
-        "properties": {
-            "dtype": {"type": "string"},
-            "shape": {"type": "array", "items": {"type": "integer"}},
-            "data": {"type": "string", "format": "binary", "description": "Bytes, little-endian, C order."},
-        },
-    },
-}
-_PART = {
-    "pose": _POSE,
-    "tensors": _TENSORS,
-    "signature": {"type": "string", "format": "binary", "description": "Ed25519, of vehicles that sign."},
-}
-_SENT = {"type": "object", "required": ["pose", "tensors"], "properties": _PART}
-_NUMBER = {"type": "integer", "minimum": 0}
-_MESSAGE: dict[str, Any] = {
-    "type": "object",
-    "description": "A vehicle's own message, as msgpack.",
-    "required": ["frame", "vehicle_id", "pose", "tensors"],
-    "properties": {"frame": _NUMBER, "vehicle_id": {"type": "string"}, **_PART},
-}
-_FRAME: dict[str, Any] = {
-    "type": "object",
-    "description": "A whole frame, as msgpack.",
-    "required": ["frame", "ego", "teammates"],
-    "properties": {
-        "frame": _NUMBER,
-        "ego": _SENT,
-        "teammates": {"type": "object", "description": "By id.", "additionalProperties": _SENT},
-    },
-}
+
+def completed(document: dict[str, Any], infos: Sequence[DetectorInfo]) -> dict[str, Any]:
+    """An API's description with what FastAPI cannot know: the tensors of these detectors, and nulls in examples.
+
+    Without detectors, bodies of tensors may hold any.
+    """
+    session, calls = "/v1/sessions/{sid}", document["paths"]
+    sent = {"messages": tensor_bodies.message_body(infos), "frames": tensor_bodies.frame_body(infos)}
+    for name, told in sent.items():
+        calls[f"{session}/{name}"]["post"]["requestBody"]["content"][MSGPACK] = told
+    kept = calls[f"{session}/frames/{{frame}}/messages"]["get"]["responses"]["200"]
+    kept["content"][MSGPACK] = tensor_bodies.kept_frame(infos)
+    examples = {f"#/components/schemas/{model.__name__}": example for model, example in EXAMPLES.items()}
+    answers = [answer for path in calls.values() for call in path.values() for answer in call["responses"].values()]
+    for content in (content for answer in answers for content in answer.get("content", {}).values()):
+        of_model = examples.get(content["schema"].get("$ref", ""))
+        if of_model is not None:
+            content["example"] = of_model
+    return document
 
 
 def body(model: type[BaseModel]) -> dict[str, Any]:
@@ -200,12 +178,9 @@ def _answer(model: type[BaseModel], description: str) -> dict[str, Any]:
 def _negotiated(model: type[BaseModel], description: str) -> dict[str, Any]:
     """An answer that is JSON, or msgpack of the same."""
     told = _answer(model, f"{description} JSON or msgpack, by `Accept`.")
-    told["content"][MSGPACK] = {"schema": {"$ref": f"#/components/schemas/{model.__name__}"}}
+    schema = {"$ref": f"#/components/schemas/{model.__name__}"}
+    told["content"][MSGPACK] = {"schema": schema, "example": EXAMPLES[model]}
     return told
-
-
-def _in_msgpack(schema: dict[str, Any]) -> dict[str, Any]:
-    return {"content": {MSGPACK: {"schema": schema}}}
 
 
 def _as_text(media_type: str, example: str, description: str) -> Answers:
@@ -218,8 +193,8 @@ def status(word: str, description: str) -> Answers:
     return {200: {"description": description, "content": {JSON: {"example": {"status": word}}}}}
 
 
-MESSAGE_BODY = {"requestBody": {"required": True, **_in_msgpack(_MESSAGE)}}
-FRAME_BODY = {"requestBody": {"required": True, **_in_msgpack(_FRAME)}}
+OF_TENSORS: dict[str, Any] = {"requestBody": {"required": True, "content": {}}}
+"""`completed` says more."""
 _OF_EGO, _OF_JSON = documented(401, 403, 404), documented(400, 408, 413, 415)
 _PROVEN = documented(401, 403, 404, 429)
 _AUDIT_HEAD = {"Audit-Head": {"description": "SHA-256 of the log's last record.", "schema": {"type": "string"}}}
@@ -239,7 +214,12 @@ DECIDED: Answers = {
     200: _negotiated(FrameAnswer, "The answer to the frame."),
 }
 TAKEN: Answers = {**DECIDED, 202: _negotiated(Receipt, "A teammate's message is kept for its frame.")}
-KEPT: Answers = {**_OF_EGO, 200: {"description": "The messages as a whole frame.", **_in_msgpack(_FRAME)}}
+_STANDING = '{"gateway": "unit-7-0f3a9c21", "answered": 41, "waiting": [42]}'
+STANDING_BY: Answers = {
+    **documented(401, 404),
+    **_as_text("text/event-stream", f"event: standing\ndata: {_STANDING}\n\n", "Events until it is to ask again."),
+}
+KEPT: Answers = {**_OF_EGO, 200: {"description": "The messages as a whole frame.", "content": {MSGPACK: {}}}}
 WATCHABLE: Answers = {**documented(401), 200: _answer(WatchableList, "The sessions.")}
 WATCHED: Answers = {
     **documented(401, 404, 422, 503),

@@ -3,6 +3,8 @@
 from __future__ import annotations
 
 import asyncio
+import contextlib
+import logging
 import math
 import threading
 import time
@@ -16,12 +18,17 @@ from typing import TypeVar
 import numpy as np
 import torch
 
+from robosac.ahead import Ahead
 from robosac.deadline import Deadline
-from robosac.detectors import Detector, Message, available, blank, load
-from robosac.fusion import FusionResult, Steps
+from robosac.defenses import EGO
+from robosac.detectors import Detector, Message, Preparer, available, blank, load
+from robosac.fusion import FusionResult
 from robosac.session import Session
+from robosac.steps import Steps
 from service.errors import Kind, Refused
 from service.turns import Turns
+
+logger = logging.getLogger(__name__)
 
 T = TypeVar("T")
 
@@ -69,6 +76,49 @@ class _Job:
             self.done.set_result(decided)
 
 
+class Begun:
+    """A frame of which the ego's message is there: what can be, is worked out while the others are waited for.
+
+    Only time that nobody's frame wants is spent on it: a piece whose turn comes while frames are being decided is left
+    to the frame itself.
+    """
+
+    def __init__(self, engine: Engine, detector: Preparer, ego: Message, *, reads: bool) -> None:
+        self._engine = engine
+        self._over = False
+        self._reads = reads
+        self.ahead = Ahead(detector, ego)
+        self.spent_s = 0.0
+        """For how long it had the engine's thread."""
+        self._do(self.ahead.see_alone)
+        if reads:
+            self._do(partial(self.ahead.read, EGO, ego))
+
+    def add(self, teammate: str, message: Message) -> None:
+        """A teammate's message is there."""
+        self._do(partial(self.ahead.lay, teammate, message))
+        if self._reads:
+            self._do(partial(self.ahead.read, teammate, message))
+
+    def end(self) -> None:
+        """No more pieces: the frame is decided now, or never."""
+        self._over = True
+
+    def _do(self, piece: Callable[[], None]) -> None:
+        self._engine.when_idle(partial(self._piece, piece))
+
+    def _piece(self, piece: Callable[[], None]) -> None:
+        if self._over:
+            return
+        began = time.perf_counter()
+        try:
+            piece()
+        except Exception:  # whatever is wrong shows when the frame is decided, and is told there
+            logger.debug("nothing was worked out ahead", exc_info=True)
+            self._over = True
+        self.spent_s += time.perf_counter() - began
+
+
 class Engine:
     """Decides frames on a thread of its own, pass by pass in turns, so that the event loop never waits for torch.
 
@@ -85,6 +135,7 @@ class Engine:
         self._executor = ThreadPoolExecutor(1, "fusion", initializer=torch.set_num_threads, initargs=(threads,))
         self._lock = threading.Lock()
         self._turns: Turns[_Job] = Turns()
+        self._working = False
         self._detectors: dict[str, Detector] = {}
         self.ready = False
 
@@ -128,40 +179,64 @@ class Engine:
         key: str = "",
         session_id: str = "",
         due: float = math.inf,
+        ahead: Ahead | None = None,
     ) -> Decided:
         """Decide a frame on the engine's thread, from what the session remembers at this moment.
 
         Between two passes frames of other sessions may have their turns, see `service.turns`; a frame that is due first
         (``due``, of `time.perf_counter`) goes first where that is fair.
         """
-        steps = copy(session).decide_in_steps(frame, ego, teammates, np.random.default_rng(seed), deadline)
+        rng = np.random.default_rng(seed)
+        steps = copy(session).decide_in_steps(frame, ego, teammates, rng, deadline, detector=ahead)
         job = _Job(key, session_id, due, steps)
         with self._lock:
             self._turns.add(job)
-        self._executor.submit(self._take_turn)
+            wake, self._working = not self._working, True
+        if wake:
+            self._executor.submit(self._work)
         return await asyncio.wrap_future(job.done)
 
-    def _take_turn(self) -> None:
-        """Do one step of the work whose turn it is. As many of these wait as there is work."""
-        if not self._step():
-            return
-        try:
-            self._executor.submit(self._take_turn)
-        except RuntimeError:  # the engine is being stopped; what was begun is finished
-            while self._turns:
-                self._step()
+    def lead(self, key: str, session_id: str, other_key: str, other_session: str) -> float:
+        """As `service.turns.Turns.lead`."""
+        with self._lock:
+            return self._turns.lead(key, session_id, other_key, other_session)
 
-    def _step(self) -> bool:
-        """Do one step; whether there is more of the same work."""
+    def begin(self, session: Session, ego: Message) -> Begun:
+        """Work out what can be of a session's frame while its teammates are waited for."""
+        return Begun(self, session.detector, ego, reads=getattr(session.defense, "asks_witnesses", False))
+
+    def when_idle(self, piece: Callable[[], None]) -> None:
+        """Do a piece of work on the engine's thread, unless frames are being decided by then."""
+        with contextlib.suppress(RuntimeError):  # the engine is being stopped
+            self._executor.submit(self._unless_busy, piece)
+
+    def _unless_busy(self, piece: Callable[[], None]) -> None:
         with self._lock:
-            job = self._turns.next()
-        began = time.perf_counter()
-        goes_on = not job.done.cancelled() and job.step()
+            busy = len(self._turns) > 0
+        if not busy:
+            piece()
+
+    def _work(self) -> None:
+        """Do one step after the other, each of the work whose turn it is, until there is none. It is not handed to the
+        thread step by step, since whoever hands work to a thread waits for the interpreter's lock.
+        """
+        try:
+            while (job := self._next()) is not None:
+                began = time.perf_counter()
+                goes_on = not job.done.cancelled() and job.step()
+                with self._lock:
+                    self._turns.charge(job, time.perf_counter() - began)
+                    if not goes_on:
+                        self._turns.remove(job)
+        except BaseException:
+            self._working = False
+            raise
+
+    def _next(self) -> _Job | None:
+        """The work whose turn it is."""
         with self._lock:
-            self._turns.charge(job, time.perf_counter() - began)
-            if not goes_on:
-                self._turns.remove(job)
-        return goes_on
+            self._working = len(self._turns) > 0
+            return self._turns.next() if self._working else None
 
     def stop(self) -> None:
         """Finish what was submitted."""

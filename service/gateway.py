@@ -9,6 +9,7 @@ from service.deciding.admission import Admission
 from service.engine import Engine
 from service.keeping.gateway_keys import GatewayKeys
 from service.keeping.store import Store
+from service.recording.recorder import Recorder
 from service.sessions.identity import ApiKeys
 from service.sessions.opening import Opening
 from service.sessions.possession import Possession
@@ -42,3 +43,9 @@ class Gateway:
     watch: LoopWatch
     feed: Feed
     viewer_tokens: ViewerTokens
+    recorder: Recorder
+
+    def stop(self) -> None:
+        """Take nothing new, and send away whoever only listens."""
+        self.sessions.drain()
+        self.feed.end()

@@ -26,6 +26,7 @@ async def healthz() -> dict[str, str]:
 async def readyz(gateway: GatewayDep) -> dict[str, str]:
     """Whether the gateway is warm and able to serve, and its database takes changes."""
     gateway.engine.check_ready()
+    gateway.sessions.moving.check_open()
     try:
         await within(gateway.store.ping(), STORE_PATIENCE_S)
     except TimeoutError:

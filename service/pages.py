@@ -18,6 +18,7 @@ from fastapi.staticfiles import StaticFiles
 from starlette.exceptions import HTTPException
 
 from service import description
+from service.arriving.bodies import STREAMED
 from service.callers import GatewayDep
 from service.schemas import WatchableList
 from service.viewing.feed import Feed
@@ -43,8 +44,6 @@ API_HEADERS = {
 }
 """Both pages of the API hold inline scripts and styles; ReDoc would load a logo from its maker."""
 API_FILES = "/api-pages"
-_STREAMED = {"Cache-Control": "no-cache", "X-Accel-Buffering": "no"}
-"""Nginx would wait for more."""
 
 pages = APIRouter(tags=["live"])
 _bearer = HTTPBearer(
@@ -99,7 +98,7 @@ async def watch(
     after: Annotated[int, Query(ge=-1, le=2**53)] = -1,
 ) -> EventSourceResponse:
     """The session's frames as server-sent events: those that are kept and numbered above `after`, then what comes."""
-    return EventSourceResponse(_events(sid, after, viewer, gateway.feed), headers=_STREAMED)
+    return EventSourceResponse(_events(sid, after, viewer, gateway.feed), headers=STREAMED)
 
 
 async def _events(sid: str, after: int, viewer: Viewer, feed: Feed) -> AsyncIterator[bytes]:

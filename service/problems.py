@@ -15,6 +15,7 @@ from fastapi import FastAPI, Request
 from fastapi.exceptions import RequestValidationError
 from fastapi.responses import JSONResponse
 from starlette.exceptions import HTTPException
+from starlette.types import Receive, Scope, Send
 
 from robosac.defenses import shipped
 from robosac.possession import ALGORITHM
@@ -39,6 +40,7 @@ ANSWERS: Mapping[Kind, tuple[int, Mapping[str, str]]] = {
     Kind.LOOPBACK_ONLY: (403, _CLOSE),
     Kind.FOREIGN_HOST: (421, _CLOSE),
     Kind.FOREIGN_ORIGIN: (403, _CLOSE),
+    Kind.MISROUTED: (421, _CLOSE),
     Kind.EGO_ONLY: (403, {}),
     Kind.WRONG_VEHICLE: (403, {}),
     Kind.UNKNOWN_SESSION: (404, {}),
@@ -68,6 +70,7 @@ ANSWERS: Mapping[Kind, tuple[int, Mapping[str, str]]] = {
     Kind.TOO_MANY_VIEWERS: (503, {"Retry-After": "10"}),
     Kind.TOO_MANY_SESSIONS: (503, {"Retry-After": "30"}),
     Kind.OVERLOADED: (503, {"Retry-After": "1"}),
+    Kind.DRAINING: (503, {"Retry-After": "0"}),
     Kind.DETECTOR_UNAVAILABLE: (503, {}),
     Kind.DEFENSE_UNAVAILABLE: (503, {}),
     Kind.AUDIT_FULL: (507, {}),
@@ -139,11 +142,26 @@ def install(app: FastAPI) -> None:
         return response(Refused(Kind.INTERNAL_ERROR, "the gateway failed to handle this request"))
 
 
+class _Problem(JSONResponse):
+    """Counted as it is sent, whether a route, a handler of errors or a middleware answers with it."""
+
+    media_type = MEDIA_TYPE
+
+    def __init__(self, fields: Mapping[str, Any], status: int, headers: Mapping[str, str], slug: str) -> None:
+        super().__init__(fields, status, headers)
+        self._slug = slug
+
+    async def __call__(self, scope: Scope, receive: Receive, send: Send) -> None:
+        if (app := scope.get("app")) is not None:  # none where a door stands before another application
+            app.state.gateway.metrics.problem(self._slug)
+        await super().__call__(scope, receive, send)
+
+
 def _problem(
     status: int, slug: str, detail: str, field: str | None = None, headers: Mapping[str, str] | None = None
 ) -> JSONResponse:
     body = _fields(status, slug, detail) | ({} if field is None else {"field": field})
-    return JSONResponse(body, status, dict(headers or {}), media_type=MEDIA_TYPE)
+    return _Problem(body, status, headers or {}, slug)
 
 
 def _fields(status: int, slug: str, detail: str) -> dict[str, Any]:

@@ -2,17 +2,20 @@
 
 from __future__ import annotations
 
+import json
 import re
+from collections.abc import AsyncIterator
 from typing import Annotated
 
 from fastapi import APIRouter, Depends, Header, Path, Query, Request, Response
 from fastapi.responses import StreamingResponse
+from fastapi.sse import KEEPALIVE_COMMENT, EventSourceResponse, format_sse_event
 from pydantic import BaseModel
 
 from robosac import wire
 from service import description
 from service.arriving.arrival import arrival_of
-from service.arriving.bodies import JSON_BYTES, MSGPACK, MSGPACK_TYPES, check_type, read_json
+from service.arriving.bodies import JSON_BYTES, MSGPACK, MSGPACK_TYPES, STREAMED, check_type, read_json
 from service.arriving.limits import expected_bytes, read_bounded
 from service.callers import Ego, GatewayDep, KeyId, ProvenEgo, ProvenVehicle, Token, Vehicle
 from service.deciding.asked import Answered
@@ -32,7 +35,8 @@ from service.schemas import (
     SessionRequest,
     SessionState,
 )
-from service.sessions.live import Caller
+from service.sessions.live import Caller, Standing
+from service.sessions.moving import news
 from service.sessions.room import Share
 
 v1 = APIRouter(prefix="/v1", responses=documented(422, 503))
@@ -46,6 +50,19 @@ async def _session_request(request: Request, gateway: GatewayDep, key_id: KeyId)
 async def _enrolment_request(request: Request, gateway: GatewayDep, caller: ProvenEgo) -> EnrolmentRequest:
     with _room(gateway, caller).holding(expected_bytes(request, JSON_BYTES)):
         return await read_json(request, EnrolmentRequest)
+
+
+async def _standing(caller: Vehicle, gateway: GatewayDep) -> AsyncIterator[Standing]:
+    with gateway.sessions.moving.standing_by(caller) as standing:
+        yield standing
+
+
+async def _standing_by(caller: Caller, gateway: Gateway, standing: Standing) -> AsyncIterator[bytes]:
+    known = gateway.sessions.moving.known(caller)
+    yield format_sse_event(event="standing", data_str=json.dumps(known))
+    async for _ in news(standing):
+        yield KEEPALIVE_COMMENT
+    yield format_sse_event(event="end", data_str="{}")
 
 
 _NO_STORE = {"Cache-Control": "no-store"}
@@ -81,7 +98,10 @@ async def open_session(
 ) -> SessionCreated:
     """Open a session of one ego with its teammates. The tokens are shown only in this answer."""
     response.headers.update(_NO_STORE)
-    return await gateway.opening.open(request, key_id)
+    gateway.recorder.check(asked=request.record)
+    opened = await gateway.opening.open(request, key_id)
+    recorded = gateway.recorder.begin(opened.session_id, asked=request.record)
+    return opened.model_copy(update={"recorded": recorded})
 
 
 @v1.get("/sessions/{sid}", tags=["sessions"], responses=description.STATE)
@@ -99,6 +119,7 @@ async def get_session(caller: Ego, gateway: GatewayDep) -> SessionState:
 async def delete_session(caller: ProvenEgo, gateway: GatewayDep, response: Response) -> None:
     """End the session; its log can be read until it is purged. The header `Audit-Head` is its last record's hash."""
     response.headers["Audit-Head"] = await gateway.sessions.close(caller)
+    gateway.recorder.end(caller.record.session_id)
 
 
 @v1.post(
@@ -163,7 +184,7 @@ async def get_audit(
 @v1.post(
     "/sessions/{sid}/messages",
     tags=["frames"],
-    openapi_extra=description.MESSAGE_BODY,
+    openapi_extra=description.OF_TENSORS,
     responses=description.TAKEN,
     response_class=Response,
 )
@@ -181,7 +202,7 @@ async def post_message(
 @v1.post(
     "/sessions/{sid}/frames",
     tags=["frames"],
-    openapi_extra=description.FRAME_BODY,
+    openapi_extra=description.OF_TENSORS,
     responses=description.DECIDED,
     response_class=Response,
 )
@@ -194,6 +215,14 @@ async def post_frame(
         body = await _read_body(request, caller, gateway, limit)
         answer = await gateway.frames.post_frame(caller, body, arrival_of(request.scope))
     return _handed_over(answer, accept, gateway)
+
+
+@v1.get("/sessions/{sid}/standby", response_class=Response, tags=["frames"], responses=description.STANDING_BY)
+async def stand_by(
+    caller: Vehicle, gateway: GatewayDep, standing: Annotated[Standing, Depends(_standing)]
+) -> EventSourceResponse:
+    """Server-sent events for a vehicle that sends again what was lost: which of its messages wait, and the end."""
+    return EventSourceResponse(_standing_by(caller, gateway, standing), headers=STREAMED)
 
 
 @v1.get(
@@ -235,6 +264,7 @@ def _handed_over(answered: Answered, accept: str | None, gateway: Gateway) -> Re
         answer = answered.now()
         response = _negotiated(answer, accept)
     gateway.frames.deciding.tell(answered, answer)
+    gateway.recorder.note(answered, answer)
     return response
 
 

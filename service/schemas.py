@@ -30,7 +30,8 @@ from robosac.detectors import DetectorInfo
 from robosac.signatures import read_public_key
 
 MAX_KEYS = 1025
-VehicleId = Annotated[str, StringConstraints(pattern=r"^[A-Za-z0-9][A-Za-z0-9._:-]{0,63}$")]
+ID_PATTERN = r"^[A-Za-z0-9][A-Za-z0-9._:-]{0,63}$"
+VehicleId = Annotated[str, StringConstraints(pattern=ID_PATTERN)]
 
 
 class _Request(BaseModel):
@@ -123,6 +124,7 @@ class SessionRequest(_Request):
     gather_ms: float | None = Field(None, ge=0, le=60_000, description="At most the latency budget.")
     public_keys: PublicKeys = {}
     frame_period_ms: float = Field(200.0, gt=0, le=60_000, description="Time between two frames, to judge motion by.")
+    record: bool = Field(False, description="Asks for a recording, where the gateway makes them.")
 
     @field_validator("teammates")
     @classmethod
@@ -209,6 +211,7 @@ class SessionCreated(BaseModel):
     gather_ms: float
     frame_period_ms: float
     receipt: LogReceipt = Field(description="The log's beginning, signed by the gateway.")
+    recorded: bool = Field(False, description="Whether the gateway records the session.")
 
 
 class GatewayKey(BaseModel):

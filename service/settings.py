@@ -81,6 +81,15 @@ class Settings(BaseSettings):
         description="Longest wait for teammates once the ego's message is in; by default at most half the budget.",
     )
     database_url: str = Field("sqlite:///robosac.db", repr=False, description="Where sessions and audit logs are kept.")
+    database_connections: int = Field(
+        10, ge=1, le=1000, description="Connections of this process to PostgreSQL, at most."
+    )
+    database_statement_s: float = Field(
+        2.0,
+        ge=0.05,
+        le=3600,
+        description="How long PostgreSQL may take for a statement, or wait for one in a transaction.",
+    )
     max_body_bytes: int = Field(32 * 2**20, ge=1024, le=2**40, description="Largest request body.")
     body_timeout_s: float = Field(
         10.0, gt=0, le=86_400, description="Time that a body may take from first to last byte."
@@ -116,6 +125,19 @@ class Settings(BaseSettings):
     max_range_m: float = Field(300.0, gt=0, le=1e6, description="A teammate farther from the ego is left out.")
     keep_frames: int = Field(
         0, ge=0, le=10_000, description="Latest frames of a session whose messages are kept, to replay decisions."
+    )
+    record: Path | None = Field(None, description="Folder that sessions are recorded to; without one, none is.")
+    record_sessions: Literal["all", "asked"] = Field(
+        "all", description="Which are recorded: all, or those whose opening asks for it."
+    )
+    record_messages: Literal["whole", "digests"] = Field(
+        "whole", description="What is recorded of messages: all, or only what proves what they were."
+    )
+    record_file_bytes: int = Field(
+        2**28, ge=2**20, le=2**40, description="Largest recording; then a session's next one begins."
+    )
+    record_bytes: int = Field(
+        2**33, ge=2**21, le=2**50, description="All recordings in the folder; beyond, the oldest are removed."
     )
     session_idle_s: float = Field(3600.0, ge=0.01, le=10 * _YEAR_S, description="A session unused for longer is ended.")
     audit_retention_s: float = Field(

@@ -2,9 +2,7 @@
 
 from __future__ import annotations
 
-import math
-from collections.abc import Iterable
-from dataclasses import dataclass, field
+from collections import Counter, OrderedDict
 from typing import Generic, Protocol, TypeVar
 
 SLACK_S = 0.02
@@ -13,6 +11,10 @@ SLACK_S = 0.02
 
 CREDIT_S = 0.1
 """How far behind the others one may be that was away for a while: a claim to that much is kept, to more it is lost."""
+
+
+KNOWN = 4096
+"""Parties that are remembered while they want nothing."""
 
 
 class Waiting(Protocol):
@@ -34,34 +36,59 @@ class Waiting(Protocol):
 W = TypeVar("W", bound=Waiting)
 
 
-@dataclass
 class _Shares:
     """Time that each of some parties had. Who comes back has little claim to time gone by, who is new has none."""
 
-    had_s: dict[str, float] = field(default_factory=dict)
+    def __init__(self) -> None:
+        self._had_s: OrderedDict[str, float] = OrderedDict()
+        self._present: Counter[str] = Counter()
+        self._floor_s = 0.0
+        """The least that anybody had who was there; it never falls, so that all keep their places while nobody is."""
 
-    def admit(self, party: str, others: Iterable[str]) -> None:
-        """A party wants time that wanted none: it begins where the one of the others is that had least, or hardly
-        before.
-        """
-        least = min((self.had_s[other] for other in others), default=0.0)
-        self.had_s[party] = max(self.had_s.get(party, least), least - CREDIT_S)
+    def __len__(self) -> int:
+        return len(self._present)
 
-    def entitled(self, parties: Iterable[str]) -> set[str]:
-        """Those of the parties that had least, or not much more."""
-        had = {party: self.had_s[party] for party in parties}
-        most = min(had.values(), default=0.0) + SLACK_S
-        return {party for party, seconds in had.items() if seconds <= most}
+    def join(self, party: str) -> None:
+        """A party wants time for one more piece of work."""
+        if party not in self._present:
+            self.know(party)
+        self._present[party] += 1
+
+    def know(self, party: str) -> float:
+        """What a party had, who is no longer new then."""
+        self._had_s[party] = self.had(party)
+        self._had_s.move_to_end(party)
+        self._forget()
+        return self._had_s[party]
+
+    def leave(self, party: str) -> None:
+        """A piece of work of a party wants no more time."""
+        self._raise_floor()
+        self._present[party] -= 1
+        if not self._present[party]:
+            del self._present[party]
+        self._forget()
+
+    def _forget(self) -> None:
+        while len(self._had_s) - len(self._present) > KNOWN:
+            del self._had_s[next(party for party in self._had_s if party not in self._present)]
+
+    def had(self, party: str) -> float:
+        """What a party had, as it counts beside the others."""
+        self._raise_floor()
+        return max(self._had_s.get(party, self._floor_s), self._floor_s - CREDIT_S)
+
+    def entitled(self) -> set[str]:
+        """Those present that had least, or not much more."""
+        most = min((self._had_s[party] for party in self._present), default=0.0) + SLACK_S
+        return {party for party in self._present if self._had_s[party] <= most}
 
     def charge(self, party: str, seconds: float) -> None:
         """A party had its turn."""
-        self.had_s[party] += seconds
+        self._had_s[party] += seconds
 
-    def forget(self, present: Iterable[str]) -> None:
-        """Forget who wants nothing and would begin anew anyway. Without anybody present, all begin anew."""
-        present = set(present)
-        least = min((self.had_s[party] for party in present), default=math.inf)
-        self.had_s = {party: s for party, s in self.had_s.items() if party in present or s > least - CREDIT_S}
+    def _raise_floor(self) -> None:
+        self._floor_s = max(self._floor_s, min((self._had_s[party] for party in self._present), default=0.0))
 
 
 class Turns(Generic[W]):
@@ -71,28 +98,25 @@ class Turns(Generic[W]):
     2. Of such a key a session may go next if it had no more than any other of the key's that wants some, likewise.
     3. Of the work of these sessions, what is due first goes next.
 
-    Time that nobody else wanted is not held against anybody for longer than others have to catch up; and time that
-    somebody did not want is not saved up. No lock is needed where one thread has the turns; `service.engine` holds one.
+    Time that nobody else wanted is not held against anybody for longer than others have to catch up. Of time that
+    somebody did not want, no more than `CREDIT_S` is saved up: so who wants little goes first among those who always
+    want more. No lock is needed where one thread has the turns; `service.engine` holds one.
     """
 
     def __init__(self) -> None:
         self._jobs: list[W] = []
         self._keys = _Shares()
-        self._sessions: dict[str, _Shares] = {}
+        self._sessions: OrderedDict[str, _Shares] = OrderedDict()
 
     def __len__(self) -> int:
         return len(self._jobs)
 
     def add(self, job: W) -> None:
         """Let work take turns from now on."""
-        keys, siblings = self._active()
-        if job.key not in keys:
-            self._keys.admit(job.key, keys)
-        sessions = self._sessions.setdefault(job.key, _Shares())
-        of_key = siblings.get(job.key, set())
-        if job.session_id not in of_key:
-            sessions.admit(job.session_id, of_key)
         self._jobs.append(job)
+        self._keys.join(job.key)
+        self._sessions.setdefault(job.key, _Shares()).join(job.session_id)
+        self._sessions.move_to_end(job.key)
 
     def next(self) -> W:
         """The work whose turn it is.
@@ -102,16 +126,12 @@ class Turns(Generic[W]):
         IndexError
             If there is none.
         """
-        keys, siblings = self._active()
-        may = {
-            (key, session)
-            for key in self._keys.entitled(keys)
-            for session in self._sessions[key].entitled(siblings[key])
-        }
-        entitled = [job for job in self._jobs if (job.key, job.session_id) in may]
-        if not entitled:
+        if not self._jobs:
             raise IndexError("nothing waits")
-        return min(entitled, key=lambda job: job.due)
+        if len(self._jobs) == 1:
+            return self._jobs[0]
+        may = {key: self._sessions[key].entitled() for key in self._keys.entitled()}
+        return min((job for job in self._jobs if job.session_id in may.get(job.key, ())), key=lambda job: job.due)
 
     def charge(self, job: W, seconds: float) -> None:
         """Work had its turn, which took so long."""
@@ -121,17 +141,22 @@ class Turns(Generic[W]):
     def remove(self, job: W) -> None:
         """Work is done, or wanted no more."""
         self._jobs.remove(job)
-        keys, siblings = self._active()
-        self._keys.forget(keys)
-        for key in list(self._sessions):
-            if key in self._keys.had_s:
-                self._sessions[key].forget(siblings.get(key, ()))
-            else:
-                del self._sessions[key]
+        self._keys.leave(job.key)
+        self._sessions[job.key].leave(job.session_id)
+        self._forget()
 
-    def _active(self) -> tuple[set[str], dict[str, set[str]]]:
-        """Keys that want time, and the sessions of each that do."""
-        siblings: dict[str, set[str]] = {}
-        for job in self._jobs:
-            siblings.setdefault(job.key, set()).add(job.session_id)
-        return set(siblings), siblings
+    def lead(self, key: str, session_id: str, other_key: str, other_session: str) -> float:
+        """For how long work of a session goes before that of another, as one of them had less than the other until now;
+        seconds, negative where it goes after.
+
+        Between keys the keys' shares count, within a key those of its sessions. The session is no longer new then: if
+        its work is refused for the sake of others, what they have meanwhile counts for it.
+        """
+        if key != other_key:
+            return self._keys.had(other_key) - self._keys.know(key)
+        sessions = self._sessions.setdefault(key, _Shares())
+        return sessions.had(other_session) - sessions.know(session_id)
+
+    def _forget(self) -> None:
+        while len(self._sessions) - len(self._keys) > KNOWN:
+            del self._sessions[next(key for key, sessions in self._sessions.items() if not sessions)]

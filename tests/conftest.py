@@ -5,7 +5,9 @@ import pytest
 import torch
 
 from robosac.detectors import EmbeddedDetector, Message
+from robosac.recording.content import Moment
 from robosac.scenes import IntersectionScene, SceneFrame
+from tests.recorded import moments
 
 GOLDEN = Path(__file__).parent / "golden"
 
@@ -52,3 +54,9 @@ def attacked(detector: EmbeddedDetector, ego_message: Message, benign: dict[str,
     surface = detector.attack_surface(ego_message, benign)
     adversarial = PGD().run(surface, ["car-2"], np.random.default_rng(0))
     return {**benign, "car-2": detector.perturbed(benign["car-2"], adversarial["car-2"])}
+
+
+@pytest.fixture(scope="session")
+def recorded_moments(detector: EmbeddedDetector) -> list[Moment]:
+    """Six frames as a session decides them, to be recorded; car-2 attacks."""
+    return list(moments(detector, range(6), attacker="car-2"))

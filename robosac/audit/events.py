@@ -128,7 +128,7 @@ class FrameAnswered(_Event, FrameAnswer):
     without a valid token.
 
     A record that is not full has no ``state``, but its ``state_digest`` (`robosac.audit.packing.state_digest`) and whom
-    it trusts.
+    it trusts. ``gateway`` names the process that decided; older logs do not.
     """
 
     event: Literal["frame_answered"] = "frame_answered"
@@ -143,6 +143,7 @@ class FrameAnswered(_Event, FrameAnswer):
     trusted: tuple[str, ...] | None = Field(None, exclude_if=lambda names: names is None)
     unlogged_refusals: dict[str, int] = Field(default_factory=dict)
     next_seed_commitment: str
+    gateway: str = Field("", exclude_if=lambda name: not name)
 
     @field_validator("seed")
     @classmethod

@@ -2,22 +2,20 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable, Iterable, Iterator, Mapping, Sequence
+from collections.abc import Callable, Iterator, Mapping, Sequence
 from dataclasses import asdict, dataclass
-from itertools import pairwise
 
 import numpy as np
 
 from robosac import attacks
 from robosac.attacks import Attack
 from robosac.calibration.fit import TooFewVerdicts, fit
+from robosac.calibration.reliability import ReliabilityBin, check
 from robosac.calibration.verdicts import STRETCH, STRETCH_STRIDE, Stretch, Trial, collect, validation_stretches
 from robosac.defenses.group_testing import Calibration, EvidenceModel, GroupTesting
 from robosac.detectors import Detector
-from robosac.evaluation.playing import play
 from robosac.scenes import DEFAULT_DATA, SOURCES, Scene, first_scenes
 
-RELIABILITY_EDGES = (0.0, 0.01, 0.05, 0.2, 0.5, 0.8, 0.95, 0.99, 1.0)
 _STREAM = 41
 _CHECK = 1
 
@@ -56,19 +54,6 @@ class Recipe:
         """Recorded frames of a level, those of the check among them."""
         frames = (self.scenes + self.check_scenes) * self.stretches_per_scene * STRETCH
         return frames * (1 + len(self.attacks) * len(self.attackers))
-
-
-@dataclass(frozen=True)
-class ReliabilityBin:
-    """Teammates whose suspicion after two frames lay between two bounds."""
-
-    low: float
-    high: float
-    teammates: int
-    predicted: float
-    """Mean suspicion."""
-    observed: float
-    """Share that did attack."""
 
 
 def calibrate(
@@ -115,7 +100,7 @@ def calibrate(
             # had it happened in one scene of as many, three times as many would have shown it with 95 %
             raise TooFewVerdicts(f"{recipe.scenes} scenes are too few ({few}): take {3 * recipe.scenes}") from few
         levels.append(model)
-        reliability[error] = check(model, stretches(scenes[recipe.scenes :], number, _CHECK))
+        reliability[error] = check(GroupTesting(model), stretches(scenes[recipe.scenes :], number, _CHECK))
     made_by = {
         "command": command,
         **asdict(recipe),
@@ -147,25 +132,6 @@ def _scenes(recipe: Recipe) -> list[Scene]:
     frames = STRETCH_STRIDE * (recipe.stretches_per_scene - 1) + STRETCH
     source, count = SOURCES.make(recipe.data), recipe.scenes + recipe.check_scenes
     return first_scenes(source, "validation", count, frames, max(recipe.attackers))
-
-
-def check(model: EvidenceModel, stretches: Iterable[Stretch]) -> list[ReliabilityBin]:
-    """Suspicion after the frames of each stretch against the truth."""
-    defense = GroupTesting(model)
-    predicted: list[float] = []
-    attacked: list[bool] = []
-    for index, (_, stretch) in enumerate(stretches):
-        *_, last = play(defense, stretch, np.random.default_rng(index))
-        for name, suspicion in (last.result.suspicion or {}).items():
-            predicted.append(suspicion)
-            attacked.append(name in stretch[-1].attackers)
-    p, y = np.array(predicted), np.array(attacked)
-    bins = []
-    for low, high in pairwise(RELIABILITY_EDGES):
-        inside = (p >= low) & ((p < high) | (high == 1.0))
-        if inside.any():
-            bins.append(ReliabilityBin(low, high, int(inside.sum()), float(p[inside].mean()), float(y[inside].mean())))
-    return bins
 
 
 def _settings(attack: Attack) -> Mapping[str, float]:

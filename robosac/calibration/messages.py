@@ -14,7 +14,7 @@ from robosac.defenses.group_testing import CalibrationError
 from robosac.detectors import Encoder
 from robosac.detectors.base import for_role
 from robosac.files import write_text
-from robosac.scenes import Scene
+from robosac.scenes import Scene, encoded
 from robosac.screening import Bounds
 from robosac.screening.fingerprints import fingerprints, likeness
 
@@ -48,7 +48,7 @@ def measure(
         before: dict[str, tuple[FloatArray, FloatArray]] = {}
         for index in range(frames if scene.length is None else min(frames, scene.length)):
             views = scene.frame(index).views
-            sent = {name: detector.encode(view.points, view.pose) for name, view in views.items()}
+            sent = {name: encoded(view, detector) for name, view in views.items()}
             tensors = {name: for_role(message, detector.info, "teammate").tensors for name, message in sent.items()}
             now: dict[str, tuple[FloatArray, FloatArray]] = {}
             for name, shown in fingerprints(tensors).items():

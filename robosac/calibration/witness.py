@@ -13,7 +13,7 @@ from robosac.boxes import FloatArray
 from robosac.calibration.places import JITTER_M, OBSERVED_HITS, Places, places
 from robosac.detectors.base import Encoder, for_role
 from robosac.detectors.witness import Layout, Witness, WitnessNetwork
-from robosac.scenes import DEFAULT_DATA, Scene, SceneError, SceneSource, seconds_apart
+from robosac.scenes import DEFAULT_DATA, Scene, SceneError, SceneSource, encoded, seconds_apart
 from robosac.testimony import ACROSS, ALONG, LIKELIHOOD, X, Y
 
 _PLACES, _BATCHES = 61, 62
@@ -86,7 +86,7 @@ def lessons(
     for scene in scenes:
         for frame in seconds_apart(scene, recipe.frames_per_scene):
             for agent, view in frame.views.items():
-                message = for_role(detector.encode(view.points, view.pose), detector.info, "teammate")
+                message = for_role(encoded(view, detector), detector.info, "teammate")
                 sent = torch.from_numpy(np.asarray(message.tensors[layout.tensor], dtype=np.float16))
                 known = places(frame, agent, layout.half_extent_m, rng)
                 learned.append(Lesson(sent, float(view.pose[2, 3]), known))
@@ -97,7 +97,7 @@ def lessons(
 def usual_size(detector: Encoder, scene: Scene) -> float:
     """Root mean square of the values in the messages of a scene's first frame: a witness reads maps divided by it."""
     layout = Layout.of(detector.info, 1.0)
-    messages = [detector.encode(view.points, view.pose) for view in scene.frame(0).views.values()]
+    messages = [encoded(view, detector) for view in scene.frame(0).views.values()]
     size = float(layout.maps(messages).pow(2).mean().sqrt())
     return size or 1.0
 

@@ -11,13 +11,13 @@ from typing import Annotated
 
 import typer
 
-from robosac import detectors, wire
+from robosac import wire
 from robosac.audit import Receipts, digest, misbehaviour, sentence, verification
 from robosac.audit.lines import RecordError, read
 from robosac.audit.receipts import by_id
 from robosac.cli.blame import blaming
+from robosac.cli.named import load_named
 from robosac.cli.outputs import Force, check_file
-from robosac.detectors.base import split_precision
 from robosac.files import write_text
 
 app = typer.Typer(no_args_is_help=True, add_completion=False, help=__doc__)
@@ -107,7 +107,7 @@ def replay_decision(
         number = wire.read_frame(body).frame if frame is None else frame
     with blaming("FILE", OSError, replay.ReplayError), file.open("rb") as lines:
         decision = replay.find(lines, number)
-    loaded = _load(detector, decision.session.detector)
+    loaded = load_named(detector, decision.session.detector, "log")
     with blaming("--defense", ValueError):
         kinds = None if defense is None else defenses.known([defense])
     with blaming("--messages", replay.ReplayError):
@@ -163,14 +163,6 @@ def _read_receipts(file: Path, keys: list[str]) -> Receipts:
         known = by_id(keys)
     with blaming("--receipts", OSError), file.open("rb") as lines:
         return Receipts.read(lines, known)
-
-
-def _load(wanted: str | None, logged: str) -> detectors.Detector:
-    """The detector that the user wants, or one that ships: what a log names may be anything."""
-    if wanted is None and split_precision(logged)[0] not in detectors.available():
-        raise typer.BadParameter(f"the log's detector, {logged!r}, does not ship; give it", param_hint="--detector")
-    with blaming("--detector", ValueError, OSError):
-        return detectors.load(wanted or logged)
 
 
 def _say(what: object, *, err: bool = False) -> None:

@@ -2,7 +2,8 @@
 
 from __future__ import annotations
 
-from collections.abc import Sequence
+from collections.abc import Mapping, Sequence
+from dataclasses import replace
 from pathlib import Path
 from typing import Annotated
 
@@ -15,14 +16,25 @@ from robosac.attacks import ATTACKS
 from robosac.calibration import Recipe, ReliabilityBin, TooFewVerdicts, calibrate
 from robosac.calibration.making import load_attacks
 from robosac.calibration.messages import add, held, measure
+from robosac.calibration.reliability import Reliability, add_worlds, check_in
 from robosac.cli.blame import blaming, failing
-from robosac.cli.options import DataName, DetectorName, Seed, command, load_data, load_detector, progress
+from robosac.cli.options import (
+    WORLD_HELP,
+    DataName,
+    DetectorName,
+    Seed,
+    command,
+    load_data,
+    load_detector,
+    load_worlds,
+    progress,
+)
 from robosac.cli.outputs import Force, check_file
-from robosac.defenses.group_testing import CalibrationError
+from robosac.defenses.group_testing import Calibration, CalibrationError
 from robosac.detectors import DEFAULT_DETECTOR, Detector, Encoder
 from robosac.files import replacing
 from robosac.plugins import lacks
-from robosac.scenes import DEFAULT_DATA, Scene, SceneError, first_scenes
+from robosac.scenes import DEFAULT_DATA, Scene, SceneError, SceneSource, first_scenes
 
 _DEFAULTS = Recipe()
 
@@ -54,26 +66,40 @@ def run(  # the options of a command line
         bool,
         typer.Option("--messages-only", help="Measure only what honest messages hold, and put that into FILE."),
     ] = False,
+    world: Annotated[
+        list[str] | None, typer.Option(help=f"A world to check the suspicion in as well: {WORLD_HELP}")
+    ] = None,
+    worlds_only: Annotated[
+        bool, typer.Option("--worlds-only", help="Only check the calibration in FILE in every --world.")
+    ] = False,
     force: Force = False,
 ) -> None:
     """Observe what tests show when it is known who attacks, write the likelihoods, and check them.
 
     Options that may be repeated: --attack (by default pgd, erase, invent and shift), --attackers (1 and 2),
-    --pose-error (0, .2, .4).
+    --pose-error (0, .2, .4), --world (none).
     """
     torch.set_num_threads(1)
     console = Console()
-    if not messages_only:
+    if messages_only and worlds_only:
+        raise typer.BadParameter("give one of them, or neither", param_hint="--messages-only, --worlds-only")
+    if worlds_only and not world:
+        raise typer.BadParameter("say which", param_hint="--world")
+    if not (messages_only or worlds_only):
         check_file(out, "--out", force)
-    chosen, source = load_detector(detector), load_data(data)
+    chosen, source, worlds = load_detector(detector), load_data(data), load_worlds(world or ())
     if missing := lacks(chosen, Encoder if messages_only else Detector):
         why = f"{chosen.info.name} cannot be calibrated: it {missing}"
         raise typer.BadParameter(why, param_hint="--detector")
+    if messages_only or worlds_only:
+        with blaming("--out", CalibrationError):
+            held(out, chosen.info.weights_digest)
+    if worlds_only:
+        _check_worlds(chosen, worlds, check_scenes, out, command(context), console)
+        return
     with blaming("--data", SceneError):
         honest = first_scenes(source, "validation", scenes)
     if messages_only:
-        with blaming("--out", CalibrationError):
-            held(out, chosen.info.weights_digest)
         with failing(OSError, ValueError):
             _measure_messages(chosen, honest, out, command(context), console)
         return
@@ -97,6 +123,7 @@ def run(  # the options of a command line
             calibration, reliability = calibrate(chosen, recipe, command(context), lambda: bar.advance(task))
         calibration.write(beside)
         _measure_messages(chosen, honest, beside, command(context), console)
+        _check_worlds(chosen, worlds, check_scenes, beside, command(context), console)
     for error_m, bins in reliability.items():
         _print(console, error_m, bins)
     console.print(f"{out}: {calibration.detector}, weights {calibration.weights_digest:.12}...")
@@ -115,6 +142,29 @@ def _measure_messages(detector: Encoder, scenes: Sequence[Scene], out: Path, mad
             f"{name}: at most {bounds.largest:g}, root mean square {bounds.rms:g}; "
             f"successive maps of one that stands still are alike up to {bounds.still:g}"
         )
+
+
+def _check_worlds(
+    detector: Detector, worlds: Mapping[str, SceneSource], scenes: int, path: Path, made_by: str, console: Console
+) -> None:
+    """Check the calibration in a file in each world, and add what that shows to it."""
+    if not worlds:
+        return
+    calibration = replace(Calibration.read(path), witnessed=detector.info.witness is not None)
+    found: dict[str, Reliability] = {}
+    with failing(OSError), blaming("--world", SceneError, ValueError), progress(console) as bar:
+        task = bar.add_task("worlds", total=len(worlds))
+        for name, source in worlds.items():
+            found[name] = check_in(detector, calibration, source, scenes)
+            bar.advance(task)
+    add_worlds(path, detector.info.weights_digest, found, made_by)
+    table = Table(title=f"Suspicion after two frames, {scenes} scenes of each world", title_justify="left")
+    for heading in ("world", "honest", "suspected", "attackers", "suspected", "calibration error"):
+        table.add_column(heading, justify="left" if heading == "world" else "right")
+    for name, each in found.items():
+        counts = (each.honest, each.honest_suspected, each.attackers, each.attackers_suspected)
+        table.add_row(name, *map(str, counts), f"{each.error:.3f}")
+    console.print(table)
 
 
 def _print(console: Console, pose_error_m: float, bins: list[ReliabilityBin]) -> None:

@@ -20,6 +20,7 @@ from robosac.extras import MissingExtra
 
 OWN = {
     "scene": "robosac.cli.scene:run",
+    "show": "robosac.cli.show:app",
     "train": "robosac.cli.train:run",
     "evaluate": "robosac.cli.evaluate:run",
     "benign-scores": "robosac.cli.benign_scores:run",

@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import re
 import time
 from collections.abc import Mapping, Sequence
 from dataclasses import replace
@@ -16,7 +15,17 @@ from rich.console import Console
 from robosac import defenses
 from robosac.attacks import lacking, load_campaign
 from robosac.cli.blame import blaming, check_known
-from robosac.cli.options import DataName, DetectorName, Seed, command, load_data, load_detector, progress
+from robosac.cli.options import (
+    WORLD_HELP,
+    DataName,
+    DetectorName,
+    Seed,
+    command,
+    load_data,
+    load_detector,
+    load_worlds,
+    progress,
+)
 from robosac.cli.outputs import Force, make_folder
 from robosac.defenses import Defense
 from robosac.detectors import DEFAULT_DETECTOR, Detector
@@ -37,7 +46,7 @@ from robosac.evaluation.comparison.report import REPORT
 from robosac.evaluation.comparison.rows import EARLY
 from robosac.evaluation.comparison.worlds import WORLDS_REPORT
 from robosac.figures import need_figures
-from robosac.scenes import DEFAULT_DATA, SOURCES, WORLDS, SceneError, SceneSource, World
+from robosac.scenes import DEFAULT_DATA, SceneError
 
 
 def run(  # the options of a command line
@@ -73,13 +82,7 @@ def run(  # the options of a command line
     seed: Seed = 0,
     detector: DetectorName = DEFAULT_DETECTOR,
     data: DataName = DEFAULT_DATA,
-    world: Annotated[
-        list[str] | None,
-        typer.Option(
-            help=f"A world to play all of this in: one of {', '.join(WORLDS)}, all of them (all), or a scene source of "
-            "one's own, module:callable; may be repeated.",
-        ),
-    ] = None,
+    world: Annotated[list[str] | None, typer.Option(help=f"A world to play all of this in: {WORLD_HELP}")] = None,
     force: Force = False,
 ) -> None:
     """Play every defence against every attack on the same test sequences, and write tables and pictures."""
@@ -91,7 +94,7 @@ def run(  # the options of a command line
     console = Console()
     if world and data != DEFAULT_DATA:
         raise typer.BadParameter("--world says where scenes come from; --data does, too", param_hint="--world")
-    chosen, sources = load_detector(detector), _worlds(world) if world else {"": load_data(data)}
+    chosen, sources = load_detector(detector), load_worlds(world) if world else {"": load_data(data)}
     reports = [str(Path(name, REPORT)) for name in sources] + ([WORLDS_REPORT] if world else [])
     make_folder(out, "--out", force, *reports)
     if recordings is not None:
@@ -110,18 +113,6 @@ def run(  # the options of a command line
     path = _write(dict(zip(plans, found, strict=True)), plans, out, command(context))
     rows = sum(len(each) for each in found)
     console.print(f"{path}: {rows} rows in {(time.monotonic() - started) / 60:.1f} minutes")
-
-
-def _worlds(names: Sequence[str]) -> dict[str, SceneSource]:
-    """The sources of the worlds that are asked for, by the names of their folders."""
-    asked = dict.fromkeys(each for name in names for each in (WORLDS if name == "all" else [name]))
-    folders = {re.sub(r"[^\w.-]", "-", name): name for name in asked}
-    with blaming("--world", ValueError):
-        if len(folders) < len(asked):
-            raise ValueError("two of them would have the same folder")
-        return {
-            folder: SOURCES.make(name if ":" in name else f"{World.kind}:{name}") for folder, name in folders.items()
-        }
 
 
 def _write(rows: Mapping[str, Sequence[Row]], plans: Mapping[str, Plan], out: Path, line: str) -> Path:

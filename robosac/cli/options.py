@@ -2,7 +2,9 @@
 
 from __future__ import annotations
 
+import re
 import shlex
+from collections.abc import Sequence
 from typing import Annotated, Any
 
 import typer
@@ -21,12 +23,16 @@ from robosac import detectors
 from robosac.attacks import Attack, Campaign, lacking
 from robosac.cli.blame import blaming
 from robosac.detectors import Detector
-from robosac.scenes import DATA_HELP, SOURCES, SceneSource
+from robosac.scenes import DATA_HELP, SOURCES, WORLDS, SceneSource, World
 
 DetectorName = Annotated[
     str, typer.Option("--detector", "--weights", help="A detector's name, its weights file, or module:callable.")
 ]
 DataName = Annotated[str, typer.Option("--data", help=DATA_HELP)]
+WORLD_HELP = (
+    f"one of {', '.join(WORLDS)}, all of them (all), or a scene source of one's own, module:callable; may be repeated."
+)
+"""What ``--world`` takes."""
 Seed = Annotated[int, typer.Option(min=0, help="Of everything random.")]
 
 
@@ -40,6 +46,18 @@ def load_data(name: str) -> SceneSource:
     """The scene source of ``--data``."""
     with blaming("--data", ValueError):
         return SOURCES.make(name)
+
+
+def load_worlds(names: Sequence[str]) -> dict[str, SceneSource]:
+    """The sources of the worlds that are asked for by ``--world``, by names that a folder may have."""
+    asked = dict.fromkeys(each for name in names for each in (WORLDS if name == "all" else [name]))
+    folders = {re.sub(r"[^\w.-]", "-", name): name for name in asked}
+    with blaming("--world", ValueError):
+        if len(folders) < len(asked):
+            raise ValueError("two of them would have the same folder")
+        return {
+            folder: SOURCES.make(name if ":" in name else f"{World.kind}:{name}") for folder, name in folders.items()
+        }
 
 
 def check_attack(attack: Attack | Campaign, detector: Detector) -> None:

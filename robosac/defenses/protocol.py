@@ -11,7 +11,7 @@ Most of it only the defence reads. Others read whom it trusts, names and suspect
 
 from __future__ import annotations
 
-from collections.abc import Collection, Generator, Mapping, Sequence
+from collections.abc import Callable, Collection, Generator, Mapping, Sequence
 from dataclasses import dataclass, field
 from enum import StrEnum
 from typing import Any, Protocol, TypeVar
@@ -141,6 +141,20 @@ class JudgedBox:
     """Ids are of teammates, or `EGO`."""
 
 
+@dataclass(frozen=True, eq=False)
+class Difference:
+    """What one decoded fusion shows otherwise than another, box by box: what a defence counts as evidence."""
+
+    test: str
+    """As evidence on a teammate calls it."""
+    teammates: Hypothesis
+    """Whose fusion shows it."""
+    beside: Hypothesis
+    """Whose fusion it is compared with: empty for the ego alone, the same for itself in the frame before."""
+    places: Callable[[], Mapping[str, FloatArray]]
+    """Gives by what happened there, such as ``lost``, the places (n, 2): ego frame, metres. Only pictures call it."""
+
+
 @dataclass(frozen=True)
 class Decision:
     """What a defence concludes about a frame."""
@@ -164,6 +178,10 @@ class Decision:
     """
     contradicted: tuple[JudgedBox, ...] = ()
     """Boxes that are left out of ``objects`` and told apart from them."""
+    differences: tuple[Difference, ...] = field(default=(), compare=False, repr=False)
+    """What was found by comparing fusions, from a defence that compares them box by box. For whoever looks on: it is
+    neither answered nor kept.
+    """
 
     @property
     def trusted(self) -> tuple[str, ...]:

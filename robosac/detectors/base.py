@@ -157,6 +157,14 @@ class GeometricSurface(AttackSurface, Protocol):
         """
 
 
+@runtime_checkable
+class Growing(Protocol):
+    """A prepared frame to which teammates may be added, or added again with another message."""
+
+    def add(self, teammates: Mapping[str, Message]) -> None:
+        """Do for these teammates what `Preparer.prepare` does, with the same result."""
+
+
 class Preparer(Protocol):
     """What fusion needs of a detector."""
 

@@ -8,7 +8,6 @@ from __future__ import annotations
 
 from abc import ABC, abstractmethod
 from collections.abc import Callable, Collection, Mapping, Sequence
-from dataclasses import dataclass
 from typing import ClassVar
 
 import numpy as np
@@ -68,10 +67,13 @@ class MapFusionDetector(ABC):
 
     def prepare(self, ego: Message, teammates: Mapping[str, Message]) -> PreparedMaps:
         """Warp every teammate's map into the ego's frame, once."""
-        with torch.inference_mode():
-            maps = self.unscaled(_sent([ego, *teammates.values()]))
-            warped = warp(maps[1:], self.matrices(ego, teammates.values())) if teammates else ()
-            return PreparedMaps(self.finder(ego, maps[0]), maps[0], dict(zip(teammates, warped, strict=True)))
+        prepared = PreparedMaps(self, ego)
+        prepared.add(teammates)
+        return prepared
+
+    def laid(self, ego: Message, teammates: Collection[Message]) -> torch.Tensor:
+        """Maps (n, C, H, W) of teammates as they lie in the ego's frame."""
+        return warp(self.unscaled(_sent(list(teammates))), self.matrices(ego, teammates))
 
     def attack_surface(self, ego: Message, teammates: Mapping[str, Message]) -> MapSurface:
         """Show a frame to an attacker."""
@@ -91,18 +93,28 @@ def _sent(messages: Sequence[Message]) -> torch.Tensor:
     return torch.from_numpy(np.stack([message.tensors[FEATURES] for message in messages])).float().contiguous()
 
 
-@dataclass(frozen=True)
 class PreparedMaps:
-    """A frame to be decoded for many subsets; see `robosac.detectors.base.PreparedFrame`."""
+    """A frame to be decoded for many subsets; see `robosac.detectors.base.PreparedFrame`, and `Growing` there."""
 
-    find: Finder
-    own: torch.Tensor
-    warped: Mapping[str, torch.Tensor]
+    def __init__(self, detector: MapFusionDetector, ego: Message) -> None:
+        self._detector = detector
+        self._ego = ego
+        with torch.inference_mode():
+            self.own = detector.unscaled(_sent([ego]))[0]
+            self._find = detector.finder(ego, self.own)
+        self.warped: dict[str, torch.Tensor] = {}
+
+    def add(self, teammates: Mapping[str, Message]) -> None:
+        """Warp the maps of these teammates."""
+        if teammates:
+            with torch.inference_mode():
+                warped = self._detector.laid(self._ego, teammates.values())
+            self.warped.update(zip(teammates, warped, strict=True))
 
     def detect(self, teammates: Collection[str] = ()) -> FloatArray:
         """Boxes (n, 6) of the ego fused with these teammates; with none, of the ego alone."""
         with torch.inference_mode():
-            return self.find([self.own, *(self.warped[name] for name in teammates)])
+            return self._find([self.own, *(self.warped[name] for name in teammates)])
 
 
 class MapSurface:

@@ -7,7 +7,7 @@ depends on that message only, so no other agent can change it. `robosac.calibrat
 from __future__ import annotations
 
 import math
-from collections.abc import Callable, Collection, Sequence
+from collections.abc import Callable, Collection, Mapping, Sequence
 from dataclasses import dataclass, replace
 from pathlib import Path
 from typing import Any
@@ -20,6 +20,7 @@ from robosac.boxes import FloatArray
 from robosac.detectors.base import DetectorInfo, Message
 from robosac.detectors.warp import warp
 from robosac.detectors.weights_file import WeightsError, read_weights, save_weights
+from robosac.steps import Steps, finished
 from robosac.testimony import LAYERS, LIKELIHOOD, Testimony, planar
 
 Float16Array = np.ndarray[Any, np.dtype[np.float16]]
@@ -167,19 +168,43 @@ class Witness:
             Whether there is time to read the messages of some agents (`Deadline.reading`). Once there is not, the
             others say nothing (``Testimony.unread``).
         """
-        names = list(messages)
+        return finished(self.testify_in_steps(ego, messages, first, fits))
+
+    def testify_in_steps(
+        self,
+        ego: str,
+        messages: dict[str, Message],
+        first: Collection[str] = (),
+        fits: Callable[[Collection[str]], bool] = lambda _: True,
+        known: Mapping[str, Float16Array] | None = None,
+    ) -> Steps[Testimony]:
+        """As `testify`, with a pause before each group but the first. Messages of which it is ``known`` what they say
+        are not read.
+        """
+        names, known = list(messages), known or {}
         order = sorted(range(len(names)), key=lambda i: (names[i] != ego, names[i] not in first))
         size = self.layout.height * self.layout.upsampling, self.layout.width * self.layout.upsampling
         maps, count = np.zeros((len(names), LAYERS, *size), dtype=np.float16), 0
         while count < len(names):
             group = sorted(order[count : count + AT_ONCE])
-            if not fits([names[i] for i in group]):
-                break
-            maps[group] = self._read([messages[names[i]] for i in group])
+            if unknown := [i for i in group if names[i] not in known]:
+                if count:
+                    yield
+                if not fits([names[i] for i in group]):
+                    break
+                maps[unknown] = self._read([messages[names[i]] for i in unknown])
+            for i in group:
+                if names[i] in known:
+                    maps[i] = known[names[i]]
             count += len(group)
         from_ego = planar(messages[ego].pose, [message.pose for message in messages.values()])
         said = as_testimony(tuple(names), maps, from_ego, self.layout.half_extent_m)
         return replace(said, unread=tuple(names[i] for i in sorted(order[count:])))
+
+    def read_message(self, message: Message) -> Float16Array:
+        """What a message says by itself: (LAYERS, H, W), as `Testimony` has it."""
+        maps: Float16Array = self._read([message])[0]
+        return maps
 
     def _read(self, messages: Sequence[Message]) -> Float16Array:
         """What some messages say: (n, LAYERS, H, W)."""

@@ -133,7 +133,7 @@ class _Table:
             self._ap[f"{self._s} benign"].add(benign.detect(subset), frame.truth)
         self._ap["all benign"].add(benign.detect(team), frame.truth)
         self._ap["ego only"].add(benign.detect(), frame.truth)
-        self._ap["no defence"].add(received.detect(team), frame.truth)
+        self._ap["no defence"].add(received.detect(frame.team), frame.truth)
         refused, missed = received.judged(self._s)
         self._refused += refused
         self._missed += missed

@@ -19,7 +19,7 @@ from robosac.defenses import EGO, Defense
 from robosac.detectors import Detector, DetectorInfo, Message, PreparedFrame
 from robosac.detectors.base import for_role
 from robosac.fusion import FusionResult, fuse
-from robosac.scenes import Frame, Scene, SceneError, SceneSource, Split, seconds_apart
+from robosac.scenes import Frame, Scene, SceneError, SceneSource, Split, encoded, seconds_apart
 from robosac.testimony import Testimony
 
 Subset = frozenset[str]
@@ -34,7 +34,7 @@ class EvaluationFrame:
     detector: Detector
     ego: Message
     benign: Mapping[str, Message]
-    """By teammate: what honest teammates would send."""
+    """By teammate: what honest teammates would send, of those of whom that is known."""
     teammates: Mapping[str, Message]
     """By teammate: what is received; the attackers' messages stand in the place of their benign ones."""
     attackers: frozenset[str]
@@ -136,7 +136,7 @@ class DecodedOnce(EvaluationFrame):
 
 def encode_all(detector: Detector, frame: Frame) -> dict[str, Message]:
     """Every agent's message, with all that it would send as an ego."""
-    return {name: detector.encode(view.points, view.pose) for name, view in frame.views.items()}
+    return {name: encoded(view, detector) for name, view in frame.views.items()}
 
 
 def misplaced(message: Message, pose_error_m: float, rng: np.random.Generator) -> Message:
@@ -167,6 +167,8 @@ class Sensed:
     """(V, 5): all other vehicles around the ego as far as the scene tells, what an adversary can know; ego frame. None
     if that is `truth`.
     """
+    hostile: frozenset[str] = frozenset()
+    """Agents of whom it is known that their messages are attacks already, as in a recording."""
 
     @classmethod
     def of(cls, detector: Detector, frame: Frame, ego_id: str, pose_error_m: float, rng: np.random.Generator) -> Sensed:
@@ -181,7 +183,8 @@ class Sensed:
             raise SceneError(f"frame {frame.index}: {ego_id} is to be the ego, and is not there")
         messages = encode_all(detector, frame)
         placed = {n: m if n == ego_id else misplaced(m, pose_error_m, rng) for n, m in messages.items()}
-        return cls(frame.index, ego_id, placed, frame.truth(ego_id), vehicles_around(frame, ego_id))
+        vehicles = vehicles_around(frame, ego_id)
+        return cls(frame.index, ego_id, placed, frame.truth(ego_id), vehicles, hostile_in(frame))
 
 
 def vehicles_around(frame: Frame, ego_id: str) -> FloatArray:
@@ -190,6 +193,11 @@ def vehicles_around(frame: Frame, ego_id: str) -> FloatArray:
     """
     nearby = getattr(frame, "nearby", None)
     return frame.truth(ego_id) if nearby is None else np.asarray(nearby(ego_id)[0])
+
+
+def hostile_in(frame: Frame) -> frozenset[str]:
+    """Agents whose messages are attacks before anybody attacks: those that a frame names ``attackers``, or nobody."""
+    return frozenset(getattr(frame, "attackers", ()))
 
 
 def foreign_views(detector: Detector, scene: Scene | None) -> Foreign | None:
@@ -206,7 +214,7 @@ def foreign_views(detector: Detector, scene: Scene | None) -> Foreign | None:
         view = views.get(name) or views.get(max(views, default=""))
         if view is None:
             return None
-        return for_role(detector.encode(view.points, view.pose), detector.info, "teammate")
+        return for_role(encoded(view, detector), detector.info, "teammate")
 
     return message
 
@@ -230,7 +238,8 @@ def under_attack(
 ) -> EvaluationFrame:
     """One frame with some teammates under the adversary's control, who optimises their messages together.
 
-    Those who are not in the frame send nothing.
+    Those who are not in the frame send nothing. Whoever is hostile without that counts as an attacker, too; what
+    it would send as an honest vehicle is not known.
 
     Parameters
     ----------
@@ -248,8 +257,10 @@ def under_attack(
     situation = past.situation(sensed.index, ego, benign, known)
     sent = Campaign.of(attack).messages(detector, ego, benign, present, sensed.index, rng, situation)
     past.keep(sensed.index, benign)
-    lies = tuple(situation.lies)
-    return EvaluationFrame(detector, ego, benign, {**benign, **sent}, frozenset(sent), sensed.truth, lies=lies)
+    received, lies = {**benign, **sent}, tuple(situation.lies)
+    hostile = frozenset(sent) | (sensed.hostile & benign.keys())
+    honest = {name: message for name, message in benign.items() if name not in sensed.hostile}
+    return EvaluationFrame(detector, ego, honest, received, hostile, sensed.truth, lies=lies)
 
 
 def evaluation_frames(  # who senses where, and what is drawn: callers vary all of it

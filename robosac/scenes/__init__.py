@@ -8,7 +8,9 @@ from robosac.scenes.base import (
     SceneSource,
     Split,
     View,
+    encoded,
     first_scenes,
+    one_scene,
     seconds_apart,
     whose_turn,
 )
@@ -17,14 +19,14 @@ from robosac.scenes.lidar import Lidar
 from robosac.scenes.worlds import WORLDS, World
 
 DEFAULT_DATA = "synthetic"
-DATA_HELP = "Where scenes come from: synthetic, world:NAME, v2x-sim:DIR, or module:callable."
+DATA_HELP = "Where scenes come from: synthetic, world:NAME, v2x-sim:DIR, recording:FILE, or module:callable."
 SOURCES: Kind[SceneSource] = Kind(
     noun="scene source",
     package="robosac.scenes",
     contract=SceneSource,
     name_of=lambda candidate: vars(candidate).get("kind", ""),
     takes_argument=True,
-    forms="world:NAME, v2x-sim:DIR, or module:callable",
+    forms="world:NAME, v2x-sim:DIR, recording:FILE, or module:callable",
     error=SceneError,
 )
 """All sources by name; `Kind.make` makes one."""
@@ -46,7 +48,9 @@ __all__ = [
     "View",
     "WORLDS",
     "World",
+    "encoded",
     "first_scenes",
+    "one_scene",
     "seconds_apart",
     "whose_turn",
 ]

@@ -8,10 +8,11 @@ user's own.
 from __future__ import annotations
 
 from collections.abc import Iterator, Mapping, Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, field
 from typing import Literal, Protocol, runtime_checkable
 
 from robosac.boxes import FloatArray
+from robosac.detectors import Encoder, Message, TensorSpec
 
 Split = Literal["test", "validation"]
 """What scenes serve: defences are calibrated on validation scenes and measured on test scenes."""
@@ -30,6 +31,8 @@ class View:
     """
     points: FloatArray
     """(P, 3): LiDAR returns in the sensor's frame, metres."""
+    message: Message | None = field(default=None, kw_only=True)
+    """What the agent sent, where that is known in the place of what it sensed; then it is not encoded again."""
 
 
 class Frame(Protocol):
@@ -86,6 +89,24 @@ class SceneSource(Protocol):
         """The scenes for a purpose, always in the same order. No frame is made before it is asked for."""
 
 
+def encoded(view: View, detector: Encoder) -> Message:
+    """An agent's message, with all that it would send as an ego: encoded, or as it was recorded.
+
+    Raises
+    ------
+    SceneError
+        If it was recorded for a detector of another layout.
+    """
+    message: Message | None = getattr(view, "message", None)
+    if message is None:
+        return detector.encode(view.points, view.pose)
+    held = {name: TensorSpec(array.dtype.name, array.shape) for name, array in message.tensors.items()}
+    if not any(wanted.items() <= held.items() for wanted in detector.info.tensors.values()):
+        shown = ", ".join(f"{name} of {spec.dtype} {list(spec.shape)}" for name, spec in held.items())
+        raise SceneError(f"the recorded messages hold {shown}: they are none for the detector {detector.info.name}")
+    return Message(view.pose, message.tensors)
+
+
 def first_scenes(source: SceneSource, split: Split, count: int, frames: int = 1, team: int = 1) -> list[Scene]:
     """The first scenes of a source that are long enough.
 
@@ -109,14 +130,33 @@ def first_scenes(source: SceneSource, split: Split, count: int, frames: int = 1,
     if len(scenes) < count:
         raise SceneError(f"{source.name} has {len(scenes)} {split} scenes; {count} are wanted")
     for scene in scenes:
-        where = f"{source.name}, scene {scene.number}"
-        if not scene.egos:
-            raise SceneError(f"{where}: no agent may be the ego")
-        if scene.length is not None and scene.length < frames:
-            raise SceneError(f"{where} has {scene.length} frames; {frames} are wanted")
-        if len(scene.agents) - 1 < team:
-            raise SceneError(f"{where} has {len(scene.agents) - 1} teammates; {team} are wanted")
+        _check(source, scene, frames, team)
     return list(scenes)
+
+
+def one_scene(source: SceneSource, split: Split, place: int, frames: int = 1, team: int = 1) -> Scene:
+    """The scene at a place, counted from 0; ``frames`` and ``team`` as for `first_scenes`.
+
+    Raises
+    ------
+    SceneError
+        If there is none, or it is too short or has a smaller team.
+    """
+    scenes = source.scenes(split)
+    if place >= len(scenes):
+        raise SceneError(f"{source.name} has {len(scenes)} {split} scenes; that number {place}, from 0 on, is wanted")
+    _check(source, scenes[place], frames, team)
+    return scenes[place]
+
+
+def _check(source: SceneSource, scene: Scene, frames: int, team: int) -> None:
+    where = f"{source.name}, scene {scene.number}"
+    if not scene.egos:
+        raise SceneError(f"{where}: no agent may be the ego")
+    if scene.length is not None and scene.length < frames:
+        raise SceneError(f"{where} has {scene.length} frames; {frames} are wanted")
+    if len(scene.agents) - 1 < team:
+        raise SceneError(f"{where} has {len(scene.agents) - 1} teammates; {team} are wanted")
 
 
 def whose_turn(scene: Scene, turn: int, *frames: Frame) -> str:

@@ -21,6 +21,8 @@ JSON_BYTES = 256 * 1024
 """The largest JSON body: a team of 1024 with keys, or a defence's calibration, with room to spare."""
 SMALL_BYTES = 4 * 1024
 """What is parsed on the event loop: for less than it costs to change threads."""
+STREAMED = {"Cache-Control": "no-cache", "X-Accel-Buffering": "no"}
+"""On answers that go on: nginx would wait for more."""
 MSGPACK = "application/vnd.msgpack"
 MSGPACK_TYPES = (MSGPACK, "application/msgpack", "application/x-msgpack")
 

@@ -9,6 +9,7 @@ from robosac import wire
 from robosac.answers import Reason
 from robosac.defenses import Rejection
 from robosac.detectors import Role
+from robosac.recording.truth import read_truth
 from robosac.signatures import is_valid, read_public_key
 from service.errors import Kind, Refused, Unusable
 from service.sessions.gathering import Received
@@ -101,7 +102,8 @@ def check(caller: Caller, vehicle: str, frame: int, payload: Any, path: str) -> 
     role: Role = "ego" if vehicle == caller.record.ego_id else "teammate"
     message = wire.check_message(payload, caller.live.detector.info, role, path)
     signature = wire.read_signature(payload, path)
-    received = Received(message, wire.content_digest(frame, vehicle, message), signature)
+    truth = read_truth(payload, path) if role == "ego" else None
+    received = Received(message, wire.content_digest(frame, vehicle, message), signature, truth)
     key = caller.record.public_keys.get(vehicle)
     if key is not None:
         field_ = f"{path}.signature" if path else "signature"

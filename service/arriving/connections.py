@@ -1,4 +1,5 @@
-"""Connections that are bounded before a request is whole: uvicorn waits for a head for ever, and takes any size of it.
+"""Connections that are bounded before a request is whole: uvicorn waits for a head for ever, takes any size of it, and
+looks at all that came in one go, however small its pieces are, while everybody else waits.
 
 Nothing that takes long to import may be imported here: a server needs this before the application.
 """
@@ -11,6 +12,15 @@ from uvicorn.protocols.http.httptools_impl import HttpToolsProtocol
 
 HEAD_BYTES = 64 * 1024
 """What of a head is taken before it is whole; `service.arriving.doors` judges it then."""
+HEADERS = 256
+PIPELINED = 32
+"""Requests that are taken on a connection beside the one that is being answered."""
+PIECES, PIECE_BYTES = 1024, 64
+"""From so many pieces on, those of a body have so many bytes on average."""
+
+
+class _TooMuch(Exception):
+    """What is not taken: a status, and why."""
 
 
 class BoundedHTTP(HttpToolsProtocol):
@@ -28,6 +38,9 @@ class BoundedHTTP(HttpToolsProtocol):
     _in_head = False
     _head_ended = False
     _head_bytes = 0
+    _pieces = 0
+    _body_bytes = 0
+    _refused: _TooMuch | None = None
 
     def connection_made(self, transport: Transport) -> None:  # type: ignore[override]
         super().connection_made(transport)
@@ -50,9 +63,30 @@ class BoundedHTTP(HttpToolsProtocol):
         self._in_head = True
         super().on_message_begin()
 
+    def on_header(self, name: bytes, value: bytes) -> None:
+        super().on_header(name, value)
+        if len(self.headers) > HEADERS:
+            self._refuse("431 Request Header Fields Too Large", f"A head may have {HEADERS} headers.")
+
     def on_headers_complete(self) -> None:
         self._in_head, self._head_ended, self._head_bytes = False, True, 0
+        self._pieces = self._body_bytes = 0
         super().on_headers_complete()
+        if len(self.pipeline) > PIPELINED:
+            self._refuse("429 Too Many Requests", f"At most {PIPELINED} requests may wait on a connection.")
+
+    def on_body(self, body: bytes) -> None:
+        self._pieces += 1
+        self._body_bytes += len(body)
+        if self._pieces > PIECES and self._body_bytes < self._pieces * PIECE_BYTES:
+            self._refuse("400 Bad Request", f"The pieces of a body must have {PIECE_BYTES} bytes on average.")
+        super().on_body(body)
+
+    def send_400_response(self, msg: str) -> None:
+        if self._refused is None:
+            super().send_400_response(msg)
+        else:
+            self._hang_up(*self._refused.args)
 
     def connection_lost(self, exc: Exception | None) -> None:
         self._disarm()
@@ -71,11 +105,19 @@ class BoundedHTTP(HttpToolsProtocol):
             self._deadline.cancel()
             self._deadline = None
 
+    def _refuse(self, status: str, why: str) -> None:
+        """Let the parser stop; it then has a 400 sent."""
+        self._refused = _TooMuch(status, why)
+        raise self._refused
+
     def _hang_up(self, status: str, why: str) -> None:
         self._disarm()
         if self.transport.is_closing():
             return
-        if self._in_head and not self._answering():
+        in_body = self._answering() and not self._in_head and not self.pipeline and not self.cycle.response_started
+        if in_body:
+            self.cycle.disconnected = True  # what it would answer comes too late
+        if in_body or (self._in_head and not self._answering()):
             head = f"HTTP/1.1 {status}\r\ncontent-type: text/plain\r\ncontent-length: {len(why)}\r\nconnection: close"
             self.transport.write(f"{head}\r\n\r\n{why}".encode())
         self.transport.close()

@@ -99,13 +99,24 @@ class Frames:
                 await self._check_ego_on_record(asked)
                 if gather:
                     began, until = time.perf_counter(), asked.arrived + caller.record.gather_ms / 1e3
-                    asked.messages = await caller.live.gathering.collect(asked.frame, until)
+                    await self.sessions.moving.hold(caller, until)
+                    asked.messages = await self._gathered(asked, until)
                     asked.spent("gather", began)
                 with self.admission.frame(caller.live.key, session_id, asked.due - time.perf_counter()):
                     return await self.deciding.answer(asked)
         except (StoreUnavailable, StoreTooSlow):
             if time.perf_counter() > asked.due:
                 self.metrics.late()
+            raise
+
+    async def _gathered(self, asked: Asked, until: float) -> dict[str, Received]:
+        """Messages of teammates; what can be worked out before the last of them is, while they are waited for."""
+        live = asked.caller.live
+        asked.begun = begun = self.deciding.engine.begin(live.session, asked.ego.message)
+        try:
+            return await live.gathering.collect(asked.frame, until, begun.add)
+        except BaseException:
+            begun.end()
             raise
 
     async def _check_ego_on_record(self, asked: Asked) -> None:
@@ -141,6 +152,7 @@ class Frames:
 
     async def _keep(self, caller: Caller, frame: int, received: Received) -> SessionRecord:
         record = await self.sessions.current(caller)
+        self.sessions.moving.check_open()
         try:
             closed = caller.live.gathering.closed
             self._check_jump(frame, None if closed < 0 else closed)
@@ -151,6 +163,7 @@ class Frames:
         except Unusable as refused:
             await self.sessions.journal.refusal(caller, refused.reason, refused.detail, frame, "frame")
             raise
+        self.sessions.moving.message_waits(caller)
         return record
 
 

@@ -5,7 +5,7 @@ from __future__ import annotations
 import math
 import time
 from collections import Counter, OrderedDict, deque
-from collections.abc import Iterable, Iterator
+from collections.abc import Callable, Iterable, Iterator
 from contextlib import contextmanager
 from itertools import chain
 
@@ -43,13 +43,24 @@ class Admission:
 
     The detector's thread is shared fairly between API keys, and between the sessions of a key (`service.engine`). So
     until a frame is done, every other session of its key is given at most as much time as its own, and every other key
-    at most as much as its own. Of what the others want no more than that counts. A frame is admitted if all this is
-    expected to fit into `SHARE` of the time that it can spare: what it has left, less its own time on the thread, less
-    the rest that a frame takes, such as storing it. A frame that waits for its teammates is not in hand.
+    at most as much as its own; less where they had more than it until now, and more where they had less. Of what the
+    others want no more than that counts. A frame is admitted if all this is expected to fit into `SHARE` of the time
+    that it can spare: what it has left, less its own time on the thread, less the rest that a frame takes, such as
+    storing it. One that nobody holds up is admitted. A frame that waits for its teammates is not in hand.
+
+    Parameters
+    ----------
+    max_hypotheses : int
+        Of one frame.
+    lead : callable
+        As `service.turns.Turns.lead`.
     """
 
-    def __init__(self, max_hypotheses: int = 1000) -> None:
+    def __init__(
+        self, max_hypotheses: int = 1000, lead: Callable[[str, str, str, str], float] = lambda *_: 0.0
+    ) -> None:
         self._max_hypotheses = max_hypotheses
+        self._lead = lead
         self._in_hand: dict[str, dict[str, list[float]]] = {}
         """When the frames are due (`time.perf_counter`), by key and session."""
         self._waiting: Counter[str] = Counter()
@@ -136,7 +147,7 @@ class Admission:
 
     def _check_time(self, key: str, session_id: str, left_s: float) -> None:
         own_s, others_s = self._cost(session_id), self._others(key, session_id, time.perf_counter() + left_s)
-        if self._in_hand and others_s > SHARE * (left_s - own_s - self._rest.value):
+        if others_s > max(0.0, SHARE * (left_s - own_s - self._rest.value)):
             raise _overloaded("the gateway has more frames in hand than it can answer in time", others_s)
 
     def _others(self, key: str, session_id: str, due: float) -> float:
@@ -145,17 +156,26 @@ class Admission:
         Those that are due later go first only once this one has had `SLACK_S` more than they.
         """
 
-        def before(wanted_s: float, dues: Iterable[float], own_s: float) -> float:
-            return max(0.0, min(wanted_s, own_s) - (SLACK_S if min(dues) > due else 0.0))
+        def before(wanted_s: float, dues: Iterable[float], own_s: float, lead_s: float) -> float:
+            return max(0.0, min(wanted_s, own_s - lead_s) - (SLACK_S if min(dues) > due else 0.0))
 
         def wanted(session: str, dues: list[float]) -> float:
             return len(dues) * self._cost(session)
 
         cost_s, siblings = self._cost(session_id), self._in_hand.get(key, {})
         own_s = cost_s + wanted(session_id, siblings.get(session_id, []))
-        of_key_s = own_s + sum(before(wanted(s, d), d, own_s) for s, d in siblings.items() if s != session_id)
+        of_key_s = own_s + sum(
+            before(wanted(other, dues), dues, own_s, self._lead(key, session_id, key, other))
+            for other, dues in siblings.items()
+            if other != session_id
+        )
         other_keys_s = sum(
-            before(sum(wanted(s, d) for s, d in sessions.items()), chain(*sessions.values()), of_key_s)
+            before(
+                sum(wanted(s, d) for s, d in sessions.items()),
+                chain(*sessions.values()),
+                of_key_s,
+                self._lead(key, session_id, other, ""),
+            )
             for other, sessions in self._in_hand.items()
             if other != key
         )

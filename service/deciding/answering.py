@@ -100,15 +100,16 @@ class Deciding:
         except BaseException:
             asked.caller.live.gathering.reopen(asked.frame)
             raise
-        result = decided.result
+        result, previous = decided.result, asked.caller.live.session.previous
         answer = result.answer(asked.frame, left_out, asked.timings, record.ego_id)
         began = time.perf_counter()
         kept = await self.keeping.keep(asked, record, present, result, answer)
         asked.spent("store", began)
         answer = answer.model_copy(update={"receipt": self.sessions.keys.receipt(kept)})
         rest_ms = asked.timings["receive"] + asked.timings["store"]
-        self.admission.learn(record.session_id, decided.worked_s, rest_ms / 1e3, asked.timings["store"] / 1e3)
-        return Answered(answer, asked, result)
+        worked_s = decided.worked_s + (0.0 if asked.begun is None else asked.begun.spent_s)  # next time all may be left
+        self.admission.learn(record.session_id, worked_s, rest_ms / 1e3, asked.timings["store"] / 1e3)
+        return Answered(answer, asked, result, record, previous, tuple(present))
 
     def _who_takes_part(self, asked: Asked, record: SessionRecord) -> tuple[dict[str, Received], dict[str, Rejection]]:
         """Messages of those who can be fused, and why the others of the team cannot; nothing more is taken for it."""
@@ -134,6 +135,9 @@ class Deciding:
         live = asked.caller.live
         messages = {name: received.message for name, received in present.items()}
         deadline = self.admission.deadline(asked.due, record.latency_budget_ms / 1e3)
+        if asked.begun is not None:
+            asked.begun.end()
+            asked.timings["ahead"] = asked.begun.spent_s * 1e3
         decided = await self.engine.decide(
             live.session,
             asked.frame,
@@ -144,6 +148,7 @@ class Deciding:
             key=live.key,
             session_id=record.session_id,
             due=asked.due,
+            ahead=None if asked.begun is None else asked.begun.ahead,
         )
         asked.timings["queue"] = decided.waited_s * 1e3
         asked.timings.update(decided.result.timings_ms)

@@ -9,6 +9,9 @@ from dataclasses import dataclass, field
 from robosac.answers import FrameAnswer
 from robosac.defenses import Rejection
 from robosac.fusion import FusionResult
+from robosac.previous import PreviousAnswer
+from service.engine import Begun
+from service.keeping.record import SessionRecord
 from service.sessions.gathering import Received
 from service.sessions.live import Caller
 
@@ -33,6 +36,8 @@ class Asked:
     """Why a part of the body is not among the messages."""
     absences: dict[str, Rejection] = field(default_factory=dict)
     """Why a teammate sent nothing; noted for another attempt."""
+    begun: Begun | None = None
+    """What is worked out while teammates are waited for."""
     timings: dict[str, float] = field(default_factory=dict)
     """Milliseconds."""
 
@@ -55,6 +60,12 @@ class Answered:
     asked: Asked
     result: FusionResult
     """From which it was made."""
+    record: SessionRecord
+    """The session before the frame."""
+    previous: PreviousAnswer | None
+    """The answer before it, where that is known."""
+    fused: tuple[str, ...]
+    """Teammates whose messages took part."""
 
     @property
     def in_time(self) -> bool:

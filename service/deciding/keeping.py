@@ -122,6 +122,7 @@ class _Write:
             state=dict(self.result.state),
             unlogged_refusals=unlogged(self.counted),
             next_seed_commitment=commitment(next_seed),
+            gateway=self.keeping.sessions.moving.name,
         )
 
     def _remember(self) -> None:

@@ -10,6 +10,7 @@ from sqlalchemy import Connection, insert
 
 from robosac.audit import Unsealed, digest
 from service.errors import SessionChanged, SessionOver
+from service.keeping.partitions import day
 from service.keeping.record import SessionRecord
 from service.keeping.rows import CHANGE, GET_BUT_STATE, GET_TO_CHANGE, columns, read_row
 from service.keeping.tables import audit_lines
@@ -53,8 +54,13 @@ def append(  # a transaction's work, and what was made ready for it
     )
     changed = columns(after, *changes, "audit_seq", "audit_head", "revision", state=state)
     connection.execute(CHANGE.values(changed), {"this": session_id})
-    connection.execute(insert(audit_lines), {"session_id": session_id, "seq": after.audit_seq, "line": line})
+    connection.execute(insert(audit_lines), line_row(session_id, after.audit_seq, line))
     return after
+
+
+def line_row(session_id: str, seq: int, line: str) -> Mapping[str, Any]:
+    """A line of a log as it is kept."""
+    return {"session_id": session_id, "seq": seq, "line": line, "day": day()}
 
 
 def check_revision(now: SessionRecord, worked_out_from: SessionRecord) -> None:

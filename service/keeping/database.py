@@ -29,18 +29,19 @@ from sqlalchemy.pool import QueuePool
 from robosac.extras import need
 from robosac.faults import describe
 from service.errors import StoreUnavailable
+from service.keeping.limits import Limits
+from service.keeping.together import Piece, Work, do_each, prepare_each
 
 logger = logging.getLogger(__name__)
 
 T = TypeVar("T")
-Work = Callable[[Connection], T]
 
 BUSY_TIMEOUT_S = 5.0
 """How long SQLite waits for another process that writes, where the URL names no ``timeout``."""
 BUSY_PAUSE_S = 0.01
 """Between two attempts of what SQLite does not wait for by itself."""
 COMMAND_TIMEOUT_S = 10.0
-"""How long PostgreSQL may take for a statement."""
+"""How long an answer of PostgreSQL is waited for, at least; it gives a statement up itself before (`Limits`)."""
 CONNECT_TIMEOUT_S = 5.0
 READERS = 2
 WRITTEN_TOGETHER = 64
@@ -50,6 +51,10 @@ _DRIVERS = {
     "postgresql+asyncpg": "postgresql+asyncpg",
 }
 _creating = threading.Lock()
+
+
+def _nothing() -> None:
+    pass
 
 
 class Database(Protocol):
@@ -63,8 +68,12 @@ class Database(Protocol):
     async def read(self, work: Work[T]) -> T:
         """Run work that only reads."""
 
-    async def write(self, work: Work[T]) -> T:
-        """Run work; what it did is kept once this returns."""
+    async def write(self, work: Work[T], first: Callable[[], object] = _nothing) -> T:
+        """Run work; what it did is kept once this returns.
+
+        ``first`` is done on a thread before the transaction. What it raises, or a fault of the database, keeps the work
+        from being done.
+        """
 
     async def close(self) -> None:
         """Let go of files and connections."""
@@ -89,7 +98,7 @@ def read_url(text: str) -> URL:
     return url.set(drivername=_DRIVERS[url.drivername])
 
 
-def connect(text: str) -> Database:
+def connect(text: str, limits: Limits | None = None) -> Database:
     """The database of a URL; nothing is opened before the first transaction.
 
     Raises
@@ -100,24 +109,28 @@ def connect(text: str) -> Database:
         For PostgreSQL, if its driver is not installed.
     """
     url = read_url(text)
-    return Sqlite(url) if url.get_backend_name() == "sqlite" else Postgres(url)
+    return Sqlite(url) if url.get_backend_name() == "sqlite" else Postgres(url, limits or Limits())
 
 
 class Postgres:
     """PostgreSQL, for several gateways on several machines."""
 
-    def __init__(self, url: URL) -> None:
+    def __init__(self, url: URL, limits: Limits) -> None:
         need("asyncpg", "PostgreSQL")
         import asyncpg  # noqa: PLC0415 (most gateways keep their sessions in SQLite and do without)
 
         self._failures = (asyncpg.PostgresError, asyncpg.InterfaceError)
         self._engine = create_async_engine(
             url,
-            pool_size=5,
-            max_overflow=15,
+            pool_size=limits.connections,
+            max_overflow=0,
             pool_timeout=CONNECT_TIMEOUT_S,
             hide_parameters=True,
-            connect_args={"timeout": CONNECT_TIMEOUT_S, "command_timeout": COMMAND_TIMEOUT_S},
+            connect_args={
+                "timeout": CONNECT_TIMEOUT_S,
+                "command_timeout": max(COMMAND_TIMEOUT_S, 2 * limits.statement_s),
+                "server_settings": limits.of_server(),
+            },
         )
         self._reader = self._engine.execution_options(isolation_level="AUTOCOMMIT")
 
@@ -126,7 +139,9 @@ class Postgres:
             async with self._reader.connect() as connection:
                 return await connection.run_sync(work)
 
-    async def write(self, work: Work[T]) -> T:
+    async def write(self, work: Work[T], first: Callable[[], object] = _nothing) -> T:
+        if first is not _nothing:
+            await asyncio.to_thread(first)
         with _unavailable(*self._failures):
             async with self._engine.begin() as connection:
                 return await connection.run_sync(work)
@@ -143,7 +158,7 @@ class Sqlite:
         event.listen(self._writer.engine, "begin", _begin_immediate)
         in_memory = url.database in (None, "", ":memory:")
         self._readers = None if in_memory else _SqliteThreads(url, READERS)
-        self._waiting: list[tuple[Work[Any], asyncio.Future[Any]]] = []
+        self._waiting: list[tuple[Piece, asyncio.Future[Any]]] = []
         self._writing: asyncio.Task[None] | None = None
 
     async def read(self, work: Work[T]) -> T:
@@ -152,9 +167,9 @@ class Sqlite:
         with _unavailable():
             return await self._readers.run(work)
 
-    async def write(self, work: Work[T]) -> T:
+    async def write(self, work: Work[T], first: Callable[[], object] = _nothing) -> T:
         done: asyncio.Future[T] = asyncio.get_running_loop().create_future()
-        self._waiting.append((work, done))
+        self._waiting.append((Piece(work, first), done))
         if self._writing is None:
             self._writing = asyncio.create_task(self._write_all())
         with _unavailable():
@@ -172,7 +187,8 @@ class Sqlite:
             batch, self._waiting = self._waiting[:WRITTEN_TOGETHER], self._waiting[WRITTEN_TOGETHER:]
             outcomes: list[Any] = []
             try:
-                outcomes = await self._writer.run(partial(_each, batch=[work for work, _ in batch]))
+                pieces = [piece for piece, _ in batch]
+                outcomes = await self._writer.run(partial(do_each, pieces=pieces), partial(prepare_each, pieces))
             except BaseException as error:
                 outcomes = [error] * len(batch)
             for (_, done), outcome in zip(batch, outcomes, strict=True):
@@ -201,34 +217,19 @@ class _SqliteThreads:
         event.listen(self.engine, "connect", _prepare)
         self._threads = ThreadPoolExecutor(number, "sqlite")
 
-    async def run(self, work: Work[T]) -> T:
-        """Run work in a transaction on one of the threads."""
-        return await asyncio.get_running_loop().run_in_executor(self._threads, self._run, work)
+    async def run(self, work: Work[T], first: Callable[[], object] = _nothing) -> T:
+        """Run work in a transaction on one of the threads, and something before it there."""
+        return await asyncio.get_running_loop().run_in_executor(self._threads, self._run, work, first)
 
     async def close(self) -> None:
         """Close the connections and end the threads."""
         await asyncio.get_running_loop().run_in_executor(self._threads, self.engine.dispose)
         self._threads.shutdown()
 
-    def _run(self, work: Work[T]) -> T:
+    def _run(self, work: Work[T], first: Callable[[], object]) -> T:
+        first()
         with self.engine.begin() as connection:
             return work(connection)
-
-
-def _each(connection: Connection, batch: list[Work[Any]]) -> list[Any]:
-    """Results, and exceptions of work that is undone; a database error undoes all."""
-    if len(batch) == 1:
-        return [batch[0](connection)]
-    outcomes: list[Any] = []
-    for work in batch:
-        try:
-            with connection.begin_nested():
-                outcomes.append(work(connection))
-        except SQLAlchemyError:
-            raise
-        except Exception as error:
-            outcomes.append(error)
-    return outcomes
 
 
 def _prepare(connection: Any, _: object) -> None:

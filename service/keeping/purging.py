@@ -1,33 +1,111 @@
-"""How an ended session is forgotten, a little at a time: whoever writes waits for no more than a few milliseconds."""
+"""How ended sessions are forgotten, a little at a time: whoever writes waits for no more than a few milliseconds.
+
+In PostgreSQL their lines go with the parts of the days on which they were written, once nobody can read any line of a
+part (`service.keeping.partitions`). So lines are deleted one by one only where the log has no parts, where logs are
+kept for less than a day, and in a part that some session's log keeps from being dropped.
+"""
 
 from __future__ import annotations
 
-from collections.abc import Iterator
+import time
+from collections.abc import Callable, Iterator, Sequence
+from typing import Any
 
-from sqlalchemy import Delete, Update, delete, select, update
+from sqlalchemy import Delete, Select, Update, delete, exists, select, update
 
+from service.keeping import partitions
+from service.keeping.database import Database
+from service.keeping.rows import ENDED
 from service.keeping.tables import audit_lines, kept_messages, sessions
 
 LINES_TOGETHER = 512
+SESSIONS_TOGETHER = 256
 MESSAGES_TOGETHER = 1
 """Frames, of a megabyte or so each."""
 
 
-def locked(session_id: str) -> Update:
-    """Takes all tokens of the session away, so that nobody reads a log that is half gone."""
-    return update(sessions).where(sessions.c.session_id == session_id).values(token_ids="{}")
+async def purge(database: Database, moment: float, *forget: Callable[[str], None]) -> None:
+    """Forget the sessions that ended before then (Unix time), with their logs and messages; each transaction is short.
+
+    Each of ``forget`` is told of each. A log that is half gone is not shown any more.
+    """
+    in_parts = await database.write(partitions.are_there) and moment < time.time() - partitions.DAY_S
+    await database.write(partitions.make_ahead)
+    ended = select(sessions.c.session_id).where(ENDED, sessions.c.touched_at < moment)
+    if in_parts:
+        while some := await _ids(database, ended.where(sessions.c.token_ids != "{}").limit(SESSIONS_TOGETHER)):
+            await _forget_together(database, some)
+            _tell(forget, *some)
+        await _drop_parts(database, moment)
+        return
+    for session_id in await _ids(database, ended):
+        await _done(database, _locked([session_id]))
+        _tell(forget, session_id)
+        for part in parts(session_id):
+            while await _done(database, part):
+                pass
+
+
+def _tell(forget: Sequence[Callable[[str], None]], *session_ids: str) -> None:
+    for session_id in session_ids:
+        for each in forget:
+            each(session_id)
+
+
+async def _forget_together(database: Database, session_ids: Sequence[str]) -> None:
+    """Let nobody read these logs any more, and delete their messages."""
+    await _done(database, _locked(session_ids))
+    with_messages = select(kept_messages.c.session_id).where(kept_messages.c.session_id.in_(session_ids)).distinct()
+    for session_id in await _ids(database, with_messages):
+        while await _done(database, _messages(session_id)):
+            pass
+
+
+async def _drop_parts(database: Database, moment: float) -> None:
+    for name in await database.read(lambda connection: partitions.finished(connection, moment)):
+        await database.write(lambda connection, this=name: partitions.drop(connection, this))  # type: ignore[misc]
+    purged = sessions.c.token_ids == "{}"
+    its_line = audit_lines.c.session_id == sessions.c.session_id
+    pinned = select(sessions.c.session_id).where(
+        purged, exists().where(its_line, audit_lines.c.day < partitions.day(moment))
+    )
+    for session_id in await _ids(database, pinned):
+        while await _done(database, _lines(session_id)):
+            pass
+    await _done(database, delete(sessions).where(purged, ~exists().where(its_line)))
+
+
+async def _ids(database: Database, query: Select[Any]) -> list[str]:
+    return await database.read(lambda connection: list(connection.execute(query).scalars()))
+
+
+async def _done(database: Database, some: Delete | Update) -> int:
+    """Rows that it was done to."""
+    return await database.write(lambda connection: int(connection.execute(some).rowcount))
+
+
+def _locked(session_ids: Sequence[str]) -> Update:
+    """Takes all tokens of sessions away, so that nobody reads a log that is half gone."""
+    return update(sessions).where(sessions.c.session_id.in_(session_ids)).values(token_ids="{}")
 
 
 def parts(session_id: str) -> Iterator[Delete]:
     """What to delete, one after another, each as often as there is something: messages, then the log, then the rest."""
-    for table, key, number in (
-        (kept_messages, kept_messages.c.frame, MESSAGES_TOGETHER),
-        (audit_lines, audit_lines.c.seq, LINES_TOGETHER),
-    ):
-        of_session = table.c.session_id == session_id
-        oldest = select(key).where(of_session).order_by(key).limit(number)
-        yield delete(table).where(of_session, key.in_(oldest.scalar_subquery()))
+    yield _messages(session_id)
+    yield _lines(session_id)
     yield delete(sessions).where(sessions.c.session_id == session_id)
+
+
+def _messages(session_id: str) -> Delete:
+    of_session = kept_messages.c.session_id == session_id
+    oldest = select(kept_messages.c.frame).where(of_session).order_by(kept_messages.c.frame).limit(MESSAGES_TOGETHER)
+    return delete(kept_messages).where(of_session, kept_messages.c.frame.in_(oldest.scalar_subquery()))
+
+
+def _lines(session_id: str) -> Delete:
+    of_session = audit_lines.c.session_id == session_id
+    oldest = select(audit_lines.c.seq).where(of_session).order_by(audit_lines.c.seq).limit(LINES_TOGETHER)
+    return delete(audit_lines).where(of_session, audit_lines.c.seq.in_(oldest.scalar_subquery()))
 
 
 def older_messages(session_id: str, before: int) -> Delete:

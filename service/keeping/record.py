@@ -47,6 +47,8 @@ class SessionRecord:
     """`robosac.audit.digest` of the latest record."""
     key_id: str = ""
     """Which API key opened it (`service.sessions.identity.ApiKeys.check`); empty where none was asked for."""
+    holder: str = ""
+    """Name of the process that the ego asked last (`service.sessions.moving.Moving`); empty if that is not known."""
     revision: int = 0
     """Changes to the session so far, other than to its log."""
 

@@ -2,27 +2,60 @@
 
 from __future__ import annotations
 
-import asyncio
 import json
 from collections import OrderedDict
-from typing import NamedTuple
+from collections.abc import Callable
+from dataclasses import dataclass, field
+from typing import Generic, TypeVar
 
 from robosac.audit import Unsealed, Writer, compact
 from robosac.audit.events import Event, FrameAnswered
 
 
-class Ready(NamedTuple):
-    """A decision, ready to be kept."""
+@dataclass(frozen=True)
+class Ready:
+    """An event, ready to be kept."""
 
     said: Unsealed
-    following: Writer
-    state: str
-    """What the defence remembers after it, as text."""
+    state: str | None = None
+    """What the defence remembers after a decision, as text."""
 
 
-async def unsealed(event: Event) -> Unsealed:
+@dataclass(frozen=True)
+class ReadyDecision(Ready):
+    """A decision, ready to be kept."""
+
+    following: Writer = field(kw_only=True)
+    """Knows what its session's log has said then."""
+
+
+T_co = TypeVar("T_co", covariant=True)
+
+
+class Draft(Generic[T_co]):
+    """Something that is made on the thread on which it is needed, just before its transaction."""
+
+    def __init__(self, make: Callable[[], T_co]) -> None:
+        self._make = make
+
+    def write(self) -> None:
+        """Make it."""
+        self._made = self._make()
+
+    @property
+    def made(self) -> T_co:
+        """What was made."""
+        return self._made
+
+
+def sealed(event: Event, session_id: str, seq: int, head: str) -> str:
+    """An event as the line that is its place in the log."""
+    return Unsealed(compact(event)).seal(session_id, seq, head)
+
+
+def drafted(event: Event) -> Draft[Ready]:
     """An event as a record that only its place in the log is missing of."""
-    return await asyncio.to_thread(lambda: Unsealed(compact(event)))
+    return Draft(lambda: Ready(Unsealed(compact(event))))
 
 
 class Sealing:
@@ -41,18 +74,18 @@ class Sealing:
         self._remembered = remembered
         self._writers: OrderedDict[str, Writer] = OrderedDict()
 
-    async def decision(self, session_id: str, event: FrameAnswered, follows: int | None) -> Ready:
-        """As `unsealed`, and what to `follow` once it is kept; ``follows`` is the latest frame before.
+    def decision(self, session_id: str, event: FrameAnswered, follows: int | None) -> Draft[ReadyDecision]:
+        """As `drafted`, and what to `follow` once it is kept; ``follows`` is the latest frame before.
 
         Until then nothing is remembered of the session: what may not be in the log must not be taken for said.
         """
         writer = self._writers.pop(session_id, None) or Writer(self._full_every)
 
-        def work() -> Ready:
+        def work() -> ReadyDecision:
             record, following = writer.record(event, follows)
-            return Ready(Unsealed(record), following, json.dumps(event.state))
+            return ReadyDecision(Unsealed(record), json.dumps(event.state), following=following)
 
-        return await asyncio.to_thread(work)
+        return Draft(work)
 
     def follow(self, session_id: str, writer: Writer) -> None:
         """A decision is kept, and this knows it."""

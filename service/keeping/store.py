@@ -2,23 +2,23 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable, Mapping
+from collections.abc import Callable, Collection, Mapping
 from dataclasses import replace
 from typing import Any
 
-from sqlalchemy import Connection, Delete, Select, Update, func, insert, select
+from sqlalchemy import Connection, Delete, Select, Update, func, insert, select, update
 
 from robosac.audit import FULL_EVERY, digest
 from robosac.audit.events import DetectorChanged, Event, FrameAnswered, SessionEnded, TeamChanged, TokenRenewed
 from service.errors import AuditFull, FrameDecided, SessionChanged
-from service.keeping import migrations, once
-from service.keeping.appending import Change, append, check_revision
+from service.keeping import migrations, once, partitions, purging
+from service.keeping.appending import Change, append, check_revision, line_row
 from service.keeping.database import connect
+from service.keeping.limits import Limits
 from service.keeping.patience import Patience
-from service.keeping.purging import locked, older_messages, parts
 from service.keeping.record import SessionRecord
-from service.keeping.rows import ENDED, FIELDS, GET, NO_CHANGE, OPEN, columns, read_row
-from service.keeping.sealing import Ready, Sealing, unsealed
+from service.keeping.rows import FIELDS, GET, NO_CHANGE, OPEN, columns, read_row
+from service.keeping.sealing import Draft, Ready, Sealing, drafted, sealed
 from service.keeping.seen import Seen
 from service.keeping.tables import audit_lines, kept_messages, sessions
 
@@ -29,9 +29,9 @@ PAGE, REMEMBERED = 128, 4096
 class Store:
     """Keeps sessions and their audit logs.
 
-    Every method is one transaction, and what it did is kept once it returns. A method that adds to a session holds the
-    session's row while it numbers and seals the log's next line, so that a log never has two ends. It raises
-    `SessionOver` if the session has ended or is not there. Any method may raise `StoreUnavailable`.
+    What a method did is kept once it returns. One that adds to a session holds its row while it numbers and seals the
+    log's next line, so that a log never has two ends; it raises `SessionOver` if the session has ended or is not
+    there. Any may raise `StoreUnavailable`.
 
     Parameters
     ----------
@@ -43,6 +43,7 @@ class Store:
         Frames from one record with the whole state to the next.
     most_records : int, optional
         Records that a log may have, besides the one that ends it; beyond, `AuditFull` is raised.
+    limits : service.keeping.database.Limits, optional
 
     Raises
     ------
@@ -56,8 +57,9 @@ class Store:
         remembered: int = REMEMBERED,
         full_every: int = FULL_EVERY,
         most_records: int | None = None,
+        limits: Limits | None = None,
     ) -> None:
-        self._database = connect(url)
+        self._database = connect(url, limits)
         self._most_records = most_records
         self._sealing = Sealing(full_every, remembered)
         self._seen = Seen(remembered)
@@ -65,18 +67,19 @@ class Store:
     async def start(self) -> None:
         """Bring the database to this version's schema."""
         await self._database.write(migrations.upgrade)
+        await self._database.write(partitions.make_ahead)
 
     async def create(self, record: SessionRecord, event: Event) -> SessionRecord:
         """Keep a new session and the first record of its log; the session as it is then."""
-        line = (await unsealed(event)).seal(record.session_id, 1, record.audit_head)
-        kept = replace(record, audit_seq=1, audit_head=digest(line))
+        draft = Draft(lambda: sealed(event, record.session_id, 1, record.audit_head))
 
-        def work(connection: Connection) -> None:
+        def work(connection: Connection) -> SessionRecord:
+            kept = replace(record, audit_seq=1, audit_head=digest(draft.made))
             connection.execute(insert(sessions), columns(kept, *FIELDS))
-            connection.execute(insert(audit_lines), {"session_id": kept.session_id, "seq": 1, "line": line})
+            connection.execute(insert(audit_lines), line_row(kept.session_id, 1, draft.made))
+            return kept
 
-        await self._database.write(work)
-        return self._seen.remember(kept)
+        return self._seen.remember(await self._database.write(work, draft.write))
 
     async def get(self, session_id: str) -> SessionRecord | None:
         """The session as the database has it, ended or not, or None."""
@@ -148,12 +151,12 @@ class Store:
                 row = {"session_id": record.session_id, "frame": event.frame, "body": messages}
                 connection.execute(insert(kept_messages), row)
                 if keep_frames:
-                    connection.execute(older_messages(record.session_id, event.frame - keep_frames + 1))
+                    connection.execute(purging.older_messages(record.session_id, event.frame - keep_frames + 1))
             patience.commit()
 
-        ready = await self._sealing.decision(record.session_id, event, record.last_frame)
-        kept = await self._append(record.session_id, event, change, keep, ready)
-        self._sealing.follow(record.session_id, ready.following)
+        draft = self._sealing.decision(record.session_id, event, record.last_frame)
+        kept = await self._append(record.session_id, event, change, keep, draft)
+        self._sealing.follow(record.session_id, draft.made.following)
         return kept
 
     async def change_team(self, record: SessionRecord, event: TeamChanged, token_ids: Mapping[str, str]) -> None:
@@ -190,6 +193,15 @@ class Store:
     async def renew_token(self, session_id: str, token_id: str, event: TokenRenewed) -> None:
         """Let another token of a vehicle count instead of the one before."""
         await self._append(session_id, event, lambda now: {"token_ids": {**now.token_ids, event.vehicle_id: token_id}})
+
+    async def hold(self, session_id: str, holder: str) -> None:
+        """Note which process a session's ego asks now; that changes nothing that was decided."""
+        await self._execute(update(sessions).where(sessions.c.session_id == session_id).values(holder=holder))
+
+    async def holders(self, session_ids: Collection[str]) -> dict[str, str]:
+        """Which process the ego of each of these asks."""
+        query = select(sessions.c.session_id, sessions.c.holder).where(sessions.c.session_id.in_(session_ids))
+        return await self._database.read(lambda connection: {row[0]: row[1] for row in connection.execute(query)})
 
     async def log(self, session_id: str, event: Event) -> None:
         """Append to a session's log."""
@@ -228,18 +240,8 @@ class Store:
         return await self._column(select(sessions.c.session_id).where(OPEN, sessions.c.touched_at < moment))
 
     async def purge(self, moment: float) -> None:
-        """Forget the sessions that ended before then (Unix time), with their logs and messages.
-
-        Each transaction is short, so that frames need not wait. A log that is half gone is not shown any more.
-        """
-        ended = select(sessions.c.session_id).where(ENDED, sessions.c.touched_at < moment)
-        for session_id in await self._column(ended):
-            await self._execute(locked(session_id))
-            self._seen.forget(session_id)
-            for some in parts(session_id):
-                while await self._execute(some):
-                    pass
-            self._sealing.forget(session_id)
+        """Forget the sessions that ended before then (Unix time), as `service.keeping.purging.purge` does."""
+        await purging.purge(self._database, moment, self._seen.forget, self._sealing.forget)
 
     async def count(self, key_id: str | None = None) -> int:
         """Open sessions, of all API keys or of one."""
@@ -277,18 +279,18 @@ class Store:
         event: Event,
         change: Change,
         keep: Callable[[Connection], None] = lambda _: None,
-        ready: Ready | None = None,
+        draft: Draft[Ready] | None = None,
     ) -> SessionRecord:
         """Change a session and append to its log, in one transaction; what takes long is done before it."""
-        said, state = (await unsealed(event), None) if ready is None else (ready.said, ready.state)
+        ready = drafted(event) if draft is None else draft
 
         def work(connection: Connection) -> SessionRecord:
-            after = append(connection, session_id, said, change, self.check_room, state)
+            after = append(connection, session_id, ready.made.said, change, self.check_room, ready.made.state)
             keep(connection)
             return after
 
         try:
-            after = await self._database.write(work)
+            after = await self._database.write(work, ready.write)
         except SessionChanged:
             self._seen.forget(session_id)
             await self.get(session_id)

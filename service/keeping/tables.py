@@ -36,6 +36,7 @@ sessions = Table(
     Column("audit_head", Text, nullable=False),
     Column("revision", BigInteger, nullable=False),
     Column("key_id", Text, nullable=False, server_default=""),
+    Column("holder", Text, nullable=False, server_default=""),
     Column("touched_at", Double, nullable=False),  # Unix time of the last audit record
 )
 _open, _ended = sessions.c.ended_at.is_(None), sessions.c.ended_at.is_not(None)
@@ -48,6 +49,7 @@ audit_lines = Table(
     _session_id(),
     Column("seq", BigInteger, primary_key=True, autoincrement=False),
     Column("line", Text, nullable=False),
+    Column("day", BigInteger, nullable=False, server_default="0"),  # in PostgreSQL a part of the key: see `partitions`
 )
 
 kept_messages = Table(

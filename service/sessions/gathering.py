@@ -4,19 +4,22 @@ from __future__ import annotations
 
 import asyncio
 import time
-from collections.abc import Sequence
+from collections.abc import Callable, Sequence
 from contextlib import suppress
-from dataclasses import dataclass
+from dataclasses import dataclass, field
 
 from robosac.answers import Distrust, Reason
 from robosac.audit.events import Proof
 from robosac.defenses import Rejection
 from robosac.detectors import Message
+from robosac.recording.truth import Truth
 from service.errors import Kind, Refused, Unusable
 from service.sessions.room import Share
 
 REMEMBERED_FRAMES = 8
 """Answered frames for which a message that comes again is told from one that says something else."""
+
+MOVED = "the session came to this gateway process with this frame; a message sent before may be lost with another"
 
 
 @dataclass(frozen=True)
@@ -27,6 +30,10 @@ class Received:
     digest: str
     """`robosac.wire.content_digest`."""
     signature: bytes | None = None
+    truth: Truth | None = None
+    """What the ego tells for recordings."""
+    at: float = field(default_factory=time.time, compare=False)
+    """When it was read, Unix seconds."""
 
     @property
     def nbytes(self) -> int:
@@ -66,9 +73,13 @@ class Gathering:
         What the session's messages may take of the room for those of all sessions.
     closed : int
         Frames up to this one are answered.
+    moved : bool
+        Whether messages for the next frame may have been sent to another process, and be lost.
     """
 
-    def __init__(self, team: Sequence[str], max_ahead: int, room: Share, closed: int = -1) -> None:
+    def __init__(
+        self, team: Sequence[str], max_ahead: int, room: Share, closed: int = -1, *, moved: bool = False
+    ) -> None:
         self._pending: dict[str, dict[int, Received | None]] = {name: {} for name in team}
         self._said: dict[str, dict[int, Proof]] = {name: {} for name in team}
         self._refusals: dict[str, tuple[int | None, Rejection]] = {}
@@ -77,6 +88,22 @@ class Gathering:
         self._closed = self._closed_before = closed
         self._set_aside: dict[str, tuple[int | None, Rejection]] = {}
         self._arrival = asyncio.Event()
+        self._moved = moved
+        self._sent_away = False
+
+    @property
+    def waits(self) -> bool:
+        """Whether a message waits for a frame that is not answered."""
+        return any(frame > self._closed for mine in self._pending.values() for frame in mine)
+
+    def waiting_of(self, sender: str) -> list[int]:
+        """Frames that are not answered, for which there is a message of a vehicle."""
+        return sorted(frame for frame in self._said.get(sender, ()) if frame > self._closed)
+
+    def send_away(self) -> None:
+        """Let nobody wait for messages any more: this process is to end."""
+        self._sent_away = True
+        self._arrival.set()
 
     @property
     def closed(self) -> int:
@@ -130,19 +157,36 @@ class Gathering:
         """Remember why a sender's message does not count, for the result of the first frame that it could be for."""
         self._refusals[sender] = (frame, Rejection(reason, {"detail": detail}))
 
-    async def collect(self, frame: int, until: float) -> dict[str, Received]:
+    async def collect(
+        self, frame: int, until: float, each: Callable[[str, Message], None] = lambda *_: None
+    ) -> dict[str, Received]:
         """Wait until every teammate's message for a frame is in, or the time (of `time.perf_counter`) has come.
+
+        ``each`` is told of every message as soon as it is in.
 
         Returns
         -------
         dict of teammate to Received
             Those that are in, and count.
+
+        Raises
+        ------
+        Refused
+            If the process is to end before (``draining``): the messages are sent to another then, and have to meet the
+            ego's there.
         """
+        told: set[str] = set()
         with suppress(TimeoutError):
             async with asyncio.timeout(until - time.perf_counter()):
-                while any(frame not in mine for mine in self._pending.values()):
+                while not self._sent_away and any(frame not in mine for mine in self._pending.values()):
+                    for name, mine in self._pending.items():
+                        if name not in told and (received := mine.get(frame)) is not None:
+                            told.add(name)
+                            each(name, received.message)
                     self._arrival.clear()
                     await self._arrival.wait()
+        if self._sent_away and any(frame not in mine for mine in self._pending.values()):
+            raise Refused(Kind.DRAINING, "this gateway process is about to end; send it again, and another takes it")
         waiting = {name: mine.get(frame) for name, mine in self._pending.items()}
         return {name: received for name, received in waiting.items() if received is not None}
 
@@ -151,8 +195,9 @@ class Gathering:
         if self._pending[teammate].get(frame, ...) is None:
             detail = "it sent different messages for this frame"
             return Rejection(Reason.DISTRUSTED, {"detail": detail}, Distrust.EQUIVOCATION)
-        refused_for, rejection = self._refusals.get(teammate, (None, Rejection(Reason.MISSING)))
-        return rejection if refused_for is None or refused_for <= frame else Rejection(Reason.MISSING)
+        missing = Rejection(Reason.MISSING, {"detail": MOVED} if self._moved else {})
+        refused_for, rejection = self._refusals.get(teammate, (None, missing))
+        return rejection if refused_for is None or refused_for <= frame else missing
 
     def change_team(self, team: Sequence[str]) -> None:
         """Keep what those who stay have sent, and forget those who left."""
@@ -179,6 +224,7 @@ class Gathering:
         if frame > self._closed:
             self._set_refusals_aside(frame)
         self._closed = frame
+        self._moved = False
         self._set_aside = {}
         for name, mine in self._pending.items():
             self._forget(name, [f for f in mine if f <= frame])

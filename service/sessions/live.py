@@ -17,8 +17,17 @@ from service.sessions.motion import Motion
 
 REFUSALS_LOGGED = 16
 """Refused messages of one vehicle between two frames that get a record each; the others are counted."""
+QUIET_S = 30.0
+"""After so long without a request it is looked whether what waits is of any use."""
 STRANGERS = "?"
 """Under which the refusals of all callers without a token that counts are counted: no vehicle is called so."""
+
+
+@dataclass(frozen=True, eq=False)
+class Standing:
+    """A vehicle that stands by, until its stream is over."""
+
+    over: asyncio.Event = field(default_factory=asyncio.Event)
 
 
 @dataclass
@@ -45,6 +54,12 @@ class LiveSession:
     renewals: Counter[str] = field(default_factory=Counter)
     settling: asyncio.Task[None] | None = None
     """A decision that nobody waits for any more, and of which it is not known yet whether it is kept."""
+    held: bool = False
+    """Whether the ego has asked here, and not been seen to ask elsewhere since."""
+    standing: dict[str, Standing] = field(default_factory=dict)
+    """Vehicles that are told when they have to send again, see `service.sessions.moving`."""
+    looked_for: float = 0.0
+    """Whether the session has moved away is looked for until then (`time.monotonic`)."""
 
     def follow(self, record: SessionRecord) -> None:
         """Catch up with what another process did to the session, if one did."""
@@ -56,6 +71,18 @@ class LiveSession:
         self.session.state = record.state
         if record.last_frame != self.answered:
             self.session.previous = self.ego_proof = None
+
+    @property
+    def is_quiet(self) -> bool:
+        """Whether messages wait, and nobody has come for long."""
+        quiet = self.last_used < time.monotonic() - QUIET_S
+        return quiet and self.gathering.waits and not self.lock.locked()
+
+    def send_away(self) -> None:
+        """The session is elsewhere now, or soon: let those who stand by find it there."""
+        self.held = False
+        for standing in self.standing.values():
+            standing.over.set()
 
     def count_anew(self) -> Counter[str]:
         """Refusals by vehicle since the last decision; all counts begin again, unless they are given back."""

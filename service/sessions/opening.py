@@ -73,6 +73,7 @@ class Opening:
             seed=self.sessions.draw_seed(),
             state=state,
             key_id=key_id,
+            holder=self.sessions.moving.name,
             weights_digest=info.weights_digest,
             calibration_digest=calibration_digest(info),
         )

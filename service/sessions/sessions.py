@@ -29,6 +29,7 @@ from service.sessions.identity import Tokens
 from service.sessions.journal import Journal
 from service.sessions.live import Caller, LiveSession
 from service.sessions.motion import Motion
+from service.sessions.moving import Moving
 from service.sessions.room import Room
 from service.settings import Settings
 from service.watching.metrics import Metrics
@@ -65,10 +66,15 @@ class Sessions:
             raise ValueError(f"ROBOSAC_EXTRA_DEFENSES: {fault}") from fault
         self.backlog = Room(self.settings.max_pending_bytes, name="ROBOSAC_MAX_PENDING_BYTES")
         self.journal = Journal(self.store, self.metrics)
+        self.moving = Moving(self.store)
 
     def begin(self, record: SessionRecord) -> None:
         """Let a session be used whose record is kept now."""
-        self._live[record.session_id] = self._revive(record)
+        self._live[record.session_id] = self._revive(record, moved=False)
+
+    def drain(self) -> None:
+        """Take nothing new: the process is to end, and another goes on with its sessions."""
+        self.moving.drain(self._live.values())
 
     async def authenticate(self, session_id: str, token: str | None) -> Caller:
         """The vehicle that a token belongs to.
@@ -77,10 +83,11 @@ class Sessions:
         ------
         Refused
             If the session is unknown or ended, the token is none of it, or its detector or its defence is not served
-            any more.
+            any more; or if this process is to end.
         StoreTooSlow
             If the store does not tell within the time that a frame of the session has.
         """
+        self.moving.check_open()
         live = self._live.get(session_id)
         patience_s = COLD_S if live is None else live.budget_s + GRACE_S
         try:
@@ -162,9 +169,9 @@ class Sessions:
                 for session_id in await self.store.unused_since(time.time() - self.settings.session_idle_s):
                     if not self._in_use(session_id):
                         await self._end(session_id, "expired")
-                for session_id in [one for one in self._live if not self._in_use(one)]:
+                for session_id in [one for one, live in self._live.items() if live.is_quiet or not self._in_use(one)]:
                     record = await self.store.get(session_id)
-                    if record is None or record.ended_at is not None:  # by another process
+                    if record is None or record.ended_at is not None or self.moving.is_elsewhere(record):
                         self._forget(session_id)
                 await self.store.purge(time.time() - self.settings.audit_retention_s)
             except Exception:  # a sweep that fails must not be the last one
@@ -182,8 +189,8 @@ class Sessions:
         caller.live.follow(record)
         return record
 
-    def _revive(self, record: SessionRecord) -> LiveSession:
-        """What this process holds of a session.
+    def _revive(self, record: SessionRecord, *, moved: bool = True) -> LiveSession:
+        """What this process holds of a session; of one that ``moved``, messages may have been sent elsewhere.
 
         Raises
         ------
@@ -216,6 +223,7 @@ class Sessions:
                 settings.max_pending_frames,
                 self.backlog.share(record.key_id, record.session_id),
                 closed,
+                moved=moved,
             ),
             Motion(settings.max_speed_mps, record.frame_period_ms / 1e3, settings.max_range_m),
             record.latency_budget_ms / 1e3,
@@ -247,6 +255,7 @@ class Sessions:
     def _forget(self, session_id: str) -> None:
         live = self._live.pop(session_id, None)
         if live is not None:
+            live.send_away()
             live.gathering.clear()
 
     async def _end(self, session_id: str, why: str) -> None:

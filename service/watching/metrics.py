@@ -3,8 +3,17 @@
 from __future__ import annotations
 
 from collections.abc import Mapping
+from importlib.metadata import version
 
-from prometheus_client import CollectorRegistry, Counter, Gauge, Histogram, generate_latest
+from prometheus_client import (
+    CollectorRegistry,
+    Counter,
+    Gauge,
+    Histogram,
+    Info,
+    ProcessCollector,
+    generate_latest,
+)
 
 from robosac.answers import FrameAnswer
 
@@ -16,6 +25,8 @@ class Metrics:
 
     def __init__(self) -> None:
         self.registry = CollectorRegistry()
+        ProcessCollector(registry=self.registry)
+        Info("robosac_gateway", "The gateway", registry=self.registry).info({"version": version("robosac")})
         self.sessions = Gauge("robosac_sessions", "Open sessions", registry=self.registry)
         self._frames = Counter("robosac_frames_total", "Answered frames", ["source"], registry=self.registry)
         self._degraded = Counter("robosac_degraded_frames_total", "Frames cut short", ["by"], registry=self.registry)
@@ -28,6 +39,15 @@ class Metrics:
         )
         self._refused = Counter(
             "robosac_refused_messages_total", "Refused messages", ["reason"], registry=self.registry
+        )
+        self._recorded = Counter("robosac_recorded_frames_total", "Frames recorded", registry=self.registry)
+        self._unrecorded = Counter(
+            "robosac_unrecorded_frames_total", "Frames left out of recordings", ["why"], registry=self.registry
+        )
+        for why in ("waiting", "disk"):
+            self._unrecorded.labels(why)  # exported from the start, so that a first one is seen as an increase
+        self._problems = Counter(
+            "robosac_problems_total", "Requests answered with a problem", ["type"], registry=self.registry
         )
         self._stages = Histogram(
             "robosac_stage_seconds", "Time of a frame by stage", ["stage"], buckets=_SECONDS, registry=self.registry
@@ -54,6 +74,18 @@ class Metrics:
     def refused(self, reason: str) -> None:
         """Count a refused message."""
         self._refused.labels(reason).inc()
+
+    def recorded(self) -> None:
+        """Count a frame that is in a recording."""
+        self._recorded.inc()
+
+    def unrecorded(self, why: str) -> None:
+        """Count a frame that should be in a recording and is not: too many were ``waiting``, or the ``disk`` failed."""
+        self._unrecorded.labels(why).inc()
+
+    def problem(self, slug: str) -> None:
+        """Count a request that was answered with a problem."""
+        self._problems.labels(slug).inc()
 
     def render(self) -> bytes:
         """The exposition text."""

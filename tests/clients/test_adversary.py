@@ -53,6 +53,14 @@ def test_frames_until_one_is_good_are_counted_in_the_order_in_which_they_were_du
     assert [seen.recovered_after(moment) for moment in (0.5, 1.5, 4.0, 5.0)] == [0, 2, 0, None]
 
 
+def test_whoever_measures_leaves_the_gateway_cores_of_its_own():
+    said = "from clients.cores import Cores; import os, sys; cores = Cores(); all = os.sched_getaffinity(0)\n"
+    said += "with cores.of_gateways(): theirs = os.sched_getaffinity(0)\n"
+    said += "ours = os.sched_getaffinity(0)\n"
+    said += "sys.exit(not (theirs | ours == all and (len(all) == 1 or not theirs & ours)))"
+    assert subprocess.run([sys.executable, "-c", said], check=False).returncode == 0
+
+
 def test_a_strange_frame_contradicts_the_ego_and_passes_what_is_looked_at_before(detector, messages):
     honest = wire.pack_frame(0, messages[EGO], {name: messages[name] for name in TEAM})
     frame = wire.read_frame(strange_frame(honest))

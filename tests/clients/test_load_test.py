@@ -4,7 +4,8 @@ import pytest
 import typer
 from typer.testing import CliRunner
 
-from clients.load_test import Bodies, Figures, Load, main
+from clients.load_test import Bodies, main
+from clients.measured import Figures, Load
 from robosac import wire
 
 
@@ -18,6 +19,8 @@ def test_a_short_run_measures_every_load(tmp_path):
         "1",
         "--egos",
         "3",
+        "--teammates",
+        "5",
         "--rate",
         "5",
         "--out",
@@ -38,6 +41,12 @@ def test_a_short_run_measures_every_load(tmp_path):
         assert load["fps"] > 0
         assert load["latency_ms"]["p50"] <= load["latency_ms"]["p95"] <= load["latency_ms"]["p99"]
         assert load["sampling_steps_mean"] >= 1
+        assert sum(of["frames"] for of in load["by_steps"].values()) == load["frames"]
+        assert all(0 < of["engine_ms"] < of["latency_ms"] for of in load["by_steps"].values())
+        used = load["used_a_frame"]
+        assert report["bytes_a_frame"] < used["sent_bytes"] < report["bytes_a_frame"] + 2000
+        assert 1000 < used["audit_bytes"] < 20_000
+        assert 0 < used["gateway_cpu_ms"] < 2000
         assert {"receive", "queue", "prepare", "hypotheses", "total"} <= set(load["stages_ms"])
         if load["loop"] == "open":
             assert load["frames"] == load["egos"] * 3
@@ -48,7 +57,12 @@ def test_refused_frames_count_as_not_answered_in_time():
     answer = type(
         "Answer",
         (),
-        {"sampling_steps": 1, "deadline_met": True, "degraded_by": "deadline", "timings_ms": {"total": 3.0}},
+        {
+            "sampling_steps": 1,
+            "deadline_met": True,
+            "degraded_by": "deadline",
+            "timings_ms": {"prepare": 2.0, "total": 3.0},
+        },
     )()
     figures.add(answer, 10.0)
     figures.add(answer, 300.0)

@@ -70,6 +70,19 @@ def test_reading_gets_a_share_of_the_time_that_is_left():
     assert Deadline().reading(0.5)(["a"])
 
 
+def test_a_pause_is_not_taken_for_what_reading_costs():
+    clock = Clock()
+    deadline = Deadline(10.0, clock=clock)
+    fits = deadline.reading(0.9)
+    assert fits(["a"])
+    clock.now = 0.5
+    with deadline.pause():
+        clock.now = 7.0
+    assert fits(["b"])
+    clock.now = 8.5
+    assert not fits(["c"])
+
+
 def test_nothing_is_read_once_it_is_late():
     clock = Clock()
     clock.now = 11.0

@@ -18,13 +18,16 @@ def test_what_is_missing_is_named_with_the_extra_that_brings_it(package, extra, 
     monkeypatch.setitem(sys.modules, package, None)
     with pytest.raises(MissingExtra, match=rf"{package} is not .*, for this test: pip install 'robosac\[{extra}\]'$"):
         need(package, "this test")
-    assert any(requirement.startswith(f"{package}>") for requirement in EXTRAS[extra])
+    names = (f"{package}>", f"{package}-sdk>", f"{package}[")
+    assert any(requirement.startswith(names) for requirement in EXTRAS[extra])
 
 
 @pytest.mark.parametrize(
     "arguments",
     [
         ["scene", "--out", "x.png"],
+        ["show", "frame", "--out", "x.png"],
+        ["show", "film", "--out", "x.gif"],
         ["reproduce", "--out", "x", "--quick"],
         ["compare", "--out", "x", "--quick"],
     ],

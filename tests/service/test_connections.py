@@ -9,7 +9,7 @@ import pytest
 import uvicorn
 
 from clients.hostile import Attack, Target, run_attack
-from service.arriving.connections import HEAD_BYTES, BoundedHTTP
+from service.arriving.connections import HEAD_BYTES, HEADERS, PIECES, PIPELINED, BoundedHTTP
 
 GET = b"GET / HTTP/1.1\r\nHost: x\r\n\r\n"
 SLOW = b"GET /slow HTTP/1.1\r\nHost: x\r\n\r\n"
@@ -124,6 +124,45 @@ async def test_a_head_without_end_is_cut_off(port, before):
         with contextlib.suppress(ConnectionError):
             answer = await reader.read(-1)
         assert not answer or b"431" in answer or before
+
+
+CHUNKED = b"POST / HTTP/1.1\r\nHost: x\r\nTransfer-Encoding: chunked\r\n\r\n"
+
+
+@pytest.mark.parametrize(
+    ("sent", "said"),
+    [
+        (GET[:-2] + b"a:\r\n" * HEADERS + b"\r\n", b"HTTP/1.1 431"),
+        (CHUNKED + b"1\r\nx\r\n" * (PIECES + 1), b"HTTP/1.1 400"),
+        (GET * (PIPELINED + 2), b""),
+    ],
+)
+async def test_what_takes_long_to_look_at_is_not_looked_at_to_its_end(port, sent, said):
+    async with connected(port) as (reader, writer):
+        writer.write(sent + b"the rest is not looked at")
+        with contextlib.suppress(ConnectionError):
+            answer = await asyncio.wait_for(reader.read(-1), 5.0)
+            assert answer.startswith(said)
+            assert bool(answer) == bool(said)
+        await asyncio.sleep(0)
+    async with connected(port) as (reader, writer):
+        writer.write(GET)
+        assert b"200" in await reader.readuntil(b"\r\n\r\n")
+
+
+@pytest.mark.parametrize("sent", [CHUNKED + b"80\r\n%b\r\n" % bytes(128) * 3000, CHUNKED + b"1\r\nx\r\n" * PIECES])
+async def test_a_body_may_come_in_pieces(port, sent):
+    async with connected(port) as (reader, writer):
+        writer.write(sent + b"0\r\n\r\n")
+        assert b"200" in await reader.readuntil(b"\r\n\r\n")
+
+
+async def test_requests_may_be_pipelined(port):
+    async with connected(port) as (reader, writer):
+        writer.write(SLOW + GET * PIPELINED)
+        for _ in range(PIPELINED + 1):
+            assert b"200" in await reader.readuntil(b"\r\n\r\n")
+            await reader.readexactly(2)
 
 
 async def test_the_bodies_before_it_do_not_count_for_a_head(port):

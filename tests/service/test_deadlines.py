@@ -89,16 +89,27 @@ async def test_what_comes_while_a_decision_is_made_is_late_even_if_that_is_not_k
     session = await hooked.open(gather_ms=20)
     loop, late = asyncio.get_running_loop(), []
 
-    def meanwhile(*_):
-        body = wire.pack_message(0, "rsu", messages["rsu"])
-        posting = hooked.post(session, "messages", body, session.teammate_tokens["rsu"])
-        late.append(asyncio.run_coroutine_threadsafe(posting, loop).result())
+    class Meanwhile:
+        """A defence that is asked while a message comes."""
 
-    hooked.detector.before_prepare = meanwhile
+        def __init__(self, defense):
+            self.defense = defense
+
+        def __getattr__(self, name):
+            return getattr(self.defense, name)
+
+        def converse(self, *asked):
+            body = wire.pack_message(0, "rsu", messages["rsu"])
+            posting = hooked.post(session, "messages", body, session.teammate_tokens["rsu"])
+            late.append(asyncio.run_coroutine_threadsafe(posting, loop).result())
+            return self.defense.converse(*asked)
+
+    decides = hooked.gateway.sessions._live[session.session_id].session
+    usual, decides.defense = decides.defense, Meanwhile(decides.defense)
     await hooked.teammate(session, "car-2").send(0, messages["car-2"])
     assert (await hooked.ego(session).ask(0, messages[EGO])).accepted == ("car-2",)
     problem(late[0], 409, "stale-frame")
-    hooked.detector.before_prepare = None
+    decides.defense = usual
     assert (await hooked.ego(session).ask(1, messages[EGO])).rejected["rsu"].reason == "late"
 
 
@@ -107,10 +118,10 @@ async def test_a_decision_past_the_point_of_return_is_found_out_about_before_the
     session = await on_disk.open(latency_budget_ms=1000, gather_ms=0)
     assert (await on_disk.post(session, "frames", good_frame(0))).status_code == 200
     database = on_disk.gateway.store._database
-    before = asyncio.create_task(database.write(lambda _: time.sleep(0.3)))
+    before = asyncio.create_task(database.write(lambda _: time.sleep(0.8)))
     await asyncio.sleep(0.05)
     posting = asyncio.create_task(on_disk.post(session, "frames", good_frame(1)))
-    while not any(work.__qualname__.startswith("Store._append") for work, _ in database._waiting):
+    while not any(piece.work.__qualname__.startswith("Store._append") for piece, _ in database._waiting):
         await asyncio.sleep(0.005)
     with_it = asyncio.create_task(database.write(lambda _: time.sleep(1.6)))
     refused = await posting

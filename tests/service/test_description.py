@@ -1,11 +1,17 @@
 """The API's own description, for tools and for whoever reads it: all of it is there, and what it says is so."""
 
 import asyncio
+import base64
+from dataclasses import replace
 
+import jsonschema_rs
+import msgpack
 import pytest
 
 from robosac import wire
 from robosac.audit.events import event_on
+from robosac.detectors import TensorSpec, blank
+from service import tensor_bodies
 from service.app import create_app
 from service.description import AUDIT_LINE, EXAMPLES, TAGS
 from service.operations import operations
@@ -13,6 +19,9 @@ from service.pages import pages
 from service.problems import ANSWERS, TYPE_PREFIX
 from service.routes import v1
 from service.settings import Settings
+from tests.robosac.test_wire import EGO as TINY_EGO
+from tests.robosac.test_wire import INFO as TINY
+from tests.robosac.test_wire import TEAMMATE as TINY_TEAMMATE
 from tests.service.conftest import TEAM
 
 MSGPACK = "application/vnd.msgpack"
@@ -85,6 +94,16 @@ def test_an_example_is_one_of_its_type(model):
     assert example.keys() <= shown.keys()
 
 
+@pytest.mark.parametrize(("method", "path"), ROUTES)
+def test_every_example_is_one_of_its_schema(method, path, description):
+    said = description["paths"][path][method]
+    for part in (*([said["requestBody"]] if "requestBody" in said else ()), *said["responses"].values()):
+        for content in part.get("content", {}).values():
+            schema = {**content["schema"], "components": description["components"]}
+            if "example" in content:
+                jsonschema_rs.validate(schema, content["example"])
+
+
 def test_examples_of_records_and_refusals_are_such(description):
     assert event_on(AUDIT_LINE.rstrip("\n").encode()).event == "token_renewed"
     for calls in description["paths"].values():
@@ -124,7 +143,14 @@ async def test_what_is_answered_is_described(served, description, ego_message, b
         assert (await call("post", f"{session}/frames", ego, content=frame, headers=sent)).status_code == 200
     assert (await call("get", f"{session}/frames/{{frame}}/messages", ego)).status_code == 404
     assert (await call("get", session)).status_code == 401
-    assert (await call("post", f"{session}/token", rsu)).status_code == 201
+    fresh = await call("post", f"{session}/token", rsu)
+    assert fresh.status_code == 201
+    standing_by = asyncio.create_task(call("get", f"{session}/standby", fresh.json()["token"]))
+    live = served.gateway.sessions.in_use(sid)
+    while not live.standing:
+        await asyncio.sleep(0.001)
+    live.send_away()
+    assert (await standing_by).status_code == 200
     await call("get", "/v1/live")
     with_it = asyncio.create_task(call("get", "/v1/live/{sid}"))
     while not served.gateway.feed.sessions()[0]["viewers"]:
@@ -137,3 +163,95 @@ async def test_what_is_answered_is_described(served, description, ego_message, b
         await call("get", path, ego)
     assert "audit-head" in (await call("delete", session, ego)).headers
     assert set(seen) == set(ROUTES)
+
+
+def bytes_of(rendered):
+    """A body that was rendered as JSON, with binary where it stands for that."""
+    if isinstance(rendered, list):
+        return [bytes_of(item) for item in rendered]
+    if not isinstance(rendered, dict):
+        return rendered
+    if rendered.keys() == {"base64", "times"}:
+        return base64.b64decode(rendered["base64"]) * rendered["times"]
+    return {name: bytes_of(value) for name, value in rendered.items()}
+
+
+def as_text(value):
+    """A body as a validator of JSON takes it: each byte of binary is a character."""
+    if isinstance(value, bytes):
+        return value.decode("latin-1")
+    if isinstance(value, list):
+        return [as_text(item) for item in value]
+    return {name: as_text(item) for name, item in value.items()} if isinstance(value, dict) else value
+
+
+def conforms(value, schema, document=None):
+    components = {} if document is None else {"components": document["components"]}
+    return jsonschema_rs.is_valid({**components, **schema}, as_text(value))
+
+
+async def test_the_examples_of_tensor_bodies_are_such_and_are_accepted(served):
+    """All that is sent comes from the description alone."""
+    document = (await served.http.get("/openapi.json")).json()
+    calls = {path: item["post"] for path, item in document["paths"].items() if "post" in item}
+    opening = calls["/v1/sessions"]["requestBody"]["content"]["application/json"]["example"]
+    opened = (await served.http.post("/v1/sessions", json={**opening, "latency_budget_ms": 20_000})).json()
+    tokens = {opening["ego_id"]: opened["ego_token"], **opened["teammate_tokens"]}
+    for name, status in (("messages", 202), ("frames", 200)):
+        path = f"/v1/sessions/{{sid}}/{name}"
+        (media_type, body), *others = calls[path]["requestBody"]["content"].items()
+        assert not others
+        sent = bytes_of(body["examples"][opened["detector"]["name"]]["value"])
+        assert conforms(sent, body["schema"], document)
+        headers = {"Authorization": f"Bearer {tokens[sent.get('vehicle_id', opening['ego_id'])]}"}
+        headers |= {"Content-Type": media_type, "Accept": media_type}
+        place = path.format(sid=opened["session_id"])
+        response = await served.http.post(place, content=msgpack.packb(sent), headers=headers)
+        assert response.status_code == status, response.text
+        answered = calls[path]["responses"][str(status)]["content"][response.headers["content-type"]]
+        assert conforms(msgpack.unpackb(response.content), answered["schema"], document)
+
+
+@pytest.mark.parametrize(
+    ("spoil", "code"),
+    [
+        (lambda part: part["tensors"]["features"].update(data=b"\0" * 11), "wrong-length"),
+        (lambda part: part["tensors"]["features"].update(shape=[3, 2]), "wrong-shape"),
+        (lambda part: part["tensors"]["features"].update(dtype="float32"), "wrong-dtype"),
+        (lambda part: part["tensors"].update(other=part["tensors"]["features"]), "unknown-tensor"),
+        (lambda part: part["tensors"].pop("features"), "missing-field"),
+        (lambda part: part.update(pose=part["pose"][:15]), "bad-pose"),
+        (lambda part: part.update(signature=b"short"), "wrong-length"),
+        (lambda part: part.pop("pose"), "missing-field"),
+    ],
+)
+def test_the_schemas_of_tensor_bodies_allow_what_the_codec_does(spoil, code):
+    """Of a detector whose ego sends more than its teammates."""
+    sent = msgpack.unpackb(wire.pack_frame(0, TINY_EGO, {"car-2": TINY_TEAMMATE}))
+    own = msgpack.unpackb(wire.pack_message(0, "car-2", TINY_TEAMMATE))
+    other = blank(served_info("other"), "teammate")
+    others = msgpack.unpackb(wire.pack_message(0, "car-2", other))
+    whole, single = tensor_bodies.frame_body([TINY])["schema"], tensor_bodies.message_body([TINY])["schema"]
+    assert conforms(sent, whole)
+    assert conforms(own, single)
+    assert conforms(msgpack.unpackb(wire.pack_message(0, "car-1", TINY_EGO)), single)
+    assert not conforms(others, single)
+    assert conforms(others, tensor_bodies.message_body([TINY, served_info("other")])["schema"])
+    assert conforms(others, tensor_bodies.message_body(())["schema"])
+    assert conforms({**sent, "states": {"before": b"{}"}}, tensor_bodies.kept_frame([TINY])["schema"])
+    assert not conforms({**sent, "ego": sent["teammates"]["car-2"]}, whole)  # it lacks what only an ego sends
+    for part, schema, body in ((sent["teammates"]["car-2"], whole, sent), (own, single, own)):
+        spoil(part)
+        assert not conforms(body, schema)
+        with pytest.raises(wire.WireError) as refused:
+            checked(part)
+        assert refused.value.code == code
+
+
+def served_info(name):
+    layout = {"map": TensorSpec("uint8", (5,))}
+    return replace(TINY, name=name, tensors={"ego": layout, "teammate": layout})
+
+
+def checked(part):
+    return wire.check_message(part, TINY, "teammate"), wire.read_signature(part)

@@ -1,6 +1,9 @@
 import asyncio
+import itertools
+import threading
 
 import msgpack
+import numpy as np
 
 from robosac import wire
 from tests.service.conftest import EGO, TEAM, problem, serve
@@ -112,3 +115,25 @@ async def test_late_stale_and_second_messages_are_refused_and_named(served, mess
     assert (await ego.ask(9, messages[EGO])).rejected["car-2"].reason == "missing"
     refused = [r["reason"] for r in await ego.audit() if r["event"] == "message_refused"]
     assert refused == ["replayed", "replayed", "late", "stale"]
+
+
+async def test_while_teammates_are_waited_for_the_ego_sees_alone_and_what_is_there_is_read(messages):
+    async with serve(seeds=itertools.repeat(7)) as served:
+        at_once = await served.open()
+        whole = await served.ego(at_once).post_frame(0, messages[EGO], {name: messages[name] for name in TEAM})
+        session = await served.open(gather_ms=20_000)
+        asking = asyncio.create_task(served.ego(session).ask(0, messages[EGO]))
+        for name in TEAM[:-1]:
+            await served.teammate(session, name).send(0, messages[name])
+        for _ in range(3):  # pieces of work are done in turn: once this one is, those of the messages above are
+            done = threading.Event()
+            served.gateway.engine.when_idle(done.set)
+            await asyncio.to_thread(done.wait)
+        await served.teammate(session, TEAM[-1]).send(0, messages[TEAM[-1]])
+        answer = await asking
+        assert (answer.accepted, answer.suspicion) == (whole.accepted, whole.suspicion)
+        np.testing.assert_array_equal(answer.boxes, whole.boxes)
+        assert answer.timings_ms["ahead"] > 0
+        assert "ahead" not in whole.timings_ms
+        assert answer.timings_ms["ego_only"] < 0.2 * whole.timings_ms["ego_only"]
+        assert answer.timings_ms["testimony"] < whole.timings_ms["testimony"]

@@ -1,3 +1,5 @@
+import asyncio
+
 import httpx
 import pytest
 
@@ -28,6 +30,7 @@ RULES = {
     "POST /v1/sessions/{sid}/token": ANY_VEHICLE,
     "POST /v1/sessions/{sid}/messages": ANY_VEHICLE,
     "POST /v1/sessions/{sid}/frames": EGO_ONLY,
+    "GET /v1/sessions/{sid}/standby": ANY_VEHICLE,
     "GET /v1/sessions/{sid}/frames/{frame}/messages": EGO_ONLY,
     "GET /v1/sessions/{sid}": EGO_ONLY,
     "DELETE /v1/sessions/{sid}": EGO_ONLY,
@@ -63,8 +66,13 @@ async def test_every_route_keeps_its_rule(route):
 
         async def call(credential):
             body = {"json": {"teammates": ["car-9"]}} if path.endswith("/teammates") else {}
-            return await served.http.request(method, path, headers=bearer(credential), **body)
+            asking = asyncio.create_task(served.http.request(method, path, headers=bearer(credential), **body))
+            while not asking.done():
+                live.send_away()  # or the stream of who stands by would not end
+                await asyncio.sleep(0.001)
+            return await asking
 
+        live = served.gateway.sessions.in_use(session.session_id)
         if RULES[route] == ANYBODY:
             assert (await call(None)).status_code == 200
             return

@@ -1,10 +1,16 @@
+import inspect
+
 import httpx
 import pytest
+from fastapi.routing import APIRoute
 
 from robosac import wire
 from service.app import create_app
+from service.operations import operations
+from service.pages import pages
+from service.routes import v1
 from service.settings import Settings
-from tests.service.conftest import problem
+from tests.service.conftest import problem, serve
 
 
 async def test_alive_at_once_and_ready_after_the_warm_up():
@@ -32,8 +38,22 @@ async def test_metrics_count_what_happened(served, ego_message, attacked, messag
     assert values['robosac_hypotheses_total{verdict="consensus"}'] == 4
     assert values['robosac_refused_messages_total{reason="unauthenticated"}'] == 1
     assert values['robosac_stage_seconds_count{stage="total"}'] == 4
+    assert values['robosac_problems_total{type="wrong-vehicle"}'] == 1
+    assert values["process_cpu_seconds_total"] > 0
     rejected = sum(v for k, v in values.items() if k.startswith("robosac_rejected_teammates_total"))
     assert rejected == 4 * 2
+
+
+async def test_problems_are_counted_wherever_they_are_answered():
+    async with serve(allowed_hosts="gateway", max_body_bytes=2048) as served:
+        await served.http.get("/healthz/none")
+        await served.http.get("/metrics", headers={"Host": "elsewhere"})
+        await served.http.get("/metrics", params={"long": "x" * 4000})
+        await served.http.post("/v1/sessions", content=b"x" * 4096)
+        await served.http.post("/v1/sessions", json={})
+        text = (await served.http.get("/metrics")).text
+    for slug in ("not-found", "foreign-host", "uri-too-long", "too-large", "invalid-request"):
+        assert f'robosac_problems_total{{type="{slug}"}} 1.0' in text
 
 
 async def test_late_frames_are_counted(served, ego_message, attacked):
@@ -97,3 +117,20 @@ async def test_what_a_strange_header_puts_into_the_log_breaks_no_line(served):
     assert (await served.http.post(path, content=b"x", headers=headers)).status_code == 415
     (_, refused) = await served.ego(session).audit()
     assert refused["detail"].endswith("a\x85b")
+
+
+def test_no_request_is_handed_to_a_thread_on_its_way_to_a_route():
+    """FastAPI calls plain functions on threads of its own, and every change of threads costs every frame."""
+
+    def called(dependant):
+        yield dependant.call
+        for part in dependant.dependencies:
+            yield from called(part)
+
+    routes = [route for router in (v1, operations, pages) for route in router.routes if isinstance(route, APIRoute)]
+    calls = {call for route in routes for call in called(route.dependant)}
+    assert len(routes) > 10
+    assert len(calls) > len(routes)
+    for call in calls:
+        plain = inspect.unwrap(call) if inspect.isroutine(call) else call.__call__
+        assert inspect.iscoroutinefunction(plain) or inspect.isasyncgenfunction(plain), call

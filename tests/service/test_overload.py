@@ -147,6 +147,19 @@ def test_many_sessions_of_a_key_add_no_more_to_a_frame_of_another_than_one_of_th
             admission.check("many", "one more", 0.2)
 
 
+def test_who_had_less_than_the_others_is_admitted_beside_them():
+    """It goes first on the thread until it had as much; and the other way round."""
+    ahead_s = 0.05
+    admission = Admission(lead=lambda key, *_: ahead_s if key == "modest" else -ahead_s)
+    for _ in range(200):
+        admission.learn("any", 0.05, 0.002, 0.001)
+    with admission.frame("greedy", "one", 20.0):
+        admission.check("modest", "its session", 0.06)
+        admission.check("modest", "its session", 0.01)  # late by itself, and by nobody's fault
+    with admission.frame("modest", "its session", 0.2), pytest.raises(Refused):
+        admission.check("greedy", "one", 0.1)
+
+
 def test_a_frame_that_waits_for_its_teammates_costs_the_others_nothing():
     admission = Admission()
     with ExitStack() as taken:

@@ -6,7 +6,7 @@ from dataclasses import dataclass
 
 import pytest
 
-from service.turns import CREDIT_S, SLACK_S, Turns
+from service.turns import CREDIT_S, KNOWN, SLACK_S, Turns
 
 PASS_S = 0.007
 
@@ -95,13 +95,57 @@ def test_who_goes_and_comes_back_has_had_what_it_had():
     assert abs(had["greedy"] - had["modest"]) <= SLACK_S / PASS_S + 1
 
 
-def test_those_who_left_are_forgotten():
-    turns = Turns()
-    for number in range(1000):
-        work = Work(f"key {number}", f"session {number}")
+def test_who_wants_little_goes_first_though_others_come_and_go():
+    """Each frame of the greedy is over, and its next one not there yet, when the modest's comes."""
+    turns, greedy, modest = Turns(), Work("greedy", "a", due=0.0), Work("modest", "b", due=9.0)
+    turns.add(modest)
+    turns.charge(turns.next(), PASS_S)
+    turns.remove(modest)
+    for _ in range(5):
+        turns.add(greedy)
+        for _ in range(20):
+            turns.charge(greedy, PASS_S)
+        turns.remove(greedy)
+        turns.add(modest)
+        turns.add(greedy)
+        assert played(turns, 10) == [modest] * 10
+        turns.remove(modest)
+        turns.remove(greedy)
+
+
+def test_who_leads_goes_first_by_as_much():
+    turns, greedy, modest = Turns(), Work("greedy", "a"), Work("modest", "b")
+    for work, number in ((modest, 1), (greedy, 8)):
         turns.add(work)
-        turns.charge(work, PASS_S)
+        for _ in range(number):
+            turns.charge(work, PASS_S)
         turns.remove(work)
-    assert (turns._keys.had_s, turns._sessions) == ({}, {})
+    lead_s = turns.lead("modest", "b", "greedy", "a")
+    assert lead_s == -turns.lead("greedy", "a", "modest", "b") == pytest.approx(8 * PASS_S)
+    turns.add(modest)
+    turns.add(greedy)
+    first = [work.key for work in played(turns, 30)].index("greedy")
+    assert abs(first * PASS_S - lead_s) <= SLACK_S + PASS_S
+    assert turns.lead("modest", "b", "modest", "new") == 0.0
+    assert turns.lead("nobody", "b", "nobody", "new") == 0.0
+
+
+def test_who_is_refused_for_the_sake_of_others_soon_goes_before_them():
+    turns = waiting(Work("greedy", "a"))
+    assert turns.lead("new", "b", "greedy", "a") == turns.lead("greedy", "c", "greedy", "a") == 0.0
+    played(turns, 10)
+    assert turns.lead("new", "b", "greedy", "a") == turns.lead("greedy", "c", "greedy", "a") == pytest.approx(0.07)
+    played(turns, 100)
+    assert turns.lead("new", "b", "greedy", "a") == pytest.approx(CREDIT_S)
+
+
+def test_of_those_who_left_only_so_many_are_remembered():
+    turns = Turns()
+    for number in range(KNOWN + 100):
+        for work in (Work(f"key {number}", "its session"), Work("", f"session {number}")):
+            turns.add(work)
+            turns.charge(work, PASS_S)
+            turns.remove(work)
+    assert len(turns._keys._had_s) == len(turns._sessions) == len(turns._sessions[""]._had_s) == KNOWN
     with pytest.raises(IndexError):
         turns.next()

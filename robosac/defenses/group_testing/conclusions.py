@@ -44,7 +44,9 @@ def conclude(found: Findings, answer: Hypothesis) -> None:
             found.lies.audited |= dict.fromkeys(done, found.known.memory.frame)
         for suspect, lies in blame(done, shown).items():
             counting = [lie for lie in lies if enough or lie.counts_as == "ghost"]
-            blamed[suspect] += [lie for lie in counting if found.calm or not lie.veiled]
+            counting = [lie for lie in counting if found.calm or not lie.veiled]
+            found.note(joined, tuple(name for name in joined if name != suspect), counting)
+            blamed[suspect] += counting
     for name, lie in _together(found, answer):
         blamed[name].append(lie)
     conflicts = _conflicts(found, answer)
@@ -68,6 +70,7 @@ def _together(found: Findings, answer: Hypothesis) -> list[tuple[str, Lie]]:
         if group and without in found.shown:
             done = found.effects(answer, without, group)
             if any(np.hypot(*(each.place - lie.place)) <= SAME_LIE_M for each in done if each.kind == lie.kind):
+                found.note(answer, without, [lie])
                 blamed += [(name, lie) for name in group]
     return blamed
 

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import math
+from collections import defaultdict
 from collections.abc import Callable, Mapping
 from dataclasses import dataclass
 from typing import Any
@@ -19,7 +20,8 @@ from robosac.defenses.group_testing.knowledge import Knowledge
 from robosac.defenses.group_testing.memory import CHANGE_REPEAT, EGO_REPEAT, PAIR_REPEAT, WORTH_KEEPING, key
 from robosac.defenses.group_testing.model import CELLS, CLEAN, LIE
 from robosac.defenses.group_testing.objects import Shown
-from robosac.defenses.protocol import Hypothesis, Outcome
+from robosac.defenses.group_testing.strangeness import TESTS
+from robosac.defenses.protocol import Difference, Hypothesis, Outcome
 
 Real = Callable[[FloatArray], BoolArray]
 _REPEATS = {"ego": EGO_REPEAT, "pair": PAIR_REPEAT, "change": CHANGE_REPEAT}
@@ -28,6 +30,10 @@ NOBODY = 0
 MISPLACED, MISPLACED_SLOPE, MISPLACED_MOST = 0.4, 3.0, 3.0
 """Boxes misplaced by more than this (`differences.misplaced`) speak against who joins, whatever the kind of attack: the
 logarithm of the likelihood ratio grows by the slope, up to the last.
+"""
+SAID_AGAIN = 1.0
+"""A finding that speaks against teammates counts 1 / (1 + so many times what findings of its test in this frame have
+counted against each of them): what makes one of them odd is in the same messages again.
 """
 _CERTAIN = 1e-9
 _TINY = 1e-300
@@ -70,6 +76,8 @@ class Evidence:
         for granted before the first outcome.
     shown : dict of key to (n, 4) ndarray
         What each subset showed in this frame, see `geometry.followed`.
+    differences : list of Difference
+        What was compared, box by box.
     """
 
     measure = staticmethod(geometry.measure)
@@ -83,8 +91,10 @@ class Evidence:
             known.memory.shown = {}
         self._checked: dict[Hypothesis, Shown | None] = {}
         self._alone: Shown | None = None
+        self._against: dict[str, defaultdict[str, float]] = {test: defaultdict(float) for test in TESTS}
         self.outcomes: list[Outcome] = []
         self.shown: dict[int, FloatArray] = {}
+        self.differences: list[Difference] = []
         self.ego_sees = self.ego_witnesses = True
 
     def learn(self, outcome: Outcome, shown: Shown | None = None) -> None:
@@ -172,8 +182,18 @@ class Evidence:
         if real is None:
             changed = self._known.memory.steadiness.unexpected(boxes, changed)
         likelihood = self._known.model.change(len(outcome.teammates), boxes, changed)
+        self._note_changes(outcome.teammates, before, now, real, outcome.pose)
         values = {"boxes": boxes, "changes": changed}
         return [_Finding("change", (), outcome.teammates, likelihood, 1.0, values)]
+
+    def _note_changes(
+        self, fused: Hypothesis, before: FloatArray, now: FloatArray, real: Real | None, pose: FloatArray
+    ) -> None:
+        def places() -> Mapping[str, FloatArray]:
+            came, gone = geometry.come_and_gone(before, now, real)
+            return {"came": _in_frame(came, pose), "gone": _in_frame(gone, pose)}
+
+        self.differences.append(Difference("change", fused, fused, places))
 
     def _finding(
         self,
@@ -185,6 +205,9 @@ class Evidence:
         misplaced: float = 0.0,
     ) -> _Finding:
         likelihood = self._known.model.pair(len(a), len(d), pair)
+        if pair.compared is not None:
+            joined = tuple(sorted((*a, *d)))
+            self.differences.append(Difference("pair" if a else "ego", joined, a, pair.compared.places))
         values = {**values, "loss": round(pair.loss, 4), "novelty": pair.novelty}
         weight *= DEPENDENCE
         return _Finding("pair" if a else "ego", a, d, likelihood, weight, values, misplaced)
@@ -195,12 +218,12 @@ class Evidence:
         masks = posterior.masks(self._known.rows([finding.a, finding.d]))
         cells = posterior.cells(masks[:, :1], masks[:, 1:])[0]
         strangeness = self._known.memory.strangeness
-        likelihood = self._neutral(strangeness.weights @ finding.likelihood, cells)
+        likelihood = self._neutral(strangeness.weights[finding.test] @ finding.likelihood, cells)
         if finding.misplaced > MISPLACED:
             against = np.exp(min(MISPLACED_MOST, MISPLACED_SLOPE * (finding.misplaced - MISPLACED)))
             likelihood[CLEAN:] *= np.tile([against, 1.0, against], len(likelihood[CLEAN:]) // CELLS)
         weight = self._weight(finding, cells, likelihood)
-        strangeness.learn(finding.likelihood, cells, weight)
+        strangeness.learn(finding.test, finding.likelihood, cells, weight)
         posterior.learn(masks, weight * np.log(likelihood))
         self._keep(finding, _log_odds(posterior.marginals()) - _log_odds(before))
 
@@ -226,7 +249,13 @@ class Evidence:
         against = attacked > clean
         weight = finding.weight * min(1.0, UNDILUTED_SIZE / (len(finding.a) + len(finding.d)))
         weight *= memory.steadiness.trust if against else 1.0
-        return weight * memory.weigh(test, _REPEATS[finding.test], 1 if against else -1)
+        weight *= memory.weigh(test, _REPEATS[finding.test], 1 if against else -1)
+        if against:
+            counted = self._against[finding.test]
+            weight /= 1.0 + SAID_AGAIN * min(counted[name] for name in finding.d)
+            for name in finding.d:
+                counted[name] += weight
+        return weight
 
     def _keep(self, finding: _Finding, ratios: FloatArray) -> None:
         """Keep a finding as evidence on those (S,) whose log-odds it moved by these ratios."""

@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Collection
+from collections.abc import Collection, Mapping, Sequence
 
 import numpy as np
 
@@ -12,11 +12,13 @@ from robosac.defenses.group_testing.differences import SAME_LIE_M, effects, gone
 from robosac.defenses.group_testing.knowledge import Knowledge
 from robosac.defenses.group_testing.lies import Lies
 from robosac.defenses.group_testing.objects import REACH_M, Hearing, Lie, Shown
-from robosac.defenses.protocol import Hypothesis, Outcome
+from robosac.defenses.protocol import Difference, Hypothesis, Outcome
 from robosac.testimony import Testimony
 
 CALM = 0.5
 """From here on the ego counts as steady."""
+DONE = {"ghost": "invented", "gone": "removed", "moved": "displaced"}
+"""What was done to an object, by the kind of a lie."""
 UNHEARD = 0.9
 """The testimony of those suspected more than this counts for nothing."""
 
@@ -44,6 +46,8 @@ class Findings:
         What all messages say; None before the first outcome.
     pose : (4, 4) ndarray
         world_from_sensor of the ego.
+    differences : list of Difference
+        What somebody is to blame for.
     """
 
     def __init__(self, known: Knowledge, lies: Lies, team: Hypothesis, named: Collection[str]) -> None:
@@ -56,6 +60,7 @@ class Findings:
         self.decoded: set[Hypothesis] = set()
         self.hearing: Hearing | None = None
         self.pose: FloatArray = np.eye(4)
+        self.differences: list[Difference] = []
         self._gone: dict[tuple[Hypothesis, Hypothesis], FloatArray] = {}
         self._effects: dict[tuple[Hypothesis, Hypothesis, Hypothesis], list[Lie]] = {}
 
@@ -95,6 +100,18 @@ class Findings:
         if asked not in self._effects:
             self._effects[asked] = effects(self.shown[joined], self.shown[without], suspects)
         return self._effects[asked]
+
+    def note(self, joined: Hypothesis, without: Hypothesis, lies: Sequence[Lie]) -> None:
+        """Note for whoever looks on what is wrong in a fusion by the fault of those whom the other one does without."""
+
+        def places() -> Mapping[str, FloatArray]:
+            return {
+                said: np.array([lie.place for lie in lies if lie.kind == kind]).reshape(-1, 2)
+                for kind, said in DONE.items()
+            }
+
+        if lies:
+            self.differences.append(Difference("objects", joined, without, places))
 
     def gone(self, joined: Hypothesis, without: Hypothesis) -> FloatArray:
         """Boxes (n, 6) that one decoded fusion shows and another has lost although others support them."""

@@ -115,7 +115,8 @@ class JudgedFrame:
         ratio = sum(suspicion.values()) / len(suspicion) if suspicion else None
         state = remember(self._known.posterior, memory, trusted, named)
         objects, contradicted = inspection.judged(accepted) or (None, ())
-        return Decision(accepted, source, rejected, ratio, state, suspicion, objects, contradicted)
+        differences = (*self._evidence.differences, *inspection.differences)
+        return Decision(accepted, source, rejected, ratio, state, suspicion, objects, contradicted, differences)
 
     def _is_attacker(self, name: str, certain: bool) -> bool:
         """Whether a teammate is to be named: it lied about objects too often, or it is suspected for certain by several

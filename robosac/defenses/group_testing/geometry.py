@@ -2,8 +2,8 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable
-from dataclasses import dataclass
+from collections.abc import Callable, Mapping
+from dataclasses import dataclass, field
 from typing import Any
 
 import numpy as np
@@ -24,6 +24,8 @@ MIN_WITNESSES = 2
 """With fewer boxes to survive there is no evidence."""
 SAME_IOU = 0.5
 """A box of the larger fusion that stands in its place by the word of others is the same vehicle from this IoU on."""
+HARDLY_IOU = 0.05
+"""A box that nothing overlaps by so much is lost; one that something overlaps by less than `SAME_IOU` is moved."""
 SAME_LOSS = 0.1
 """Such a box counts as this much lost, at most: about what a box changes between honest fusions on average."""
 
@@ -34,6 +36,25 @@ TURN_RAD = 0.4
 """How far a vehicle gets from one frame to the next, along itself (22 m/s at 5 Hz) and across, and how far it turns."""
 
 
+@dataclass(frozen=True, eq=False)
+class Compared:
+    """The boxes that a pair is measured by."""
+
+    witnesses: FloatArray
+    """(n, 6): boxes of ``a`` that are to survive."""
+    lost: FloatArray
+    """(n,): how much of each is lost, in [0, 1]."""
+    added: FloatArray
+    """(m, 6): boxes of ``a + d`` that overlap nothing of before."""
+
+    def places(self) -> Mapping[str, FloatArray]:
+        """Centres (k, 2) of boxes that are lost, moved and added."""
+        lost = self.lost > 1.0 - HARDLY_IOU
+        moved = (self.lost > 1.0 - SAME_IOU) & ~lost
+        boxes = {"lost": self.witnesses[lost], "moved": self.witnesses[moved], "added": self.added}
+        return {name: of[:, :2] for name, of in boxes.items()}
+
+
 @dataclass(frozen=True)
 class PairMeasure:
     """How the fusion of ``a + d`` differs from that of ``a``."""
@@ -42,6 +63,8 @@ class PairMeasure:
     """g, geometric preservation loss, in [0, 1]."""
     novelty: int
     """v, boxes that overlap nothing of before."""
+    compared: Compared | None = field(default=None, compare=False, repr=False)
+    """Box by box, where there were boxes."""
 
 
 @dataclass(frozen=True)
@@ -84,7 +107,8 @@ def measure(smaller: FloatArray, larger: FloatArray, said: Said | None = None) -
     claimed = larger[(larger[:, 5] >= NEW_SCORE) & (True if said is None else ~said.vouched)]
     known = smaller[smaller[:, 5] >= KNOWN_SCORE]
     overlap = pairwise_iou(claimed, known).max(axis=1, initial=0.0)
-    return PairMeasure(float(lost.mean()), int((overlap == 0.0).sum()))
+    added = claimed[overlap == 0.0]
+    return PairMeasure(float(lost.mean()), len(added), Compared(witnesses, lost, added))
 
 
 def followed(boxes: FloatArray, pose: FloatArray) -> FloatArray:
@@ -113,6 +137,13 @@ def crowd(now: FloatArray) -> int:
 
 
 def changes(before: FloatArray, now: FloatArray, real: Callable[[FloatArray], BoolArray] | None = None) -> int:
+    """How many boxes came or went, see `come_and_gone`."""
+    return sum(map(len, come_and_gone(before, now, real)))
+
+
+def come_and_gone(
+    before: FloatArray, now: FloatArray, real: Callable[[FloatArray], BoolArray] | None = None
+) -> tuple[FloatArray, FloatArray]:
     """Boxes that came or went between two frames of one fusion, (n, 4) and (m, 4), as `followed` gives them.
 
     A box has come if it has a score >= .3 and before none was kept where it can have been; it has gone if it had a
@@ -123,8 +154,10 @@ def changes(before: FloatArray, now: FloatArray, real: Callable[[FloatArray], Bo
     """
     came = _nowhere(now[now[:, 3] >= NEW_SCORE], before)
     gone = _nowhere(before[before[:, 3] >= WITNESS_SCORE], now)
-    changed = np.concatenate([came, gone])
-    return len(changed) if real is None else int((~real(changed)).sum())
+    if real is None:
+        return came, gone
+    counts = ~real(np.concatenate([came, gone]))
+    return came[counts[: len(came)]], gone[counts[len(came) :]]
 
 
 def _nowhere(boxes: FloatArray, others: FloatArray) -> FloatArray:

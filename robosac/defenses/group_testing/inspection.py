@@ -11,7 +11,7 @@ from robosac.defenses.group_testing.findings import Findings
 from robosac.defenses.group_testing.objects import Lie, Shown
 from robosac.defenses.group_testing.posterior import EXACT
 from robosac.defenses.group_testing.standing import Judged, judge
-from robosac.defenses.protocol import Hypothesis, Outcome
+from robosac.defenses.protocol import Difference, Hypothesis, Outcome
 
 AUDIT_FRAMES = 40
 """After so many frames a teammate of the answer is left out again, to see what it does."""
@@ -34,6 +34,11 @@ class Inspection:
         self._found = found
         self._keep_contradicted = keep_contradicted
         self._whole: Hypothesis | None = None
+
+    @property
+    def differences(self) -> list[Difference]:
+        """What somebody is to blame for, box by box."""
+        return self._found.differences
 
     def learn(self, outcome: Outcome) -> Shown | None:
         """Take in a decoded subset; what it shows is given back, checked, if there is testimony to check it by."""

@@ -164,5 +164,5 @@ class Memory:
             shown_in=int(state.get("shown_in", 0)),
             lies=Lies.from_state(state["lies"]) if "lies" in state else Lies(),
             steadiness=Steadiness.from_state(state["steadiness"]) if "steadiness" in state else Steadiness(),
-            strangeness=Strangeness.from_state(state["strangeness"]) if "strangeness" in state else Strangeness(),
+            strangeness=Strangeness.from_state(state.get("strangeness", ())),
         )

@@ -8,7 +8,7 @@ honest messages show is stretched so; what attacks show is not.
 
 from __future__ import annotations
 
-from collections.abc import Sequence
+from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, field
 
 import numpy as np
@@ -23,33 +23,40 @@ FORGETTING = 0.02
 """Each frame the weights of the worlds go back towards the prior by this share."""
 
 
+TESTS = ("ego", "pair", "change")
+"""What is learned apart: fusions may lose boxes as they did where likelihoods were calibrated, and yet flicker more."""
+
+
 @dataclass
 class Strangeness:
     """Mutable while a frame is judged."""
 
-    weights: FloatArray = field(default_factory=lambda: np.array(PRIOR))
-    """(len(STRETCHES),): how likely each world is; they sum to 1."""
+    weights: dict[str, FloatArray] = field(default_factory=lambda: {test: np.array(PRIOR) for test in TESTS})
+    """By test, (len(STRETCHES),): how likely each world is; they sum to 1."""
 
     def step(self) -> None:
         """Another frame."""
-        self.weights = (1 - FORGETTING) * self.weights + FORGETTING * np.array(PRIOR)
+        for test, weights in self.weights.items():
+            self.weights[test] = (1 - FORGETTING) * weights + FORGETTING * np.array(PRIOR)
 
-    def learn(self, likelihood: FloatArray, cells: FloatArray, weight: float) -> None:
+    def learn(self, test: str, likelihood: FloatArray, cells: FloatArray, weight: float) -> None:
         """Take in a finding: its likelihood (worlds, cells) in each world, the probability of what is true (cells,),
         and what it counts.
         """
-        self.weights = self.weights * np.maximum(likelihood @ cells, 1e-12) ** weight
-        self.weights /= self.weights.sum()
+        weights = self.weights[test] * np.maximum(likelihood @ cells, 1e-12) ** weight
+        self.weights[test] = weights / weights.sum()
 
-    def to_state(self) -> list[float]:
+    def to_state(self) -> dict[str, list[float]]:
         """What `from_state` reads."""
-        return [round(float(w), 9) for w in self.weights]
+        return {test: [round(float(w), 9) for w in weights] for test, weights in self.weights.items()}
 
     @classmethod
-    def from_state(cls, state: Sequence[float]) -> Strangeness:
-        """What `to_state` wrote."""
-        weights = np.array(state, dtype=np.float64)
-        return cls(weights / weights.sum())
+    def from_state(cls, state: Mapping[str, Sequence[float]] | Sequence[float]) -> Strangeness:
+        """What `to_state` wrote; with anything else, as earlier versions kept it, nothing is learned yet."""
+        if not isinstance(state, Mapping):
+            return cls()
+        weights = {test: np.array(state[test], dtype=np.float64) for test in TESTS}
+        return cls({test: values / values.sum() for test, values in weights.items()})
 
 
 def stretched(edges: Sequence[float], stretch: float) -> FloatArray:

@@ -225,6 +225,7 @@ def _play(
 
 
 def _naming(sequence: Sequence[EvaluationFrame], named: Sequence[frozenset[str]], chosen: Collection[str]) -> Naming:
+    hostile = frozenset(chosen).union(*(frame.attackers for frame in sequence))  # in recordings others may be, too
     strikes: dict[str, int] = {}
     after: dict[str, int] = {}
     all_after: int | None = None
@@ -233,9 +234,9 @@ def _naming(sequence: Sequence[EvaluationFrame], named: Sequence[frozenset[str]]
             strikes.setdefault(name, index)
         for name in named[index] & set(strikes):
             after.setdefault(name, index - strikes[name] + 1)
-        if strikes and all_after is None and named[index].issuperset(chosen):
+        if strikes and all_after is None and named[index] >= hostile:
             all_after = index - min(strikes.values()) + 1
-    honest = {name for frame in sequence for name in frame.team} - set(chosen)
+    honest = {name for frame in sequence for name in frame.team} - hostile
     return Naming(
         struck=len(strikes),
         after=tuple(after[name] for name in sorted(after)),

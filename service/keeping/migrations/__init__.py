@@ -6,7 +6,7 @@ from pathlib import Path
 
 from sqlalchemy import Connection, func, inspect, select, text
 
-HEAD = "0004"
+HEAD = "0006"
 """The latest step."""
 _LOCK = 0x0D5EAC
 """Number of the advisory lock that processes starting at once take in PostgreSQL, chosen at random."""
@@ -25,6 +25,9 @@ def upgrade(connection: Connection) -> None:
     lock(connection)
     if _revision(connection) == HEAD:
         return
+    if connection.dialect.name == "postgresql":  # a step may rewrite what takes longer than a frame may wait
+        connection.execute(text("SET LOCAL statement_timeout = 0"))
+        connection.execute(text("SET LOCAL idle_in_transaction_session_timeout = 0"))
     from alembic import command  # noqa: PLC0415 - 0.2 s that most starts need not spend
     from alembic.config import Config  # noqa: PLC0415
 

@@ -10,7 +10,6 @@ from robosac.attacks import GaussianNoise
 from robosac.boxes import pose_matrix
 from robosac.calibrated import calibration_of
 from robosac.calibration import Recipe
-from robosac.calibration.making import check
 from robosac.calibration.verdicts import Trial, Verdicts, complementary, validation_stretches
 from robosac.cli import app
 from robosac.defenses.group_testing import Calibration, CalibrationError, GroupTestingSettings
@@ -141,15 +140,6 @@ def test_the_shipped_detector_finds_an_attacker(detector, ego_message, attacked)
     assert set(results[-1].accepted) == set(attacked) - {"car-2"}
     assert results[-1].named == ("car-2",)
     assert {name for r in results for name in r.state["memory"]["lies"]["levels"]} == {"car-2"}
-
-
-def test_reliability_compares_suspicion_with_the_truth():
-    stretches = [(None, [recorded()]), ("pgd", [recorded(["a"])]), ("pgd", [recorded(["b", "c"])])] * 4
-    bins = check(make_model(), stretches)
-    assert sum(b.teammates for b in bins) == 36
-    assert bins[0].observed == 0.0
-    assert bins[-1].observed == 1.0
-    assert all(b.low <= b.predicted <= b.high for b in bins)
 
 
 @pytest.mark.parametrize(

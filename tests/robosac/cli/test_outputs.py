@@ -11,6 +11,10 @@ from robosac.cli import app, commands
 runner = CliRunner()
 WRITTEN = {
     "scene": ("--out", "x.png"),
+    "show frame": ("--out", "x.png"),
+    "show film": ("--out", "x.gif"),
+    "show suspicion": ("--out", "x.svg"),
+    "show comparison": ("--out", "x.png"),
     "train": ("--out", "intersection-mean.safetensors"),
     "evaluate": ("--out", "bounds.json"),
     "benign-scores": ("--out", "x.json"),
@@ -20,6 +24,7 @@ WRITTEN = {
     "witness": ("--out", "x.safetensors"),
     "convert-checkpoint": ("OUT", "x.safetensors"),
     "audit report": ("--out", "x.json"),
+    "record export": ("--out", "x.jsonl"),
     "demo": ("--report", "summary.json"),
     "fleet": ("--report", "summary.json"),
     "load-test": ("--out", "load_test.json"),
@@ -27,10 +32,16 @@ WRITTEN = {
     "flood": ("--out", "flood.json"),
     "adversary": ("--out", "adversary.json"),
     "crash-test": ("--out", "crash_test.json"),
+    "capacity": ("--out", "capacity.json"),
 }
 """By command: what its user names, and what it would write there."""
-FOLDERS = ("train", "evaluate", "reproduce", "compare", *list(WRITTEN)[10:])
-ARGUMENTS = {"audit report": ["pyproject.toml", "--vehicle", "car-2"]}
+FOLDERS = ("train", "evaluate", "reproduce", "compare", *list(WRITTEN)[15:])
+ARGUMENTS = {
+    "audit report": ["pyproject.toml", "--vehicle", "car-2"],
+    "show comparison": ["docs/comparison/comparison.csv"],
+    "record export": ["nowhere.mcap", "--to", "cpm"],
+    "capacity": ["pyproject.toml"],
+}
 
 
 def every_command():

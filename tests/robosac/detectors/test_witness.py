@@ -1,5 +1,6 @@
 """What a witness reads of messages, and how it lies."""
 
+import math
 from dataclasses import replace
 
 import numpy as np
@@ -82,6 +83,11 @@ def test_what_there_is_no_time_for_says_nothing(rng):
     assert not said.maps[~np.array(read)].any()
     assert not said.over_ego[~np.array(read)].any()
     assert said.of(["a", "p"]).unread == ("p",)
+
+
+def test_reading_pauses_between_groups(rng):
+    sent = {name: messages(rng)["a"] for name in ["", *"bcdefghijklmnopqr"]}
+    assert len(list(witness().testify_in_steps("", sent))) == math.ceil(len(sent) / AT_ONCE) - 1
 
 
 def test_testimony_of_a_message_depends_on_no_other(rng):

@@ -160,9 +160,8 @@ def test_only_what_the_latest_frame_showed_is_kept():
 
 def test_honest_boxes_stay_where_they_are():
     honest = Flitting(attackers=()).last(DEFENSE)
-    apart = Flitting(attackers=()).last(with_settings(compare_frames=False))
     assert set(honest.accepted) == set(TEAM)
-    assert max(honest.suspicion.values()) < max(apart.suspicion.values())
+    assert max(honest.suspicion.values()) < 0.01
 
 
 @pytest.mark.parametrize(

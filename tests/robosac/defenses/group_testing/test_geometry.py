@@ -2,7 +2,7 @@ import numpy as np
 import pytest
 
 from robosac.boxes import pose_matrix
-from robosac.defenses.group_testing.geometry import Said, changes, crowd, followed, measure
+from robosac.defenses.group_testing.geometry import Said, changes, come_and_gone, crowd, followed, measure
 from tests.robosac.defenses.group_testing.conversing import SEEN
 
 
@@ -37,6 +37,35 @@ def test_what_was_nowhere_is_new_if_it_is_claimed_with_confidence():
     assert measure(SEEN, np.vstack([SEEN, far])).novelty == 3
     faint = far * [1, 1, 1, 1, 1, 0.2]
     assert measure(SEEN, np.vstack([SEEN, faint])).novelty == 0
+
+
+def test_it_is_told_which_boxes_are_lost_moved_and_added():
+    pushed = SEEN[:6] + np.array([2.0, 0, 0, 0, 0, 0]) * (np.arange(6) == 1)[:, None]
+    far = SEEN[:2] + [0, 30.0, 0, 0, 0, 0]
+    pair = measure(SEEN, np.vstack([pushed, far]))
+    places = pair.compared.places()
+    np.testing.assert_array_equal(places["lost"], SEEN[6:, :2])
+    np.testing.assert_array_equal(places["moved"], SEEN[1:2, :2])
+    np.testing.assert_array_equal(places["added"], far[:, :2])
+    assert pair.novelty == len(places["added"])
+    assert {name: len(of) for name, of in measure(SEEN, SEEN).compared.places().items()} == {
+        "lost": 0, "moved": 0, "added": 0,
+    }  # fmt: skip
+    real = np.arange(8) != 6
+    places = measure(SEEN, pushed, said(pushed, real=real, vouched=None)).compared.places()
+    np.testing.assert_array_equal(places["lost"], SEEN[7:, :2])
+
+
+def test_it_is_told_which_boxes_came_and_went():
+    before, now = kept(SEEN[:6]), kept(SEEN[2:])
+    came, gone = come_and_gone(before, now)
+    np.testing.assert_allclose(came[:, :2], kept(SEEN[6:])[:, :2])
+    np.testing.assert_allclose(gone[:, :2], kept(SEEN[:2])[:, :2])
+    assert changes(before, now) == 4
+    at_last = kept(SEEN[7:])[0, :2]
+    came, gone = come_and_gone(before, now, lambda boxes: (boxes[:, :2] == at_last).all(axis=1))
+    np.testing.assert_allclose(came[:, :2], kept(SEEN[6:7])[:, :2])
+    assert (len(gone), changes(before, now, lambda boxes: (boxes[:, :2] == at_last).all(axis=1))) == (2, 3)
 
 
 def test_what_somebody_else_vouches_for_is_not_new():

@@ -111,6 +111,41 @@ def test_who_lies_about_an_object_is_named_and_nobody_else(world, kind):
         assert item["places"][0] == pytest.approx(PLACE, abs=2.0)
 
 
+@pytest.mark.parametrize(("world", "done"), [(GHOST, "invented"), (ERASED, "removed"), (MOVED, "displaced")])
+def test_what_is_wrong_by_somebodys_fault_is_told_with_its_place(world, done):
+    decision, tested = world.play(1, quiet=6)[0]
+    found = [each for each in decision.differences if each.test == "objects"]
+    assert found
+    for each in found:
+        assert set(each.teammates) - set(each.beside) == {LIAR}
+        assert {each.teammates, each.beside} <= set(tested)
+        places = {kind: where for kind, where in each.places().items() if len(where)}
+        assert set(places) == {done}
+        np.testing.assert_allclose(places[done], [PLACE], atol=2.0)
+    assert HONEST.play(1, quiet=6)[0][0].differences
+    assert not [each for each in HONEST.play(1, quiet=6)[0][0].differences if each.test == "objects"]
+
+
+def test_what_fusions_show_otherwise_than_each_other_is_told():
+    """Each fusion beside the ego alone and beside its parts, and beside itself in the frame before."""
+    (before, _), (decision, tested) = GHOST.play(2, quiet=6)
+    again = [each for each in decision.differences if each.test == "change"]
+    assert {each.teammates for each in again} <= set(tested)
+    assert all(each.teammates == each.beside for each in again)
+    beside_ego = [each for each in before.differences if each.test == "ego"]
+    assert beside_ego
+    for each in beside_ego:
+        assert each.beside == ()
+        added = each.places()["added"]
+        assert len(added) == (LIAR in each.teammates)
+        assert added.tolist() == [PLACE.tolist()] * len(added)
+    pairs = [each for each in before.differences if each.test == "pair"]
+    assert pairs
+    for each in pairs:
+        brought = LIAR in each.teammates and LIAR not in each.beside
+        assert len(each.places()["added"]) == brought
+
+
 def test_without_testimony_a_lie_names_nobody():
     """A single object is below what whole fusions show."""
     world = World({}, GHOST.shows)

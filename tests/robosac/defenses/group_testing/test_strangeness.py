@@ -7,7 +7,7 @@ import pytest
 
 from robosac.defenses.group_testing.geometry import PairMeasure
 from robosac.defenses.group_testing.model import CHANGE_EDGES, CLEAN, LOSS_EDGES, NOVELTY_EDGES
-from robosac.defenses.group_testing.strangeness import PRIOR, STRETCHES, Strangeness, stretched
+from robosac.defenses.group_testing.strangeness import PRIOR, STRETCHES, TESTS, Strangeness, stretched
 from tests.robosac.defenses.group_testing.conversing import make_model
 
 MODEL = make_model().with_lies
@@ -44,28 +44,46 @@ def test_only_what_honest_messages_show_is_stretched():
 def told(strangeness, shown, certain_cell=0):
     cells = np.zeros(MODEL.pairs.shape[0])
     cells[certain_cell] = 1.0
-    strangeness.learn(MODEL.pair(0, 1, shown), cells, 1.0)
+    strangeness.learn("ego", MODEL.pair(0, 1, shown), cells, 1.0)
 
 
 def test_the_session_learns_how_strange_its_world_is():
     strangeness = Strangeness()
     for _ in range(6):
         told(strangeness, PairMeasure(0.35, 0))
-    assert strangeness.weights[2:].sum() > 0.9
-    assert strangeness.weights.sum() == pytest.approx(1.0)
+    assert strangeness.weights["ego"][2:].sum() > 0.9
+    assert strangeness.weights["ego"].sum() == pytest.approx(1.0)
     again = Strangeness.from_state(json.loads(json.dumps(strangeness.to_state())))
-    assert again.weights == pytest.approx(strangeness.weights)
+    for test in TESTS:
+        assert again.weights[test] == pytest.approx(strangeness.weights[test])
+
+
+def test_fusions_that_flicker_are_not_made_less_strange_by_those_that_lose_nothing():
+    strangeness, cells = Strangeness(), np.zeros(MODEL.pairs.shape[0])
+    cells[0] = 1.0
+    for _ in range(6):
+        told(strangeness, PairMeasure(0.01, 0))
+        strangeness.learn("change", MODEL.change(1, 20, 6)[:, : len(cells)], cells, 1.0)
+    assert strangeness.weights["ego"][0] > PRIOR[0]
+    assert strangeness.weights["change"][0] < 0.1
+    assert strangeness.weights["pair"] == pytest.approx(np.array(PRIOR))
 
 
 def test_what_attackers_show_says_nothing_about_the_world():
     strangeness = Strangeness()
     for _ in range(20):
         told(strangeness, PairMeasure(0.9, 20), certain_cell=CLEAN)
-    assert strangeness.weights == pytest.approx(np.array(PRIOR))
+    assert strangeness.weights["ego"] == pytest.approx(np.array(PRIOR))
 
 
 def test_what_was_learned_fades():
-    strangeness = Strangeness(np.array([0.0, 0.0, 0.0, 1.0]))
+    strangeness = Strangeness({test: np.array([0.0, 0.0, 0.0, 1.0]) for test in TESTS})
     for _ in range(400):
         strangeness.step()
-    assert strangeness.weights == pytest.approx(np.array(PRIOR), abs=0.01)
+    for test in TESTS:
+        assert strangeness.weights[test] == pytest.approx(np.array(PRIOR), abs=0.01)
+
+
+def test_a_session_kept_by_an_earlier_version_begins_to_learn_anew():
+    for test, weights in Strangeness.from_state([0.1, 0.2, 0.3, 0.4]).weights.items():
+        assert weights == pytest.approx(np.array(PRIOR)), test

@@ -20,6 +20,7 @@ from robosac.evaluation.comparison import (
     compare_defenses,
     write_comparison,
 )
+from robosac.evaluation.comparison.pictures import TableError, read_table
 from robosac.evaluation.comparison.rows import NamingFigures
 from robosac.evaluation.comparison.settings import NOBODY
 from robosac.evaluation.playing import FaultyDefense
@@ -164,6 +165,42 @@ def test_the_report_holds_tables_and_pictures(rows, plan, tmp_path):
         assert float(line["infiltrated_from_5"]) == row.windows[5].infiltrated
         empty = ("ap70_se", "ap50_from_10", "infiltrated_from_10", "named_all", "honest", "milliseconds")
         assert [line[name] for name in empty] == [""] * len(empty)
+
+
+def test_a_heat_map_of_the_table_is_that_of_the_rows(rows, plan, tmp_path):
+    write_comparison(rows, plan(TRIO, SMALL), tmp_path, "")
+    heat = read_table(tmp_path / "comparison.csv", "ap70")
+    shown = {(row.setting.label, row.defense): row.whole for row in rows if row.defense != "oracle"}
+    assert heat.texts == {place: f"{figures.ap70.value:.2f}" for place, figures in shown.items()}
+    lost = {place: -figures.ap70_difference.value for place, figures in shown.items()}
+    assert heat.colours == pytest.approx(lost, abs=1e-5)
+    later = read_table(tmp_path / "comparison.csv", "ap70_from_5").colours
+    assert later == pytest.approx(
+        {(r.setting.label, r.defense): -r.windows[5].ap70_difference.value for r in rows if r.defense != "oracle"},
+        abs=1e-5,
+    )
+    passes = read_table(tmp_path / "comparison.csv", "passes_first")
+    assert passes.colours == pytest.approx({(r.setting.label, r.defense): r.passes_first for r in rows}, abs=1e-5)
+    assert read_table(tmp_path / "comparison.csv", "named_all").texts == {}
+
+
+@pytest.mark.parametrize(
+    ("text", "why"),
+    [
+        ("", "lacks one of the columns campaign, attackers, defense"),
+        ("a,b\n1,2\n", "lacks one of the columns"),
+        ("campaign,attackers,defense,ap50\npgd,1,none,0.5\n", "no figure 'ap70'; it has ap50"),
+        ("campaign,attackers,defense,ap70\npgd,one,none,0.5\n", "'one' is no number of attackers"),
+        ("campaign,attackers,defense,ap70\npgd,1,none,high\n", "'high' in ap70 is no number"),
+        ("campaign,attackers,defense,ap70\npgd\n", "is no number of attackers"),
+        ("\udcff", "is no table"),
+    ],
+)
+def test_what_is_no_table_of_a_comparison_is_explained(text, why, tmp_path):
+    path = tmp_path / "x.csv"
+    path.write_bytes(text.encode("utf-8", "surrogateescape"))
+    with pytest.raises(TableError, match=why):
+        read_table(path, "ap70")
 
 
 def test_naming_has_its_own_tables(plan, tmp_path):

@@ -5,6 +5,7 @@ import pytest
 from typer.testing import CliRunner
 
 from robosac.cli import app
+from robosac.cli.options import load_worlds
 from robosac.defenses import Undefended
 from robosac.evaluation.comparison import Extent, Plan, Setting, compare_defenses, compare_plans, write_worlds
 from robosac.evaluation.comparison.playing import attackers
@@ -129,6 +130,5 @@ def test_all_asks_for_every_world(tmp_path):
     )
     assert result.exit_code == 2
     assert "scene 0 has 5 teammates; 6 are wanted" in result.output
-    from robosac.cli.compare import _worlds
-
-    assert list(_worlds(["highway", "all", "highway"])) == ["highway", *(name for name in WORLDS if name != "highway")]
+    asked = load_worlds(["highway", "all", "highway"])
+    assert list(asked) == ["highway", *(name for name in WORLDS if name != "highway")]

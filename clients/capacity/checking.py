@@ -1,0 +1,76 @@
+"""The model against what was measured: predicted from single egos in an open loop, compared with all other loads."""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Iterator
+from dataclasses import dataclass
+
+from clients.capacity.costs import Costs, MeasuredLoad, Report, calibration, costs_of
+from clients.capacity.queueing import closed_rate
+
+WITHIN = 0.2
+"""How far a prediction may be off, of what was measured."""
+
+
+@dataclass(frozen=True)
+class Check:
+    """One figure of one load."""
+
+    load: MeasuredLoad
+    figure: str
+    predicted: float
+    measured: float
+
+    @property
+    def off(self) -> float:
+        """By how much the prediction is higher, of what was measured."""
+        return self.predicted / self.measured - 1
+
+    @property
+    def holds(self) -> bool:
+        """Whether it is near enough."""
+        return abs(self.off) <= WITHIN
+
+
+def checks(report: Report) -> list[Check]:
+    """Every load that costs were not fitted to, with its frames a second and its bytes on disk and on record.
+
+    Raises
+    ------
+    ValueError
+        As `costs_of`.
+    """
+    costs, fitted = costs_of(report), calibration(report)
+    return [check for load in report.loads if load not in fitted for check in _of_load(costs, report, load)]
+
+
+def predicted_fps(costs: Costs, load: MeasuredLoad, processes: int, cores: int) -> float:
+    r"""Frames a second of a load whose client runs on the gateway's machine.
+
+    Of each process a closed network: the process is one server, since the interpreter's lock lets one of its threads
+    work at a time; what a frame waits for besides (the disk, the client) is a delay. All together can not have more
+    processor time than there is: :math:`X \leq \mathrm{cores} / (\mathrm{CPU}_g + \mathrm{CPU}_c)`, that of the
+    gateway and of the client. Egos are spread evenly. In an open loop no more is answered than is asked. Frames that
+    are refused are not in it: measure with a budget that refuses none.
+    """
+    at = (load.teammates, load.sampling_steps_mean)
+    latency_ms = costs.latency_ms.at(*at)
+    gateway_ms, client_ms = (
+        line.at(*at) if (line := costs.used[name]) else math.nan for name in ("gateway_cpu_ms", "client_cpu_ms")
+    )
+    delay_ms = max(0.0, latency_ms - gateway_ms)
+    shares = [load.egos // processes + (number < load.egos % processes) for number in range(processes)]
+    rate = sum(closed_rate(egos, [gateway_ms], delay_ms) for egos in shares) * 1e3
+    rate = min(rate, cores * 1e3 / (gateway_ms + client_ms))
+    return rate if load.rate_hz is None else min(rate, load.egos * load.rate_hz)
+
+
+def _of_load(costs: Costs, report: Report, load: MeasuredLoad) -> Iterator[Check]:
+    fps = predicted_fps(costs, load, report.processes, report.machine.cores)
+    yield Check(load, "frames a second", fps, load.fps)
+    for name in ("disk_bytes", "audit_bytes"):
+        line, measured = costs.used[name], load.used_a_frame.get(name)
+        if line is not None and measured:
+            at = line.at(load.teammates, load.sampling_steps_mean)
+            yield Check(load, name.replace("_", " ") + " a frame", at, measured)

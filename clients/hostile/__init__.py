@@ -1,0 +1,120 @@
+"""Attacks on a gateway by somebody who has a key: each is bounded in time and in number, and says what it was answered.
+
+They run in a process of their own, so that the honest ego's clock does not wait for them.
+"""
+
+from __future__ import annotations
+
+import asyncio
+import sqlite3
+import time
+from collections import Counter
+from collections.abc import Awaitable, Callable
+from contextlib import closing
+from enum import StrEnum
+
+import httpx
+
+from clients.hostile import connections, requests, sessions
+from clients.hostile.attacker import STRANGERS, Attacker, Target, strange_frame
+
+__all__ = ["LOCKED", "STRANGERS", "Attack", "Target", "run_attack", "strange_frame"]
+
+LOCKED = 0.5
+"""Part of the time for which the database is locked; the rest shows how the gateway recovers."""
+
+
+class Attack(StrEnum):
+    """What an attacker does."""
+
+    IDLE = "idle gathers"
+    """Nine sessions wait for teammates that never send."""
+    LONG = "long budgets"
+    """One session asks for 600 hypotheses within 60 s."""
+    MANY = "many sessions"
+    """Ten sessions of one key do so at once, one frame after the other."""
+    TEAMS = "large teams"
+    """Sessions of 63 teammates send whole frames, with the default defence."""
+    BODIES = "body flood"
+    """Bodies as large as allowed that are no messages, with a good token, some sent very slowly."""
+    HEADS = "heads without end"
+    """Heads of requests that never end, most of them sent very slowly."""
+    SMALL = "small bad messages"
+    """A teammate sends messages that are none, as fast as it can."""
+    OPENING = "sessions in a loop"
+    """Sessions are opened and closed."""
+    OPENINGS = "large openings"
+    """Requests for sessions, as large as allowed, that are wrong in every part."""
+    TEAM = "joining and leaving"
+    """Teammates join, with keys of their own, and leave."""
+    TOKENS = "tokens in a loop"
+    """An ego asks for one token after the other."""
+    AUDIT = "audit in a loop"
+    """A log is read, again and again."""
+    METRICS = "metrics in a loop"
+    """Whoever has no key at all asks for what is counted."""
+    PAGES = "pages in a loop"
+    """The description of the API is asked for."""
+    VIEWERS = "viewers that do not read"
+    """As many as may watch the honest session, and none of them reads."""
+    UNREAD = "answers nobody reads"
+    """Many connections ask for long answers, and read none."""
+    PIPELINE = "pipelined requests"
+    """Thousands of requests are sent over each connection before the first answer."""
+    CHUNKS = "chunks of a byte"
+    """A body in as many chunks as it has bytes."""
+    HEADERS = "thousands of headers"
+    """Heads of many short lines."""
+    DATABASE = "locked database"
+    """Another process holds the database's write lock."""
+
+
+_PLAYED: dict[Attack, Callable[[Attacker], Awaitable[object]]] = {
+    Attack.IDLE: sessions.idle,
+    Attack.LONG: lambda attacker: sessions.long(attacker, 1),
+    Attack.MANY: lambda attacker: sessions.long(attacker, sessions.SESSIONS),
+    Attack.TEAMS: sessions.large_teams,
+    Attack.BODIES: connections.flood,
+    Attack.HEADS: connections.heads,
+    Attack.SMALL: requests.small_messages,
+    Attack.OPENING: requests.opening,
+    Attack.OPENINGS: requests.large_openings,
+    Attack.TEAM: requests.joining,
+    Attack.TOKENS: requests.tokens,
+    Attack.AUDIT: requests.audit,
+    Attack.METRICS: requests.metrics,
+    Attack.PAGES: requests.pages,
+    Attack.VIEWERS: connections.viewers,
+    Attack.UNREAD: connections.unread,
+    Attack.PIPELINE: connections.pipeline,
+    Attack.CHUNKS: connections.chunks,
+    Attack.HEADERS: connections.headers,
+}
+
+
+def run_attack(attack: Attack, target: Target, seconds: float) -> Counter[str]:
+    """Attack for a time; what was answered, by status."""
+    if attack is Attack.DATABASE:
+        return _lock(target, LOCKED * seconds)
+    return asyncio.run(_attack(attack, target, seconds))
+
+
+async def _attack(attack: Attack, target: Target, seconds: float) -> Counter[str]:
+    answers: Counter[str] = Counter()
+    limits = httpx.Limits(max_connections=None)
+    async with httpx.AsyncClient(base_url=target.url, timeout=seconds + 30.0, limits=limits) as http:
+        try:
+            async with asyncio.timeout(seconds):
+                await _PLAYED[attack](Attacker(http, target, answers))
+        except TimeoutError:
+            pass
+    return answers
+
+
+def _lock(target: Target, seconds: float) -> Counter[str]:
+    """Hold the lock with which the gateway would write."""
+    with closing(sqlite3.connect(target.database, isolation_level=None, timeout=10.0)) as connection:
+        connection.execute("BEGIN IMMEDIATE")
+        time.sleep(seconds)
+        connection.execute("ROLLBACK")
+    return Counter()

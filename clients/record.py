@@ -1,0 +1,220 @@
+"""Look into recordings of the gateway, play them again, and give them other forms."""
+
+from __future__ import annotations
+
+import asyncio
+from collections import Counter
+from collections.abc import Callable, Sequence
+from datetime import UTC, datetime
+from enum import StrEnum
+from pathlib import Path
+from typing import Annotated
+
+import typer
+from rich.console import Console
+from rich.table import Table
+
+from clients import trial
+from clients.errors import GatewayError
+from clients.playing import play_against
+from robosac import defenses
+from robosac.calibrated import calibration_of
+from robosac.cli.blame import blaming, failing
+from robosac.cli.named import load_named
+from robosac.cli.options import progress
+from robosac.cli.outputs import Force, check_file, make_folder
+from robosac.defenses import Defense, build
+from robosac.detectors import Detector
+from robosac.extras import need
+from robosac.figures import need_figures
+from robosac.recording.reading import RecordedSession, RecordingError, sessions
+
+app = typer.Typer(no_args_is_help=True, add_completion=False, help=__doc__)
+
+File = Annotated[Path, typer.Argument(help="A recording, or a folder of them.", metavar="FILE")]
+DetectorOption = Annotated[
+    str | None,
+    typer.Option(
+        "--detector", help="A detector's name, weights file or module:callable; by default the recorded name."
+    ),
+]
+SessionOption = Annotated[
+    str | None, typer.Option("--session", help="Which one, where there are several: the beginning of its id.")
+]
+SHOWN = 5
+
+
+class Form(StrEnum):
+    """What a recording can be turned into."""
+
+    RERUN = "rerun"
+    PICTURES = "pictures"
+    VIDEO = "video"
+    CPM = "cpm"
+    ROS2 = "ros2"
+
+
+@app.command()
+def info(file: File) -> None:
+    """Tell what is in a recording; 1 if one ends in the middle."""
+    console, broken = Console(), False
+    for session in _read(file):
+        opening, frames = session.opening, session.frames
+        console.print(f"[bold]Session {opening.session_id}[/bold], opened {opening.created_at}", highlight=False)
+        team = list(dict.fromkeys(name for frame in frames for name in frame.decided.team)) or opening.teammates
+        sources = Counter(frame.answer.source.value for frame in frames)
+        named = list(dict.fromkeys(name for frame in frames for name in frame.answer.named))
+        attackers = sorted({name for frame in frames if frame.truth for name in frame.truth.attackers})
+        rows = {
+            "ego": opening.ego_id,
+            "teammates": ", ".join(team),
+            "detector": f"{opening.detector} ({str(opening.weights_digest)[:12]})",
+            "defence": str(opening.defense.get("kind")),
+            "frames": _span(session),
+            "not recorded": str(sum(frame.decided.dropped for frame in frames)),
+            "messages": "whole" if opening.bodies else "digests",
+            "truth": f"of {len(frames) - session.without_truth} frames",
+            "attackers, as recorded": ", ".join(attackers) or "-",
+            "answers": ", ".join(f"{count} {source}" for source, count in sources.most_common()) or "-",
+            "named": ", ".join(named) or "-",
+        }
+        for part in session.files:
+            broken |= part.damage is not None
+            whole = "whole" if part.damage is None else f"[red]{part.damage}[/red]; what is before that is good"
+            rows[part.path.name] = f"{part.path.stat().st_size} bytes, {len(part.frames)} frames, {whole}"
+        counts = sum((Counter(part.counts) for part in session.files), Counter[str]())
+        rows["topics"] = ", ".join(f"{topic} {count}" for topic, count in counts.items())
+        table = Table(box=None, show_header=False)
+        for name, told in rows.items():
+            table.add_row(name, told)
+        console.print(table)
+    if broken:
+        raise typer.Exit(1)
+
+
+@app.command()
+def replay(
+    file: File,
+    defense: Annotated[
+        str | None,
+        typer.Option(help=f"Another defence: {', '.join(defenses.shipped())}, or module:callable."),
+    ] = None,
+    detector: DetectorOption = None,
+    own: Annotated[
+        str | None, typer.Option("--recorded-defense", help="Where the recorded defence is, if it does not ship.")
+    ] = None,
+    url: Annotated[str | None, typer.Option(help="A gateway to play it to, at the speed it was recorded.")] = None,
+    api_key: trial.ApiKey = None,
+) -> None:
+    """Decide the recorded frames again; 1 if recorded detector and defence do not come to the recorded answers."""
+    import torch  # noqa: PLC0415 (seconds to import)
+
+    torch.set_num_threads(1)  # as gateways do: another order of summation moves boxes
+    console, same = Console(), True
+    if url is not None and (detector, own) != (None, None):
+        raise typer.BadParameter("the gateway has its own detectors and defences", param_hint="--url")
+    for session in _read(file):
+        if url is None:
+            same &= _decide_again(session, detector, defense, own, console)
+        else:
+            with failing(GatewayError, RecordingError):
+                asked = None if defense is None else {"kind": defense}
+                console.print(asyncio.run(play_against(url, session, asked, api_key)), highlight=False)
+    if not same and defense is None and detector is None:
+        raise typer.Exit(1)
+
+
+@app.command()
+def export(
+    file: File,
+    to: Annotated[
+        Form,
+        typer.Option(
+            help="rerun: an .rrd file; pictures: a folder with one of each frame; video: .gif, or .mp4 where there is "
+            "ffmpeg; cpm: perceived objects as JSON Lines; ros2: MCAP with messages of ROS 2 alone."
+        ),
+    ],
+    out: Annotated[Path, typer.Option(help="The file, or for pictures the folder.")],
+    session: SessionOption = None,
+    force: Force = False,
+) -> None:
+    """Write what was recorded in another form."""
+    from robosac.playback import plain, rerun_file, views  # noqa: PLC0415 (a second to import)
+
+    if to is not Form.PICTURES:
+        check_file(out, "--out", force)
+    chosen = _one(_read(file), session)
+    if to is Form.PICTURES:
+        make_folder(out, "--out", force, *(f"{frame.number:06d}.png" for frame in chosen.frames[:1]))
+    if to is Form.RERUN:
+        need("rerun", "files of rerun")
+    if to in (Form.PICTURES, Form.VIDEO):
+        need_figures()
+    if to is Form.VIDEO and out.suffix.lower() not in views.MOVING:
+        raise typer.BadParameter(f"must end with one of {', '.join(views.MOVING)}", param_hint="--out")
+    console = Console()
+    with failing(OSError, RecordingError, views.NoFfmpeg), progress(console) as bar:
+        task = bar.add_task("frames", total=len(chosen.frames))
+        tick: Callable[[], None] = lambda: bar.advance(task)  # noqa: E731
+        score = chosen.opening.least_score
+        {
+            Form.RERUN: lambda: rerun_file.write_rerun(chosen, out),
+            Form.PICTURES: lambda: views.write_pictures(chosen, out, score, tick),
+            Form.VIDEO: lambda: views.write_moving(chosen, out, score, tick),
+            Form.CPM: lambda: plain.write_cpm(chosen, out),
+            Form.ROS2: lambda: plain.write_ros2(chosen, out),
+        }[to]()
+        bar.update(task, completed=len(chosen.frames))
+    console.print(f"{out}: {len(chosen.frames)} frames of {chosen.opening.ego_id}", highlight=False)
+
+
+def _read(file: Path) -> list[RecordedSession]:
+    with blaming("FILE", RecordingError, OSError):
+        return sessions(file)
+
+
+def _one(found: Sequence[RecordedSession], wanted: str | None) -> RecordedSession:
+    those = [session for session in found if session.opening.session_id.startswith(wanted or "")]
+    if len(those) != 1:
+        ids = ", ".join(session.opening.session_id[:8] for session in found)
+        raise typer.BadParameter(f"must choose one of {ids}", param_hint="--session")
+    return those[0]
+
+
+def _span(session: RecordedSession) -> str:
+    if not session.frames:
+        return "none"
+    first, last = session.frames[0], session.frames[-1]
+    began = datetime.fromtimestamp(first.time_ns / 1e9, UTC).strftime("%Y-%m-%dT%H:%M:%SZ")
+    seconds = (last.time_ns - first.time_ns) / 1e9
+    return f"{len(session.frames)}, numbers {first.number} to {last.number}, {began}, {seconds:.1f} s"
+
+
+def _decide_again(
+    session: RecordedSession, detector: str | None, defense: str | None, own: str | None, console: Console
+) -> bool:
+    """Whether all answers are the same."""
+    from robosac.playback.comparing import Compared  # noqa: PLC0415 (seconds to import)
+    from robosac.playback.replay import replay as decide  # noqa: PLC0415
+
+    opening = session.opening
+    loaded = load_named(detector, opening.detector, "recording")
+    other = None if defense is None else _defense(defense, loaded)
+    with blaming("--recorded-defense", ValueError):
+        kinds = None if own is None else defenses.known([own])
+    if loaded.info.weights_digest != opening.weights_digest:
+        console.print(f"{loaded.info.name} has other weights than the recorded {opening.detector}.", highlight=False)
+    compared = Compared()
+    with failing(RecordingError, OSError):
+        for frame in decide(session, loaded, other, kinds):
+            compared.add(frame)
+    by = defense or opening.defense.get("kind")
+    console.print(f"{opening.session_id}, {by} on {loaded.info.name}:", highlight=False)
+    for line in compared.lines(SHOWN if (detector, defense) == (None, None) else 0):
+        console.print(line, highlight=False)
+    return compared.same == compared.frames
+
+
+def _defense(text: str, detector: Detector) -> Defense:
+    with blaming("--defense", ValueError):
+        return build(defenses.load(text), lambda: calibration_of(detector.info))

@@ -1,0 +1,77 @@
+"""Sending again what a gateway process took and could not pass on, as it ended or its sessions moved elsewhere."""
+
+from __future__ import annotations
+
+import asyncio
+from collections import OrderedDict
+from collections.abc import AsyncIterator, Awaitable, Callable
+from typing import Any
+
+from clients.errors import FrameConflict, GatewayError, GatewayUnavailable, GatewayUnreachable, RequestRefused
+
+KEPT_FRAMES = 6
+"""Latest messages that can be sent again; the gateway takes no more ahead by default."""
+FIRST_PAUSE_S, LONGEST_PAUSE_S = 0.02, 0.5
+"""Between two attempts to reach the gateway."""
+
+
+class Standby:
+    """A teammate's side of ``GET .../standby``.
+
+    Parameters
+    ----------
+    events : callable
+        Opens the stream and gives its events.
+    send : callable
+        Posts a body once more.
+    """
+
+    def __init__(
+        self,
+        events: Callable[[], AsyncIterator[tuple[str, Any]]],
+        send: Callable[[bytes], Awaitable[object]],
+    ) -> None:
+        self._events = events
+        self._send = send
+        self._sent: OrderedDict[int, bytes] = OrderedDict()
+        self.standing = asyncio.Event()
+        """Set while the gateway knows that the vehicle stands by."""
+        self.sent_again: list[int] = []
+        """Frames."""
+
+    def sent(self, frame: int, body: bytes) -> None:
+        """A message was taken by the gateway."""
+        self._sent[frame] = body
+        if len(self._sent) > KEPT_FRAMES:
+            self._sent.popitem(last=False)
+
+    async def run(self) -> None:
+        """Stand by until the session is over, or the token is worth nothing any more."""
+        pause_s = FIRST_PAUSE_S
+        while True:
+            taken = dict(self._sent)  # what is sent from now on goes where the stream goes, or later
+            try:
+                async for event, said in self._events():
+                    if event == "standing":
+                        pause_s = FIRST_PAUSE_S
+                        await self._send_again(taken, said)
+                        self.standing.set()
+                continue
+            except (GatewayUnreachable, GatewayUnavailable):
+                await asyncio.sleep(pause_s)
+                pause_s = min(2 * pause_s, LONGEST_PAUSE_S)
+            except RequestRefused:
+                return
+            finally:
+                self.standing.clear()
+
+    async def _send_again(self, taken: dict[int, bytes], said: dict[str, Any]) -> None:
+        for frame, body in sorted(taken.items()):
+            if frame > said["answered"] and frame not in said["waiting"]:
+                try:
+                    await self._send(body)
+                except FrameConflict:  # answered meanwhile
+                    continue
+                except GatewayError:  # the next stream tells what is still to be sent
+                    return
+                self.sent_again.append(frame)

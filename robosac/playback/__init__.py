@@ -1,0 +1,1 @@
+"""What can be done with recordings: decisions made again, and other forms of what is in them."""

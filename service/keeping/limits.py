@@ -1,0 +1,23 @@
+"""What a gateway process may take of a database server."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+
+
+@dataclass(frozen=True)
+class Limits:
+    """What a gateway process takes of a PostgreSQL server.
+
+    A process that stands still within a transaction holds a session's row: it is hung up on, so that another can go on.
+    """
+
+    connections: int = 10
+    statement_s: float = 2.0
+
+    def of_server(self) -> dict[str, str]:
+        """Settings of a connection."""
+        milliseconds = str(round(self.statement_s * 1e3))
+        bounds = {"statement_timeout": milliseconds, "idle_in_transaction_session_timeout": milliseconds}
+        alive = {"tcp_keepalives_idle": "5", "tcp_keepalives_interval": "2", "tcp_keepalives_count": "3"}
+        return {"application_name": "robosac", **bounds, **alive}

@@ -1,0 +1,86 @@
+"""The audit log in PostgreSQL, in a part for each day: to forget a day is to drop its part, not to delete its lines.
+
+A line is put into the part of the day on which it is written (UTC). What was there before the log had parts is the part
+of day 0. A part can be dropped when no session whose log can still be read has a line in it.
+"""
+
+from __future__ import annotations
+
+import re
+import time
+from datetime import UTC, datetime
+
+from sqlalchemy import Connection, TextClause, text
+
+from service.keeping import migrations
+
+DAY_S = 86_400
+AHEAD = 3
+"""Days after today for which there are parts already."""
+LOCK_MS = 200
+"""How long a change of parts waits for a lock, while others wait for it; then the next sweep tries again."""
+_NAME = re.compile(r"audit_lines_(\d{8})")
+BEFORE = "audit_lines_before"
+"""The part of day 0."""
+_PARTS = text("SELECT inhrelid::regclass::text FROM pg_inherits WHERE inhparent = 'audit_lines'::regclass ORDER BY 1")
+
+
+def day(moment: float | None = None) -> int:
+    """Number of a day (Unix time); by default today."""
+    return int((time.time() if moment is None else moment) // DAY_S)
+
+
+def are_there(connection: Connection) -> bool:
+    """Whether the database keeps the log in parts."""
+    return connection.dialect.name == "postgresql"
+
+
+def make_ahead(connection: Connection) -> None:
+    """Make the parts of today and the next days, where they are missing."""
+    if not are_there(connection):
+        return
+    numbers = range(day(), day() + AHEAD + 1)
+    if set(connection.execute(_PARTS).scalars()) >= {name_of(number) for number in numbers}:
+        return
+    migrations.lock(connection)
+    known = set(connection.execute(_PARTS).scalars())
+    _wait_briefly(connection)
+    for number in numbers:
+        if (name := name_of(number)) not in known:
+            values = f"FOR VALUES FROM ({number}) TO ({number + 1})"
+            connection.execute(text(f"CREATE TABLE {name} PARTITION OF audit_lines {values}"))
+
+
+def finished(connection: Connection, before: float) -> list[str]:
+    """Parts of days that ended before then (Unix time), in which no log has a line that can still be read."""
+    old = [name for name in connection.execute(_PARTS).scalars() if _day_of(name) < day(before)]
+    return [name for name in old if not connection.execute(_any_of(name)).first()]
+
+
+def drop(connection: Connection, name: str) -> None:
+    """Forget a part."""
+    _wait_briefly(connection)
+    connection.execute(text(f"DROP TABLE {name}"))
+
+
+def name_of(number: int) -> str:
+    """The part of a day."""
+    return f"audit_lines_{datetime.fromtimestamp(number * DAY_S, UTC):%Y%m%d}"
+
+
+def _day_of(name: str) -> float:
+    found = _NAME.fullmatch(name)
+    if found is None:
+        return 0 if name == BEFORE else float("inf")  # somebody else's
+    return day(datetime.strptime(found[1], "%Y%m%d").replace(tzinfo=UTC).timestamp())
+
+
+def _any_of(name: str) -> TextClause:
+    return text(
+        "SELECT 1 FROM sessions WHERE token_ids <> '{}' AND EXISTS "
+        f"(SELECT 1 FROM {name} AS part WHERE part.session_id = sessions.session_id) LIMIT 1"
+    )
+
+
+def _wait_briefly(connection: Connection) -> None:
+    connection.execute(text(f"SET LOCAL lock_timeout = {LOCK_MS}"))

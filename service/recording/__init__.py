@@ -1,0 +1,1 @@
+"""Recordings of sessions, written beside the frames and never in their way."""

@@ -1,0 +1,158 @@
+"""The folder that sessions are recorded to: a file or more of each, and never more bytes than it may have."""
+
+from __future__ import annotations
+
+import re
+import time
+from collections.abc import Iterator
+from dataclasses import dataclass, field
+from importlib.metadata import version
+from pathlib import Path
+
+from robosac.interfaces.ros2 import Ros2
+from robosac.recording.content import Moment, Opening
+from robosac.recording.writing import RecordingFile
+from service.keeping.record import SessionRecord
+
+IDLE_S = 10.0
+"""After so long without a frame a file is closed. The session's next frame begins another."""
+LOOKS = 16
+"""How often the folder is measured while as much is written as it may hold."""
+_NAME = re.compile(r"\d{8}T\d{6}Z-(?P<session>[0-9a-f]{32})-(?P<part>\d{4,})\.mcap")
+
+
+@dataclass
+class _Open:
+    """A file that is written to."""
+
+    file: RecordingFile
+    used: float
+
+
+@dataclass
+class Folder:
+    """Recordings on disk, used from one thread at a time.
+
+    Parameters
+    ----------
+    root : Path
+    most_file : int
+        Bytes of a file after which the session's next one begins.
+    most : int
+        Bytes of all recordings in the folder, of other processes' too. The oldest are removed.
+    bodies : bool
+        Whether messages are recorded, or their digests.
+    most_open : int
+        Files that are open at a time; the one unused for longest is closed for another.
+    """
+
+    root: Path
+    most_file: int
+    most: int
+    bodies: bool
+    most_open: int = 64
+    _files: dict[str, _Open] = field(default_factory=dict)
+    _ros2: Ros2 = field(default_factory=Ros2)
+    _written: int = 0
+    """Bytes since the folder was measured."""
+
+    def make(self) -> None:
+        """Make the folder, and make sure that it can be written to.
+
+        Raises
+        ------
+        OSError
+        """
+        self.root.mkdir(parents=True, exist_ok=True)
+        probe = self.root / ".probe"
+        probe.touch()
+        probe.unlink()
+
+    def recorded(self) -> set[str]:
+        """The sessions of which there are files."""
+        return {match["session"] for match, _ in self._found()}
+
+    def add(self, record: SessionRecord, moment: Moment, dropped: int) -> None:
+        """Add a frame to its session's recording.
+
+        Raises
+        ------
+        OSError
+            If it cannot be written. What was written before stays readable, and the next frame begins a new file.
+        """
+        now, session_id = time.monotonic(), record.session_id
+        opened = self._files.get(session_id) or self._begin(record, moment)
+        opened.used = now
+        try:
+            before = opened.file.size
+            opened.file.add(moment, dropped)
+            self._written += opened.file.size - before
+        except BaseException:
+            self._files.pop(session_id).file.abandon()
+            raise
+        if opened.file.size >= min(self.most_file, self.most // 2):
+            self.end(session_id)
+        if self._written * LOOKS >= self.most:
+            self.make_room()
+
+    def end(self, session_id: str) -> None:
+        """Close a session's file, if one is open.
+
+        Raises
+        ------
+        OSError
+        """
+        opened = self._files.pop(session_id, None)
+        if opened is not None:
+            opened.file.close()
+
+    def close(self, idle_s: float = 0.0) -> None:
+        """Close the files that were not written to for so long.
+
+        Raises
+        ------
+        OSError
+            If one cannot be closed; the others are closed by the next call.
+        """
+        until = time.monotonic() - idle_s
+        for session_id in [name for name, opened in self._files.items() if opened.used <= until]:
+            self.end(session_id)
+
+    def make_room(self) -> None:
+        """Remove the oldest recordings while all together are too large; those being written come last."""
+        self._written = 0
+        open_ones = {opened.file.path: name for name, opened in self._files.items()}
+        sizes: list[tuple[bool, float, int, Path]] = []
+        for _, path in self._found():
+            try:
+                told = path.stat()
+            except FileNotFoundError:  # another process was faster
+                continue
+            sizes.append((path in open_ones, told.st_mtime, told.st_size, path))
+        total = sum(size for _, _, size, _ in sizes)
+        for is_open, _, size, path in sorted(sizes):
+            if total <= self.most:
+                return
+            if is_open:
+                self._files.pop(open_ones[path]).file.abandon()
+            path.unlink(missing_ok=True)
+            total -= size
+
+    def _begin(self, record: SessionRecord, moment: Moment) -> _Open:
+        if len(self._files) >= self.most_open:
+            self.end(min(self._files, key=lambda name: self._files[name].used))
+        self.make_room()
+        part = 1 + max((int(m["part"]) for m, _ in self._found() if m["session"] == record.session_id), default=0)
+        began = time.strftime("%Y%m%dT%H%M%SZ", time.gmtime(moment.time_ns / 1e9))
+        path = self.root / f"{began}-{record.session_id}-{part:04d}.mcap"
+        kept = {name: value for name, value in vars(record).items() if name in Opening.model_fields}
+        more = {"version": version("robosac"), "least_score": moment.least_score, "bodies": self.bodies, "part": part}
+        opening = Opening(**kept, **more)
+        file = RecordingFile(path, opening, moment.time_ns, self._ros2)
+        opened = self._files[record.session_id] = _Open(file, time.monotonic())
+        return opened
+
+    def _found(self) -> Iterator[tuple[re.Match[str], Path]]:
+        for path in self.root.iterdir():
+            if match := _NAME.fullmatch(path.name):
+                yield match, path

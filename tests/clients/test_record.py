@@ -1,0 +1,119 @@
+import asyncio
+import io
+import json
+
+import pytest
+from rich.console import Console
+from typer.testing import CliRunner
+
+from clients.fleet import FleetOptions, run_fleet
+from clients.local_gateway import GatewayProcess
+from clients.playing import play_against
+from clients.record import app
+from robosac.recording.reading import RecordingError, sessions
+from tests.recorded import write
+
+
+@pytest.fixture(scope="module")
+def path(detector, recorded_moments, tmp_path_factory):
+    return write(tmp_path_factory.mktemp("recording") / "one.mcap", detector, recorded_moments[:3])
+
+
+def run(*words):
+    result = CliRunner().invoke(app, [str(word) for word in words])
+    return result.exit_code, " ".join(result.output.replace("│", " ").split())
+
+
+async def test_a_fleet_is_recorded_by_a_gateway_that_is_killed_and_played_again(tmp_path):
+    recordings = tmp_path / "recordings"
+    settings = {"ROBOSAC_RECORD": str(recordings), "ROBOSAC_LATENCY_BUDGET_MS": "5000"}
+    process = GatewayProcess(tmp_path / "log", f"sqlite:///{tmp_path}/db", settings=settings)
+    try:
+        await process.ready()
+        options = FleetOptions(process.url, scenes=1, frames=2, attack="noise", truth=True)
+        summary = await run_fleet(options, Console(file=io.StringIO()))
+        await recorded(recordings, [2])
+        (fleet,) = sessions(recordings)
+        told = await play_against(process.url, fleet)
+        assert "2 frames" in told
+        await recorded(recordings, [2, 2])
+    finally:
+        await process.kill()
+    first, second = sessions(recordings)
+    assert len(summary.attacked_from) == 1
+    attackers = {name for _, _, name in summary.attacked_from}
+    assert {frame.truth.attackers for frame in first.frames + second.frames} == {tuple(attackers)}
+    status, said = await asyncio.to_thread(run, "replay", recordings)
+    assert status == 0, said
+    assert said.count("2 of 2 answers are the same") == 2
+
+
+async def recorded(folder, frames):
+    async with asyncio.timeout(30):
+        while not list(folder.iterdir()) or [len(session.frames) for session in sessions(folder)] != frames:
+            await asyncio.sleep(0.05)
+
+
+def test_info_tells_what_is_in_it(path, tmp_path):
+    status, said = run("info", path)
+    assert status == 0, said
+    for part in ("car-1", "car-2, car-3, car-4, car-5, rsu", "group_testing", "of 3 frames", "/messages 18", "whole"):
+        assert part in said
+    broken = tmp_path / "broken.mcap"
+    broken.write_bytes(path.read_bytes()[:-2000])
+    status, said = run("info", broken)
+    assert status == 1
+    assert "what is before that is good" in said
+
+
+def test_replay_ends_with_1_only_if_the_recorded_defence_differs(path, detector, recorded_moments, tmp_path):
+    assert run("replay", path)[0] == 0
+    status, said = run("replay", path, "--defense", "none")
+    assert status == 0, said
+    assert "a recorded attacker in 3 of 3 answers" in said
+    other = write(tmp_path / "other.mcap", detector, recorded_moments[:1], defense={"kind": "none"})
+    status, said = run("replay", other)
+    assert status == 1
+    assert "0 of 1 answers are the same frame 0 differs in" in said
+
+
+@pytest.mark.parametrize(
+    ("words", "why"),
+    [
+        (("replay", "none.mcap"), "No such file"),
+        (("replay", "{path}", "--defense", "nonesuch"), "Invalid value for --defense"),
+        (("replay", "{path}", "--detector", "nonesuch"), "Invalid value for --detector"),
+        (("replay", "{path}", "--url", "http://127.0.0.1:9", "--detector", "x"), "the gateway has its own"),
+        (("export", "{path}", "--to", "video", "--out", "{folder}/x.avi"), "must end with one of .gif, .mp4"),
+        (("export", "{path}", "--to", "cpm", "--out", "{path}"), "is there already; --force"),
+        (
+            ("export", "{path}", "--to", "cpm", "--out", "{folder}/x", "--session", "nonesuch"),
+            "must choose one of 5e5e5e5e",
+        ),
+    ],
+)
+def test_what_cannot_be_done_is_said_before_it_is_begun(words, why, path, tmp_path):
+    status, said = run(*(word.format(path=path, folder=tmp_path) for word in words))
+    assert status == 2
+    assert why in said
+
+
+def test_a_recording_of_digests_cannot_be_replayed(detector, recorded_moments, tmp_path):
+    path = write(tmp_path / "digests.mcap", detector, recorded_moments[:1], bodies=False)
+    status, said = run("replay", path)
+    assert status == 1
+    assert "holds digests in the place of messages" in said
+
+
+async def test_an_empty_recording_is_played_to_nobody(detector, recorded_moments, tmp_path):
+    path = write(tmp_path / "one.mcap", detector, recorded_moments[:1])
+    (session,) = sessions(path)
+    session.files[0].frames.clear()
+    with pytest.raises(RecordingError, match="has no frames"):
+        await play_against("http://127.0.0.1:9", type(session)(session.opening, [], session.files))
+
+
+def test_perceived_objects_are_exported(path, tmp_path):
+    status, said = run("export", path, "--to", "cpm", "--out", tmp_path / "out.jsonl")
+    assert status == 0, said
+    assert [json.loads(line)["frame"] for line in (tmp_path / "out.jsonl").read_text().splitlines()] == [0, 1, 2]

@@ -1,0 +1,78 @@
+import json
+
+import pytest
+from matplotlib.image import imread
+from mcap.reader import make_reader
+from PIL import Image
+
+from robosac.interfaces.ros2 import TOPICS
+from robosac.playback.plain import write_cpm, write_ros2
+from robosac.playback.views import NoFfmpeg, write_moving, write_pictures
+from robosac.recording.reading import sessions
+from tests.recorded import write
+
+
+@pytest.fixture(scope="module")
+def session(detector, recorded_moments, tmp_path_factory):
+    some = recorded_moments[:2]
+    (session,) = sessions(write(tmp_path_factory.mktemp("recording") / "one.mcap", detector, some))
+    return session
+
+
+def test_rerun_reads_what_is_written_for_it(session, tmp_path):
+    chunk = pytest.importorskip("rerun.chunk", reason="rerun-sdk is not installed")
+    from robosac.playback.rerun_file import write_rerun
+
+    path = tmp_path / "one.rrd"
+    write_rerun(session, path)
+    reader = chunk.RrdReader(path)
+    (recording,) = reader.recordings()
+    assert (recording.application_id, recording.recording_id) == ("robosac", session.opening.session_id)
+    rows = {}
+    for part in reader.stream():
+        rows[part.entity_path] = rows.get(part.entity_path, 0) + part.num_rows
+    assert {"/world/boxes", "/world/truth", "/world/vehicles/car-1", "/suspicion/car-2", "/decision"} <= rows.keys()
+    assert rows["/world/boxes"] == 2
+
+
+def test_rerun_reads_the_recording_itself(session):
+    chunk = pytest.importorskip("rerun.chunk", reason="rerun-sdk is not installed")
+    paths = {part.entity_path for part in chunk.McapReader(session.files[0].path).stream()}
+    assert any("tf" in path for path in paths)
+
+
+def test_ros2_alone(session, tmp_path):
+    write_ros2(session, tmp_path / "ros.mcap")
+    with (tmp_path / "ros.mcap").open("rb") as file:
+        reader = make_reader(file)
+        assert reader.get_header().profile == "ros2"
+        topics = [channel.topic for _, channel, _ in reader.iter_messages()]
+    assert sorted(topics) == sorted([*TOPICS, *TOPICS])
+
+
+def test_perceived_objects_are_a_line_a_frame(session, tmp_path):
+    write_cpm(session, tmp_path / "out.jsonl")
+    lines = [json.loads(line) for line in (tmp_path / "out.jsonl").read_text().splitlines()]
+    assert [line["frame"] for line in lines] == [0, 1]
+    for line, frame in zip(lines, session.frames, strict=True):
+        assert line["perceivedObjectContainer"]["numberOfPerceivedObjects"] == len(frame.answer.boxes)
+
+
+def test_a_picture_a_frame(session, tmp_path):
+    drawn = []
+    write_pictures(session, tmp_path, 0.3, lambda: drawn.append(1))
+    assert sorted(path.name for path in tmp_path.iterdir()) == ["000000.png", "000001.png"]
+    assert imread(tmp_path / "000001.png").std() > 0.01
+    assert len(drawn) == 2
+
+
+def test_a_moving_picture(session, tmp_path):
+    write_moving(session, tmp_path / "one.gif", 0.3, lambda: None)
+    with Image.open(tmp_path / "one.gif") as picture:
+        assert picture.n_frames == 2
+
+
+def test_without_ffmpeg_a_video_is_refused(session, tmp_path, monkeypatch):
+    monkeypatch.setenv("PATH", str(tmp_path))
+    with pytest.raises(NoFfmpeg, match="there is no ffmpeg"):
+        write_moving(session, tmp_path / "one.mp4", 0.3, lambda: None)

@@ -1,0 +1,65 @@
+import dataclasses
+
+import pytest
+
+from robosac.defenses import build, read_settings
+from robosac.playback.comparing import Compared
+from robosac.playback.replay import replay
+from robosac.recording.reading import RecordingError, sessions
+from tests.recorded import write
+
+
+@pytest.fixture(scope="module")
+def some(recorded_moments):
+    return recorded_moments[:4]
+
+
+@pytest.fixture(scope="module")
+def session(detector, some, tmp_path_factory):
+    (session,) = sessions(write(tmp_path_factory.mktemp("recording") / "one.mcap", detector, some))
+    return session
+
+
+def test_recorded_decisions_come_out_the_same(session, detector):
+    replayed = list(replay(session, detector))
+    assert [each.differing for each in replayed] == [()] * 4
+    assert replayed[-1].answer.suspicion["car-2"] > 0.9
+
+
+def test_so_they_do_after_a_gap(detector, some, tmp_path):
+    (session,) = sessions(write(tmp_path / "gap.mcap", detector, [some[0], some[3]]))
+    assert [each.differing for each in replay(session, detector)] == [(), ()]
+
+
+def test_a_recording_that_was_changed_does_not(session, detector):
+    frame = session.frames[0]
+    boxes = frame.answer.boxes.copy()
+    boxes[0, 0] += 0.01
+    changed = dataclasses.replace(frame, answer=frame.answer.model_copy(update={"boxes": boxes}))
+    (only,) = replay(dataclasses.replace(session, frames=[changed]), detector)
+    assert only.differing == ("boxes",)
+
+
+def test_another_defence_decides_otherwise(session, detector):
+    undefended = build(read_settings({"kind": "none"}), None)
+    compared = Compared()
+    for each in replay(session, detector, undefended):
+        assert len(each.answer.accepted) == 5
+        compared.add(each)
+    assert (compared.same, compared.infiltrated[1], compared.with_truth) == (0, 4, 4)
+    first, *_, made = compared.lines(0)
+    assert first == "  0 of 4 answers are the same"
+    assert "a recorded attacker in 4 of 4 answers" in made
+
+
+def test_a_defence_that_is_not_known_is_named(session, detector):
+    opening = session.opening.model_copy(update={"defense": {"kind": "nonesuch"}})
+    with pytest.raises(RecordingError, match="make no defence"):
+        list(replay(dataclasses.replace(session, opening=opening), detector))
+
+
+def test_a_team_that_changed_is_the_one_that_decides(detector, some, tmp_path):
+    smaller = [dataclasses.replace(m, team=m.team[:-1], fused=m.fused[:-1]) for m in some[:1]]
+    (session,) = sessions(write(tmp_path / "team.mcap", detector, [*smaller, some[1]]))
+    undefended = build(read_settings({"kind": "none"}), None)
+    assert [len(each.answer.accepted) for each in replay(session, detector, undefended)] == [4, 5]

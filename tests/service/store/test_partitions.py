@@ -1,0 +1,172 @@
+"""The log in a part for each day, in PostgreSQL."""
+
+import time
+
+import asyncpg
+import pytest
+from alembic import command
+from alembic.config import Config
+from sqlalchemy import text
+
+from service.errors import SessionOver, StoreUnavailable
+from service.keeping import partitions
+from service.keeping.database import connect
+from service.keeping.limits import Limits
+from service.keeping.partitions import AHEAD, DAY_S, day, name_of
+from service.keeping.store import Store
+from tests.service.store.conftest import THE_END, added, all_of, check_chain, decided, note, opened
+from tests.service.store.test_database import INI
+
+
+@pytest.fixture
+async def url(postgres):
+    return await postgres.new_database()
+
+
+async def run(url, *statements):
+    connection = await asyncpg.connect(url.replace("+asyncpg", ""))
+    try:
+        return [await connection.fetch(statement) for statement in statements][-1]
+    finally:
+        await connection.close()
+
+
+async def parts(url):
+    return [
+        row[0]
+        for row in await run(
+            url, "SELECT inhrelid::regclass::text FROM pg_inherits WHERE inhparent = 'audit_lines'::regclass ORDER BY 1"
+        )
+    ]
+
+
+async def written_on(url, sid, number):
+    """Let a session's lines be of another day."""
+    name, values = name_of(number), f"FOR VALUES FROM ({number}) TO ({number + 1})"
+    await run(
+        url,
+        f"CREATE TABLE IF NOT EXISTS {name} PARTITION OF audit_lines {values}",
+        f"UPDATE audit_lines SET day = {number} WHERE session_id = '{sid}'",
+    )
+
+
+async def test_there_are_parts_for_today_and_the_next_days(url):
+    async with opened(url) as store, opened(url):
+        sid = await added(store)
+        await decided(store, sid, 1)
+        await check_chain(store, sid)
+    today = [name_of(day() + ahead) for ahead in range(AHEAD + 1)]
+    assert await parts(url) == sorted([*today, partitions.BEFORE])
+    assert (await run(url, f"SELECT count(*) FROM {today[0]}"))[0][0] == 2
+
+
+async def test_what_was_there_before_stays_and_the_log_goes_on(url):
+    database = connect(url)
+
+    def before(connection):
+        config = Config(INI)
+        config.attributes["connection"] = connection
+        command.upgrade(config, "0005")
+
+    await database.write(before)
+    await run(url, "ALTER TABLE audit_lines ADD COLUMN day bigint DEFAULT 0")  # for the code of today
+    store = Store(url)
+    sid = await added(store)
+    await store.log(sid, note())
+    await store.close()
+    await run(url, "ALTER TABLE audit_lines DROP COLUMN day")
+    async with opened(url) as store:
+        await store.log(sid, note())
+        assert len(await check_chain(store, sid)) == 3
+    assert (await run(url, f"SELECT count(*) FROM {partitions.BEFORE}"))[0][0] == 2
+    assert partitions._day_of(partitions.BEFORE) == 0
+
+    def back_and_forth(connection):
+        config = Config(INI)
+        config.attributes["connection"] = connection
+        command.downgrade(config, "0005")
+        command.upgrade(config, "head")
+
+    await database.write(back_and_forth)
+    await database.close()
+    async with opened(url) as store:
+        await store.log(sid, note())
+        assert len(await check_chain(store, sid)) == 4
+
+
+async def test_a_day_goes_as_a_whole_once_nobody_can_read_its_logs(url):
+    now, old = time.time(), day() - 9
+    async with opened(url) as store:
+        ended, other, open_one = [await added(store, number) for number in range(3)]
+        for sid in (ended, other):
+            await store.end(sid, THE_END)
+            await written_on(url, sid, old)
+        await written_on(url, open_one, old)
+        await run(url, f"UPDATE sessions SET touched_at = {now - 8 * DAY_S} WHERE session_id = '{ended}'")
+        await store.purge(now - 7 * DAY_S)
+        assert name_of(old) in await parts(url)  # two logs in it can be read
+        assert await store.get(ended) is None
+        assert await store.audit(ended, 0) == []
+        assert len(await check_chain(store, other)) == 2
+        await run(url, f"UPDATE sessions SET touched_at = {now - 8 * DAY_S} WHERE session_id = '{other}'")
+        await store.end(open_one, THE_END)
+        await run(
+            url,
+            f"UPDATE sessions SET touched_at = {now - 8 * DAY_S}",
+            f"UPDATE audit_lines SET day = {old} WHERE session_id = '{open_one}'",
+        )
+        await store.purge(now - 7 * DAY_S)
+        assert name_of(old) not in await parts(url)
+        assert [await store.get(sid) for sid in (ended, other, open_one)] == [None] * 3
+        with pytest.raises(SessionOver):
+            await store.log(other, note())
+
+
+async def test_a_part_of_young_lines_is_kept_though_nobody_reads_it(url):
+    async with opened(url) as store:
+        sid = await added(store)
+        await store.end(sid, THE_END)
+        await run(url, f"UPDATE sessions SET touched_at = {time.time() - 3 * DAY_S}")
+        await store.purge(time.time() - 2 * DAY_S)
+        assert name_of(day()) in await parts(url)
+        kept = await store.get(sid)
+        assert kept.purging  # and goes with the day
+
+
+async def test_who_stands_still_in_a_transaction_or_takes_too_long_is_hung_up_on(url):
+    async with opened(url) as store:
+        sid = await added(store)
+    stuck = connect(url, Limits(connections=1, statement_s=0.3))
+    try:
+        with pytest.raises(StoreUnavailable):
+            await stuck.write(lambda connection: connection.execute(text("SELECT pg_sleep(5)")))
+
+        def dawdle(connection):
+            connection.execute(text(f"SELECT 1 FROM sessions WHERE session_id = '{sid}' FOR UPDATE"))
+            time.sleep(1.0)  # the whole process stands still
+            connection.execute(text("SELECT 1"))
+
+        with pytest.raises(StoreUnavailable):
+            await stuck.write(dawdle)
+    finally:
+        await stuck.close()
+    async with opened(url) as store:
+        began = time.monotonic()
+        await store.log(sid, note())
+        assert time.monotonic() - began < 1.5
+
+
+def connected(connection):
+    """Connections at a moment when others wait for one."""
+    connection.execute(text("SELECT pg_sleep(0.05)"))
+    count = "SELECT count(*) FROM pg_stat_activity WHERE application_name = 'robosac' AND datname = current_database()"
+    return connection.execute(text(count)).scalar()
+
+
+async def test_a_process_takes_no_more_connections_than_it_may(url):
+    database = connect(url, Limits(connections=2))
+    try:
+        counted = await all_of(*(database.write(connected) for _ in range(6)))
+    finally:
+        await database.close()
+    assert max(counted) == 2

@@ -1,0 +1,87 @@
+"""Two gateway processes behind the real HAProxy, with the configuration that ships and TLS."""
+
+import asyncio
+import datetime
+import ipaddress
+import subprocess
+from pathlib import Path
+
+import httpx
+import pytest
+from cryptography import x509
+from cryptography.hazmat.primitives import hashes
+from cryptography.hazmat.primitives.asymmetric import ec
+from cryptography.hazmat.primitives.serialization import Encoding, NoEncryption, PrivateFormat
+from cryptography.x509.oid import NameOID
+
+from clients.continuity import Traffic, affinity, prepare
+from clients.load_test import DEFENSE
+from clients.proxied import configured, program, proxied
+
+CONFIG = Path(__file__).parents[2] / "deploy" / "haproxy.cfg"
+KEY = "a-key-of-the-proxied-gateway"
+pytestmark = pytest.mark.skipif(program() is None, reason="HAProxy is not installed")
+
+
+@pytest.fixture(scope="module")
+def certificate(tmp_path_factory):
+    """A certificate of loopback, signed by itself, and its key."""
+    key = ec.generate_private_key(ec.SECP256R1())
+    name = x509.Name([x509.NameAttribute(NameOID.COMMON_NAME, "localhost")])
+    now = datetime.datetime.now(datetime.UTC)
+    names = [x509.DNSName("localhost"), x509.IPAddress(ipaddress.ip_address("127.0.0.1"))]
+    made = (
+        x509.CertificateBuilder(name, name, key.public_key(), x509.random_serial_number())
+        .not_valid_before(now - datetime.timedelta(hours=1))
+        .not_valid_after(now + datetime.timedelta(days=1))
+        .add_extension(x509.SubjectAlternativeName(names), critical=False)
+        .add_extension(x509.BasicConstraints(ca=True, path_length=None), critical=True)
+        .sign(key, hashes.SHA256())
+    )
+    path = tmp_path_factory.mktemp("tls") / "gateway.pem"
+    private = key.private_bytes(Encoding.PEM, PrivateFormat.PKCS8, NoEncryption())
+    path.write_bytes(private + made.public_bytes(Encoding.PEM))
+    return path
+
+
+def test_what_ships_is_a_configuration(tmp_path, certificate):
+    text = CONFIG.read_text().replace("/etc/robosac/gateway.pem", str(certificate))
+    (tmp_path / "haproxy.cfg").write_text(text)
+    checked = subprocess.run(
+        [program(), "-c", "-f", tmp_path / "haproxy.cfg"], check=False, capture_output=True, text=True
+    )
+    assert (checked.returncode, checked.stderr) == (0, "")
+
+
+def test_only_the_shipped_configuration_is_changed():
+    with pytest.raises(ValueError, match="ships"):
+        configured("frontend gateway\n    bind :80\n", [1, 2], 3, None)
+
+
+async def test_sessions_go_on_while_one_process_is_restarted_and_the_other_is_killed(tmp_path, certificate):
+    async with proxied(CONFIG, tmp_path, f"sqlite:///{tmp_path}/robosac.db", KEY, 2, certificate) as gateways:
+        with pytest.raises(httpx.ConnectError, match="certificate"):  # nobody vouches for it but the test
+            await asyncio.to_thread(httpx.get, f"{gateways.url}/readyz", trust_env=False)
+        async with gateways.client() as client:
+            refused = await client._http.get("/metrics")
+            assert refused.status_code == 404
+            traffic = Traffic(client, prepare(2), rate_hz=3.0, budget_ms=20_000.0)
+            await traffic.open(4, DEFENSE)
+            traffic.begin("both")
+            await asyncio.sleep(1.0)
+            traffic.begin("restart")
+            await gateways.restart(0, gently=True)
+            await asyncio.sleep(1.5)  # until the proxy has seen it twice
+            traffic.begin("kill")
+            await gateways.end(1, gently=False)
+            await asyncio.sleep(1.0)
+            await traffic.stop()
+            wrong, writers = await traffic.check()
+    assert wrong == []
+    assert affinity(writers, moves=3) == []
+    assert all(len(names) >= 2 for names in writers)  # wherever it was, it had to move
+    for phase in traffic.phases:
+        told = phase.as_dict()
+        assert phase.answered >= 4, told
+        assert (phase.whole, phase.tested) == (phase.answered, phase.answered), told
+        assert phase.answered + phase.refused["decided, the answer lost"] == phase.asked, told
