@@ -140,7 +140,7 @@ def _built(
     settings: Settings, api_keys: ApiKeys, tokens: Tokens, seeds: Callable[[], str], tracing: Tracing
 ) -> Gateway:
     engine, metrics = Engine(settings.torch_threads, settings.extra_detectors), Metrics()
-    admission = Admission(settings.max_hypotheses, engine.lead)
+    admission = Admission(settings.max_hypotheses, engine)
     store = Store(
         settings.database_url,
         full_every=settings.audit_full_every,

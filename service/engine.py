@@ -8,7 +8,7 @@ import logging
 import math
 import threading
 import time
-from collections.abc import Callable, Mapping, Sequence
+from collections.abc import Callable, Iterable, Mapping, Sequence
 from concurrent.futures import Future, ThreadPoolExecutor
 from copy import copy
 from dataclasses import dataclass
@@ -26,11 +26,14 @@ from robosac.fusion import FusionResult
 from robosac.session import Session
 from robosac.steps import Steps
 from service.errors import Kind, Refused
-from service.turns import Turns
+from service.turns import Turns, Work
 
 logger = logging.getLogger(__name__)
 
 T = TypeVar("T")
+
+LEAST = 0.5
+"""Part of what a frame is expected to take that it takes at least, however little is tested."""
 
 
 @dataclass(frozen=True)
@@ -47,12 +50,14 @@ class Decided:
 class _Job:
     """A frame that is being decided."""
 
-    def __init__(self, key: str, session_id: str, due: float, steps: Steps[FusionResult]) -> None:
-        self.key, self.session_id, self.due = key, session_id, due
+    def __init__(self, work: Work, steps: Steps[FusionResult], others_s: float) -> None:
+        self.work = work
         self.done: Future[Decided] = Future()
         self._steps = steps
         self._submitted = time.perf_counter()
-        self._worked_s = 0.0
+        self._had_s = work.had_s
+        self._others_s = others_s
+        """What all had when it was submitted."""
 
     def step(self) -> bool:
         """Do the next step; whether there are more."""
@@ -61,19 +66,28 @@ class _Job:
             next(self._steps)
         except StopIteration as stop:
             now = time.perf_counter()
-            worked_s = self._worked_s + now - began
-            self._end(Decided(stop.value, worked_s, now - self._submitted - worked_s))
+            worked_s = self.work.had_s - self._had_s + now - began
+            self.end(Decided(stop.value, worked_s, now - self._submitted - worked_s))
             return False
         except BaseException as error:
-            if self.done.set_running_or_notify_cancel():
-                self.done.set_exception(error)
+            self.fail(error)
             return False
-        self._worked_s += time.perf_counter() - began
         return True
 
-    def _end(self, decided: Decided) -> None:
+    def is_hopeless(self, now: float, others_s: float) -> bool:
+        """Whether it cannot be in time any more, for the time that others had."""
+        late_s = now + LEAST * self.work.expected_s - self.work.due
+        return self.work.had_s == 0 and 0 < late_s <= others_s - self._others_s
+
+    def end(self, decided: Decided) -> None:
+        """It is decided."""
         if self.done.set_running_or_notify_cancel():
             self.done.set_result(decided)
+
+    def fail(self, error: BaseException) -> None:
+        """It cannot be decided."""
+        if self.done.set_running_or_notify_cancel():
+            self.done.set_exception(error)
 
 
 class Begun:
@@ -134,7 +148,8 @@ class Engine:
         self._extra = extra_detectors
         self._executor = ThreadPoolExecutor(1, "fusion", initializer=torch.set_num_threads, initargs=(threads,))
         self._lock = threading.Lock()
-        self._turns: Turns[_Job] = Turns()
+        self._turns = Turns()
+        self._jobs: dict[Work, _Job] = {}
         self._working = False
         self._detectors: dict[str, Detector] = {}
         self.ready = False
@@ -176,30 +191,39 @@ class Engine:
         seed: int,
         deadline: Deadline,
         *,
-        key: str = "",
-        session_id: str = "",
-        due: float = math.inf,
+        work: Work | None = None,
         ahead: Ahead | None = None,
     ) -> Decided:
         """Decide a frame on the engine's thread, from what the session remembers at this moment.
 
-        Between two passes frames of other sessions may have their turns, see `service.turns`; a frame that is due first
-        (``due``, of `time.perf_counter`) goes first where that is fair.
+        Between two passes frames of other sessions may have their turns, see `service.turns`.
+
+        Raises
+        ------
+        Refused
+            With the kind ``overloaded``, if others had so many turns that it cannot be in time any more.
         """
         rng = np.random.default_rng(seed)
         steps = copy(session).decide_in_steps(frame, ego, teammates, rng, deadline, detector=ahead)
-        job = _Job(key, session_id, due, steps)
+        work = Work("", "", math.inf, 0.0) if work is None else work
         with self._lock:
-            self._turns.add(job)
+            self._jobs[work] = job = _Job(work, steps, self._turns.charged_s)
+            work.over = False
+            self._turns.add(work)
             wake, self._working = not self._working, True
         if wake:
             self._executor.submit(self._work)
         return await asyncio.wrap_future(job.done)
 
-    def lead(self, key: str, session_id: str, other_key: str, other_session: str) -> float:
+    def order(self, works: Iterable[Work]) -> list[Work]:
+        """As `service.turns.Turns.order`."""
+        with self._lock:
+            return self._turns.order(works)
+
+    def lead(self, work: Work, other: Work) -> float:
         """As `service.turns.Turns.lead`."""
         with self._lock:
-            return self._turns.lead(key, session_id, other_key, other_session)
+            return self._turns.lead(work, other)
 
     def begin(self, session: Session, ego: Message) -> Begun:
         """Work out what can be of a session's frame while its teammates are waited for."""
@@ -225,18 +249,27 @@ class Engine:
                 began = time.perf_counter()
                 goes_on = not job.done.cancelled() and job.step()
                 with self._lock:
-                    self._turns.charge(job, time.perf_counter() - began)
+                    self._turns.charge(job.work, time.perf_counter() - began)
                     if not goes_on:
-                        self._turns.remove(job)
+                        self._remove(job)
         except BaseException:
             self._working = False
             raise
 
     def _next(self) -> _Job | None:
-        """The work whose turn it is."""
+        """The frame whose turn it is. Those that have become hopeless are refused."""
         with self._lock:
+            now = time.perf_counter()
+            for job in [job for job in self._jobs.values() if job.is_hopeless(now, self._turns.charged_s)]:
+                self._remove(job)
+                job.fail(Refused(Kind.OVERLOADED, "other frames took the time that this one had", retry_after_s=1))
             self._working = len(self._turns) > 0
-            return self._turns.next() if self._working else None
+            return self._jobs[self._turns.next(now)] if self._working else None
+
+    def _remove(self, job: _Job) -> None:
+        job.work.over = True
+        self._turns.remove(job.work)
+        del self._jobs[job.work]
 
     def stop(self) -> None:
         """Finish what was submitted."""

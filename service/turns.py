@@ -2,38 +2,51 @@
 
 from __future__ import annotations
 
-from collections import Counter, OrderedDict
-from typing import Generic, Protocol, TypeVar
+from collections import Counter, OrderedDict, defaultdict
+from collections.abc import Iterable
+from dataclasses import dataclass, field
+from operator import itemgetter
 
 SLACK_S = 0.02
-"""How much more than the others one may have had and still go first, if it is due first."""
-
-
+"""How much more than the others one may have at the end of its work and still go first, if it is due first."""
 CREDIT_S = 0.1
 """How far behind the others one may be that was away for a while: a claim to that much is kept, to more it is lost."""
-
-
 KNOWN = 4096
 """Parties that are remembered while they want nothing."""
+LEAST_S, MOST_S = 0.002, 0.5
+"""What work is taken to want yet, however little or much is expected. So long it may hold up those who had as much."""
+LAST_STEPS = 3
+"""Steps before work is due from which on it goes first, if it was begun; and as many after, no more."""
 
 
-class Waiting(Protocol):
-    """Work that waits for its next turn."""
+@dataclass(eq=False)
+class Work:
+    """A piece of work for a session of an API key. It is done in steps."""
+
+    key: str
+    session_id: str
+    due: float
+    """When it has to be over; seconds of `time.perf_counter`."""
+    expected_s: float
+    """The time that it is expected to want."""
+    had_s: float = 0.0
+    """The time that it had."""
+    longest_step_s: float = field(default=0.0, repr=False)
+    over: bool = False
 
     @property
-    def key(self) -> str:
-        """The API key that it is done for."""
+    def left_s(self) -> float:
+        """What it is taken to want yet."""
+        return min(max(self.expected_s - self.had_s, LEAST_S), MOST_S)
 
-    @property
-    def session_id(self) -> str:
-        """The session that it is done for."""
+    def is_urgent(self, now: float) -> bool:
+        """Whether it was begun, and must have its turn now to be over in time, or hardly late."""
+        return self.had_s > 0 and abs(self.due - now) < LAST_STEPS * self.longest_step_s
 
-    @property
-    def due(self) -> float:
-        """When it is due; seconds."""
-
-
-W = TypeVar("W", bound=Waiting)
+    def charge(self, seconds: float) -> None:
+        """It had a step."""
+        self.had_s += seconds
+        self.longest_step_s = max(self.longest_step_s, seconds)
 
 
 class _Shares:
@@ -75,13 +88,10 @@ class _Shares:
 
     def had(self, party: str) -> float:
         """What a party had, as it counts beside the others."""
+        if party in self._present:
+            return self._had_s[party]
         self._raise_floor()
         return max(self._had_s.get(party, self._floor_s), self._floor_s - CREDIT_S)
-
-    def entitled(self) -> set[str]:
-        """Those present that had least, or not much more."""
-        most = min((self._had_s[party] for party in self._present), default=0.0) + SLACK_S
-        return {party for party in self._present if self._had_s[party] <= most}
 
     def charge(self, party: str, seconds: float) -> None:
         """A party had its turn."""
@@ -91,12 +101,14 @@ class _Shares:
         self._floor_s = max(self._floor_s, min((self._had_s[party] for party in self._present), default=0.0))
 
 
-class Turns(Generic[W]):
-    """Pieces of work that take turns.
+class Turns:
+    """Pieces of work that take turns, step by step.
 
-    1. A key may go next if it had no more time than any other key that wants some, but for `SLACK_S`.
-    2. Of such a key a session may go next if it had no more than any other of the key's that wants some, likewise.
+    1. A key may go next if it will have had less than any other once a piece of its work is over, as in fair queueing,
+       but for `SLACK_S`. So work that was begun is not put off for that of equals.
+    2. Of such a key a session may go next by the same rule.
     3. Of the work of these sessions, what is due first goes next.
+    4. Work that was begun, and is about to be due, goes before all others: it ends then with what it has.
 
     Time that nobody else wanted is not held against anybody for longer than others have to catch up. Of time that
     somebody did not want, no more than `CREDIT_S` is saved up: so who wants little goes first among those who always
@@ -104,21 +116,23 @@ class Turns(Generic[W]):
     """
 
     def __init__(self) -> None:
-        self._jobs: list[W] = []
+        self._works: list[Work] = []
         self._keys = _Shares()
         self._sessions: OrderedDict[str, _Shares] = OrderedDict()
+        self.charged_s = 0.0
+        """Time that all had."""
 
     def __len__(self) -> int:
-        return len(self._jobs)
+        return len(self._works)
 
-    def add(self, job: W) -> None:
+    def add(self, work: Work) -> None:
         """Let work take turns from now on."""
-        self._jobs.append(job)
-        self._keys.join(job.key)
-        self._sessions.setdefault(job.key, _Shares()).join(job.session_id)
-        self._sessions.move_to_end(job.key)
+        self._works.append(work)
+        self._keys.join(work.key)
+        self._sessions.setdefault(work.key, _Shares()).join(work.session_id)
+        self._sessions.move_to_end(work.key)
 
-    def next(self) -> W:
+    def next(self, now: float) -> Work:
         """The work whose turn it is.
 
         Raises
@@ -126,36 +140,73 @@ class Turns(Generic[W]):
         IndexError
             If there is none.
         """
-        if not self._jobs:
+        if not self._works:
             raise IndexError("nothing waits")
-        if len(self._jobs) == 1:
-            return self._jobs[0]
-        may = {key: self._sessions[key].entitled() for key in self._keys.entitled()}
-        return min((job for job in self._jobs if job.session_id in may.get(job.key, ())), key=lambda job: job.due)
+        if len(self._works) == 1:
+            return self._works[0]
+        by_key = self._by_key(self._works)
+        claims = {key: self._keys.had(key) + of_key[0][1].left_s for key, of_key in by_key.items()}
+        most_s = min(claims.values()) + SLACK_S
+        first = [
+            work
+            for key, of_key in by_key.items()
+            if claims[key] <= most_s
+            for claim_s, work in of_key
+            if claim_s <= of_key[0][0] + SLACK_S
+        ]
+        return min([work for work in self._works if work.is_urgent(now)] or first, key=lambda work: work.due)
 
-    def charge(self, job: W, seconds: float) -> None:
+    def order(self, works: Iterable[Work]) -> list[Work]:
+        """Work in the order in which it would be over if no other came, as far as claims tell.
+
+        Its sessions are no longer new then: if work is refused for the sake of others, what they have meanwhile counts
+        for it.
+        """
+        works = list(works)
+        for work in works:
+            self._keys.know(work.key)
+            self._sessions.setdefault(work.key, _Shares()).know(work.session_id)
+        self._forget()
+        claims = []
+        for key, of_key in self._by_key(works).items():
+            claim_s = self._keys.had(key)
+            for _, work in of_key:
+                claim_s += work.left_s
+                claims.append((claim_s, work))
+        return [work for _, work in sorted(claims, key=itemgetter(0))]
+
+    def charge(self, work: Work, seconds: float) -> None:
         """Work had its turn, which took so long."""
-        self._keys.charge(job.key, seconds)
-        self._sessions[job.key].charge(job.session_id, seconds)
+        work.charge(seconds)
+        self.charged_s += seconds
+        self._keys.charge(work.key, seconds)
+        self._sessions[work.key].charge(work.session_id, seconds)
 
-    def remove(self, job: W) -> None:
+    def remove(self, work: Work) -> None:
         """Work is done, or wanted no more."""
-        self._jobs.remove(job)
-        self._keys.leave(job.key)
-        self._sessions[job.key].leave(job.session_id)
+        self._works.remove(work)
+        self._keys.leave(work.key)
+        self._sessions[work.key].leave(work.session_id)
         self._forget()
 
-    def lead(self, key: str, session_id: str, other_key: str, other_session: str) -> float:
-        """For how long work of a session goes before that of another, as one of them had less than the other until now;
-        seconds, negative where it goes after.
+    def lead(self, work: Work, other: Work) -> float:
+        """How much more one had than the other until now; seconds, negative where it had less.
 
-        Between keys the keys' shares count, within a key those of its sessions. The session is no longer new then: if
-        its work is refused for the sake of others, what they have meanwhile counts for it.
+        Between keys the keys' shares count, within a key those of its sessions.
         """
-        if key != other_key:
-            return self._keys.had(other_key) - self._keys.know(key)
-        sessions = self._sessions.setdefault(key, _Shares())
-        return sessions.had(other_session) - sessions.know(session_id)
+        if work.key != other.key:
+            return self._keys.had(other.key) - self._keys.had(work.key)
+        sessions = self._sessions.setdefault(work.key, _Shares())
+        return sessions.had(other.session_id) - sessions.had(work.session_id)
+
+    def _by_key(self, works: Iterable[Work]) -> dict[str, list[tuple[float, Work]]]:
+        """Work of each key, and what its session will have had once it is over, by which it is sorted."""
+        by_key: defaultdict[str, list[tuple[float, Work]]] = defaultdict(list)
+        for work in works:
+            by_key[work.key].append((self._sessions[work.key].had(work.session_id) + work.left_s, work))
+        for of_key in by_key.values():
+            of_key.sort(key=itemgetter(0))
+        return by_key
 
     def _forget(self) -> None:
         while len(self._sessions) - len(self._keys) > KNOWN:

@@ -102,8 +102,8 @@ class Frames:
                     await self.sessions.moving.hold(caller, until)
                     asked.messages = await self._gathered(asked, until)
                     asked.spent("gather", began)
-                with self.admission.frame(caller.live.key, session_id, asked.due - time.perf_counter()):
-                    return await self.deciding.answer(asked)
+                with self.admission.frame(caller.live.key, session_id, asked.due, caller.live.budget_s) as work:
+                    return await self.deciding.answer(asked, work)
         except (StoreUnavailable, StoreTooSlow):
             if time.perf_counter() > asked.due:
                 self.metrics.late()

@@ -5,17 +5,21 @@ from __future__ import annotations
 import math
 import time
 from collections import Counter, OrderedDict, deque
-from collections.abc import Callable, Iterable, Iterator
+from collections.abc import Iterable, Iterator
 from contextlib import contextmanager
-from itertools import chain
+from typing import Protocol
 
 from robosac.deadline import Deadline
 from service.errors import Kind, Refused
-from service.turns import SLACK_S
+from service.turns import Turns, Work
 
 SHARE = 0.5
 """Part of a frame's time, beyond what it needs itself, that others' work may take; and the most that is kept for
 storing its decision.
+"""
+MARGIN_S = 0.08
+"""By how much less a party must have had than another to make its frames late; less than what a party saves up that was
+away (`service.turns.CREDIT_S`), more than what equals differ by.
 """
 SESSION_FRAMES = 3
 """Frames of one session in hand or waiting at a time."""
@@ -38,31 +42,37 @@ class Typical:
         self.value = sorted(self._latest)[(len(self._latest) - 1) // 2]
 
 
-class Admission:
-    """Counts the frames in hand and estimates from the latest what those of each session cost.
+class Ordering(Protocol):
+    """Who goes before whom, as `service.turns.Turns` has it."""
 
-    The detector's thread is shared fairly between API keys, and between the sessions of a key (`service.engine`). So
-    until a frame is done, every other session of its key is given at most as much time as its own, and every other key
-    at most as much as its own; less where they had more than it until now, and more where they had less. Of what the
-    others want no more than that counts. A frame is admitted if all this is expected to fit into `SHARE` of the time
-    that it can spare: what it has left, less its own time on the thread, less the rest that a frame takes, such as
-    storing it. One that nobody holds up is admitted. A frame that waits for its teammates is not in hand.
+    def order(self, works: Iterable[Work]) -> list[Work]:
+        """As `service.turns.Turns.order`."""
+
+    def lead(self, work: Work, other: Work) -> float:
+        """As `service.turns.Turns.lead`."""
+
+
+class Admission:
+    """Knows the frames in hand and estimates from the latest what those of each session cost.
+
+    The detector's thread is shared fairly between API keys, and between the sessions of a key (`service.turns`). A
+    frame is admitted if those that go before it there are expected to fit into `SHARE` of the time that it can spare:
+    what it has left, less its own time on the thread, less the rest that a frame takes, such as storing it. One that
+    nobody holds up is admitted. But it is refused if one in hand would be late for it, unless its party had less than
+    the other's by more than `MARGIN_S`. A frame that waits for its teammates is not in hand.
 
     Parameters
     ----------
     max_hypotheses : int
         Of one frame.
-    lead : callable
-        As `service.turns.Turns.lead`.
+    turns : Ordering, optional
+        Those of the thread.
     """
 
-    def __init__(
-        self, max_hypotheses: int = 1000, lead: Callable[[str, str, str, str], float] = lambda *_: 0.0
-    ) -> None:
+    def __init__(self, max_hypotheses: int = 1000, turns: Ordering | None = None) -> None:
         self._max_hypotheses = max_hypotheses
-        self._lead = lead
-        self._in_hand: dict[str, dict[str, list[float]]] = {}
-        """When the frames are due (`time.perf_counter`), by key and session."""
+        self._turns = Turns() if turns is None else turns
+        self._in_hand: set[Work] = set()
         self._waiting: Counter[str] = Counter()
         self._store, self._rest = Typical(0.0), Typical(0.0)
         self._frame = Typical(FIRST_GUESS_S)
@@ -77,7 +87,7 @@ class Admission:
             With the kind ``overloaded``.
         """
         self.check_waiting(session_id)
-        self._check_time(key, session_id, left_s)
+        self._check_time(self._work(key, session_id, time.perf_counter() + left_s), left_s)
 
     def check_waiting(self, session_id: str) -> None:
         """Refuse a frame of a session of which enough wait, as `check` does."""
@@ -100,24 +110,32 @@ class Admission:
                 del self._waiting[session_id]
 
     @contextmanager
-    def frame(self, key: str, session_id: str, left_s: float) -> Iterator[None]:
-        """Take a frame on for the length of a block, or refuse it as too late among those in hand."""
-        self._check_time(key, session_id, left_s)
-        due = time.perf_counter() + left_s
-        sessions = self._in_hand.setdefault(key, {})
-        sessions.setdefault(session_id, []).append(due)
-        try:
-            yield
-        finally:
-            sessions[session_id].remove(due)
-            if not sessions[session_id]:
-                del sessions[session_id]
-            if not sessions:
-                del self._in_hand[key]
+    def frame(self, key: str, session_id: str, due: float, budget_s: float) -> Iterator[Work]:
+        """Take a frame on for the length of a block, or refuse it as too late among those in hand.
 
-    def deadline(self, due: float, budget_s: float) -> Deadline:
-        """The deadline of a frame that is due then (`time.perf_counter`); time to keep its decision is reserved."""
-        return Deadline(due, min(self._store.value, SHARE * budget_s), hypotheses=self._max_hypotheses)
+        Parameters
+        ----------
+        key, session_id : str
+        due : float
+            When its answer is (`time.perf_counter`); time to keep the decision is reserved in the work's.
+        budget_s : float
+
+        Yields
+        ------
+        Work
+            Of the detector's thread.
+        """
+        work = self._work(key, session_id, due - min(self._store.value, SHARE * budget_s))
+        self._check_time(work, due - time.perf_counter())
+        self._in_hand.add(work)
+        try:
+            yield work
+        finally:
+            self._in_hand.remove(work)
+
+    def deadline(self, work: Work) -> Deadline:
+        """The deadline of a frame's work."""
+        return Deadline(work.due, hypotheses=self._max_hypotheses)
 
     def learn(self, session_id: str, worked_s: float, rest_s: float, store_s: float) -> None:
         """Take a frame into account.
@@ -145,41 +163,24 @@ class Admission:
     def _cost(self, session_id: str) -> float:
         return self._of_session.get(session_id, self._frame).value
 
-    def _check_time(self, key: str, session_id: str, left_s: float) -> None:
-        own_s, others_s = self._cost(session_id), self._others(key, session_id, time.perf_counter() + left_s)
-        if others_s > max(0.0, SHARE * (left_s - own_s - self._rest.value)):
+    def _work(self, key: str, session_id: str, due: float) -> Work:
+        return Work(key, session_id, due, self._cost(session_id))
+
+    def _check_time(self, new: Work, left_s: float) -> None:
+        works = [work for work in self._in_hand if not work.over]
+        end, others_s, is_after = time.perf_counter(), 0.0, False
+        for work in self._turns.order([*works, new]):
+            if work is new:
+                is_after = True
+            elif not is_after:
+                others_s += work.left_s
+                end += work.left_s
+            else:
+                end += work.left_s
+                if end <= work.due < end + new.expected_s and self._turns.lead(new, work) < MARGIN_S:
+                    raise _overloaded("frames in hand would be answered late for it", end - time.perf_counter())
+        if others_s > max(0.0, SHARE * (left_s - new.expected_s - self._rest.value)):
             raise _overloaded("the gateway has more frames in hand than it can answer in time", others_s)
-
-    def _others(self, key: str, session_id: str, due: float) -> float:
-        """How long the thread is expected to work for others until one more frame of a session is done.
-
-        Those that are due later go first only once this one has had `SLACK_S` more than they.
-        """
-
-        def before(wanted_s: float, dues: Iterable[float], own_s: float, lead_s: float) -> float:
-            return max(0.0, min(wanted_s, own_s - lead_s) - (SLACK_S if min(dues) > due else 0.0))
-
-        def wanted(session: str, dues: list[float]) -> float:
-            return len(dues) * self._cost(session)
-
-        cost_s, siblings = self._cost(session_id), self._in_hand.get(key, {})
-        own_s = cost_s + wanted(session_id, siblings.get(session_id, []))
-        of_key_s = own_s + sum(
-            before(wanted(other, dues), dues, own_s, self._lead(key, session_id, key, other))
-            for other, dues in siblings.items()
-            if other != session_id
-        )
-        other_keys_s = sum(
-            before(
-                sum(wanted(s, d) for s, d in sessions.items()),
-                chain(*sessions.values()),
-                of_key_s,
-                self._lead(key, session_id, other, ""),
-            )
-            for other, sessions in self._in_hand.items()
-            if other != key
-        )
-        return of_key_s - cost_s + other_keys_s
 
 
 def _overloaded(detail: str, busy_s: float) -> Refused:

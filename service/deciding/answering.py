@@ -22,6 +22,7 @@ from service.keeping.patience import GRACE_S
 from service.keeping.record import SessionRecord
 from service.sessions.gathering import Received
 from service.sessions.sessions import Sessions
+from service.turns import Work
 from service.viewing.feed import Feed
 from service.watching.metrics import Metrics
 from service.watching.tracing import Tracing
@@ -44,8 +45,8 @@ class Deciding:
     tracing: Tracing
     feed: Feed
 
-    async def answer(self, asked: Asked) -> Answered:
-        """Decide a frame and keep the decision. The session's lock is held.
+    async def answer(self, asked: Asked, work: Work) -> Answered:
+        """Decide a frame, which is work for the engine, and keep the decision. The session's lock is held.
 
         What was worked out from a session that another process has changed by then is worked out again.
 
@@ -58,7 +59,7 @@ class Deciding:
         """
         for _ in range(ATTEMPTS):
             with contextlib.suppress(SessionChanged):
-                return await self._decide(asked)
+                return await self._decide(asked, work)
         raise SessionChanged("the session keeps being changed elsewhere; try again")
 
     def tell(self, answered: Answered, answer: FrameAnswer) -> None:
@@ -91,12 +92,12 @@ class Deciding:
                 raise StoreTooSlow("is still writing the decision before this one; send the frame again")
         asked.caller.live.settling = None
 
-    async def _decide(self, asked: Asked) -> Answered:
+    async def _decide(self, asked: Asked, work: Work) -> Answered:
         """As `answer`, from the session as this process knows it."""
         record = await self.sessions.current(asked.caller)
         present, left_out = self._who_takes_part(asked, record)
         try:
-            decided = await self._fuse(asked, record, present)
+            decided = await self._fuse(asked, work, record, present)
         except BaseException:
             asked.caller.live.gathering.reopen(asked.frame)
             raise
@@ -131,10 +132,9 @@ class Deciding:
         live.gathering.begin(asked.frame)
         return present, left_out
 
-    async def _fuse(self, asked: Asked, record: SessionRecord, present: Mapping[str, Received]) -> Decided:
+    async def _fuse(self, asked: Asked, work: Work, record: SessionRecord, present: Mapping[str, Received]) -> Decided:
         live = asked.caller.live
         messages = {name: received.message for name, received in present.items()}
-        deadline = self.admission.deadline(asked.due, record.latency_budget_ms / 1e3)
         if asked.begun is not None:
             asked.begun.end()
             asked.timings["ahead"] = asked.begun.spent_s * 1e3
@@ -144,10 +144,8 @@ class Deciding:
             asked.ego.message,
             messages,
             int(record.seed, 16),
-            deadline,
-            key=live.key,
-            session_id=record.session_id,
-            due=asked.due,
+            self.admission.deadline(work),
+            work=work,
             ahead=None if asked.begun is None else asked.begun.ahead,
         )
         asked.timings["queue"] = decided.waited_s * 1e3

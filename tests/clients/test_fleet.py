@@ -159,6 +159,7 @@ def test_the_demo_shows_a_summary(tmp_path, monkeypatch):
 
 
 def test_a_demo_to_be_watched_drives_on_until_it_is_interrupted(tmp_path):
+    signal.signal(signal.SIGINT, signal.default_int_handler)  # jobs in the background ignore it
     command = [sys.executable, "-m", "clients.demo", "--report", str(tmp_path), "--scenes", "1", "--frames", "1"]
     with subprocess.Popen(
         [*command, "--watch"], stdout=subprocess.PIPE, text=True, env={**os.environ, "COLUMNS": "200"}

@@ -1,12 +1,20 @@
 import asyncio
+import math
+import time
 from contextlib import ExitStack
 
 import pytest
 
 from robosac import wire
-from service.deciding.admission import SESSION_FRAMES, Admission
+from service.deciding.admission import MARGIN_S, SESSION_FRAMES, Admission
 from service.errors import Kind, Refused
+from service.turns import Turns, Work
 from tests.service.conftest import EGO, problem, serve
+
+
+def taking(admission, key, session_id, left_s):
+    """Take a frame on that has so much time left."""
+    return admission.frame(key, session_id, time.perf_counter() + left_s, left_s)
 
 
 def test_frames_are_admitted_as_long_as_they_can_be_answered_in_time():
@@ -17,7 +25,7 @@ def test_frames_are_admitted_as_long_as_they_can_be_answered_in_time():
 
     def take_on_until_refused():
         for number in range(100):
-            block = admission.frame("", f"session {number}", 0.2)
+            block = taking(admission, "", f"session {number}", 0.2)
             block.__enter__()
             taken.append(block)
 
@@ -26,10 +34,10 @@ def test_frames_are_admitted_as_long_as_they_can_be_answered_in_time():
     assert 9 <= len(taken) <= 10  # 0.5 x (200 - 10 - 2) ms / 10 ms, and itself
     assert refused.value.kind is Kind.OVERLOADED
     assert refused.value.retry_after_s >= 1
-    with admission.frame("", "more time", 20.0):
+    with taking(admission, "", "more time", 20.0):
         pass
     taken.pop().__exit__(None, None, None)
-    with admission.frame("", "again", 0.2):
+    with taking(admission, "", "again", 0.2):
         pass
 
 
@@ -37,7 +45,7 @@ def test_a_frame_that_cannot_be_in_time_anyway_is_admitted_if_nothing_else_is_in
     admission = Admission()
     for _ in range(200):
         admission.learn("any", 1.0, 0.002, 0.001)
-    with admission.frame("", "slow", 0.1), pytest.raises(Refused):
+    with taking(admission, "", "slow", 0.1), pytest.raises(Refused):
         admission.check("", "other", 0.1)
 
 
@@ -63,7 +71,7 @@ async def test_beyond_capacity_a_frame_is_refused_before_it_is_read(served, good
         pytest.fail("the body was read")
         yield b""
 
-    with admission.frame("", "another", 10.0), admission.frame("", "a third", 10.0):
+    with taking(admission, "", "another", 10.0), taking(admission, "", "a third", 10.0):
         refused = await served.post(session, "frames", unread(), token="not even looked at")
         assert refused.headers["retry-after"]
         problem(refused, 503, "overloaded")
@@ -124,15 +132,15 @@ async def test_opening_sessions_costs_little_and_ends_at_the_limit():
         problem(await served.http.post("/v1/sessions", json=body), 503, "too-many-sessions")
 
 
-def test_a_costly_session_adds_no_more_to_a_frame_than_its_own_cost():
+def test_a_short_frame_is_not_refused_for_a_long_one():
     admission = Admission()
     for _ in range(20):
         admission.learn("long", 10.0, 0.002, 0.001)
         admission.learn("short", 0.05, 0.002, 0.001)
-    with admission.frame("key", "long", 60.0):
-        admission.check("key", "short", 0.12)
-        with pytest.raises(Refused):
-            admission.check("key", "short", 0.1)
+    with taking(admission, "key", "long", 60.0):
+        admission.check("key", "short", 0.06)
+    with taking(admission, "key", "short", 0.06):
+        admission.check("key", "long", 60.0)
 
 
 def test_many_sessions_of_a_key_add_no_more_to_a_frame_of_another_than_one_of_them():
@@ -140,23 +148,48 @@ def test_many_sessions_of_a_key_add_no_more_to_a_frame_of_another_than_one_of_th
     for _ in range(200):
         admission.learn("any", 0.05, 0.002, 0.001)
     with ExitStack() as taken:
-        for number in range(40):
-            taken.enter_context(admission.frame("many", f"session {number}", 20.0))
-        admission.check("one", "its session", 0.12)
+        for number in range(12):
+            taken.enter_context(taking(admission, "many", f"session {number}", 20.0))
+        admission.check("one", "its session", 0.16)
         with pytest.raises(Refused):
             admission.check("many", "one more", 0.2)
 
 
+@pytest.mark.parametrize("led_by_s", [0.0, MARGIN_S + 0.01])
+def test_a_frame_in_hand_is_made_late_only_by_who_had_much_less(led_by_s):
+    turns = Turns()
+    for key, had_s in (("modest", 0.01), ("greedy", 0.01 + led_by_s)):
+        work = Work(key, "its session", math.inf, 0.01)
+        turns.add(work)
+        turns.charge(work, had_s)
+        turns.remove(work)
+    admission = Admission(turns=turns)
+    for _ in range(200):
+        admission.learn("short", 0.04, 0.0, 0.0)
+        admission.learn("long", 0.05, 0.0, 0.0)
+    with taking(admission, "greedy", "long", 0.08):
+        if led_by_s:
+            admission.check("modest", "short", 20.0)
+        else:
+            with pytest.raises(Refused, match="would be answered late for it"):
+                admission.check("modest", "short", 20.0)
+
+
 def test_who_had_less_than_the_others_is_admitted_beside_them():
-    """It goes first on the thread until it had as much; and the other way round."""
-    ahead_s = 0.05
-    admission = Admission(lead=lambda key, *_: ahead_s if key == "modest" else -ahead_s)
+    """It goes first on the thread; and the other way round."""
+    turns = Turns()
+    for key, had_s in (("modest", 0.01), ("greedy", 0.1)):
+        work = Work(key, "its session", math.inf, 0.05)
+        turns.add(work)
+        turns.charge(work, had_s)
+        turns.remove(work)
+    admission = Admission(turns=turns)
     for _ in range(200):
         admission.learn("any", 0.05, 0.002, 0.001)
-    with admission.frame("greedy", "one", 20.0):
+    with taking(admission, "greedy", "one", 20.0):
         admission.check("modest", "its session", 0.06)
         admission.check("modest", "its session", 0.01)  # late by itself, and by nobody's fault
-    with admission.frame("modest", "its session", 0.2), pytest.raises(Refused):
+    with taking(admission, "modest", "its session", 0.2), pytest.raises(Refused):
         admission.check("greedy", "one", 0.1)
 
 
@@ -177,6 +210,7 @@ def test_one_stall_teaches_nothing():
     for number in range(20):
         stalled = number == 15
         admission.learn("any", *((0.9, 5.0, 5.0) if stalled else (0.01, 0.002, 0.001)))
-    with admission.frame("", "one", 0.2):
+    with taking(admission, "", "one", 0.2):
         admission.check("", "any", 0.1)
-    assert admission.deadline(100.0, 0.2)._end == pytest.approx(99.999)
+    with admission.frame("", "one", 100.0, 0.2) as work:
+        assert work.due == pytest.approx(99.999)

@@ -2,27 +2,23 @@
 
 import math
 from collections import Counter
-from dataclasses import dataclass
 
 import pytest
 
-from service.turns import CREDIT_S, KNOWN, SLACK_S, Turns
+from service.turns import CREDIT_S, KNOWN, SLACK_S, Turns, Work
 
 PASS_S = 0.007
 
 
-@dataclass(eq=False)
-class Work:
-    key: str
-    session_id: str
-    due: float = math.inf
+def work_of(key, session_id, due=math.inf, expected_s=0.0):
+    return Work(key, session_id, due, expected_s)
 
 
 def played(turns, number):
     """Work in the order of its turns, each as long as a pass."""
     order = []
     for _ in range(number):
-        work = turns.next()
+        work = turns.next(0.0)
         turns.charge(work, PASS_S)
         order.append(work)
     return order
@@ -36,22 +32,22 @@ def waiting(*works):
 
 
 def test_a_key_with_ten_sessions_gets_no_more_than_a_key_with_one():
-    turns = waiting(Work("one", "a"), *(Work("ten", f"s{i}") for i in range(10)))
+    turns = waiting(work_of("one", "a"), *(work_of("ten", f"s{i}") for i in range(10)))
     had = Counter(work.key for work in played(turns, 1000))
     assert abs(had["one"] - had["ten"]) * PASS_S <= SLACK_S + PASS_S
 
 
 def test_the_sessions_of_a_key_share_its_time():
-    turns = waiting(*(Work("", f"s{i}", due=i) for i in range(4)))
+    turns = waiting(*(work_of("", f"s{i}", due=i) for i in range(4)))
     had = Counter(work.session_id for work in played(turns, 400))
     assert max(had.values()) - min(had.values()) <= SLACK_S / PASS_S + 1
 
 
 def test_among_equals_what_is_due_first_goes_first():
-    turns = waiting(Work("", "late", 9.0), Work("", "soon", 1.0), Work("", "middle", 5.0))
+    turns = waiting(work_of("", "late", 9.0), work_of("", "soon", 1.0), work_of("", "middle", 5.0))
     order = []
     while len(turns):
-        work = turns.next()
+        work = turns.next(0.0)
         order.append(work.session_id)
         turns.charge(work, 0.001)
         turns.remove(work)
@@ -59,21 +55,21 @@ def test_among_equals_what_is_due_first_goes_first():
 
 
 def test_a_short_frame_does_not_wait_for_a_long_one():
-    turns = waiting(Work("", "long", 60.0))
+    turns = waiting(work_of("", "long", 60.0))
     played(turns, 500)
-    short = Work("", "short", 0.2)
+    short = work_of("", "short", 0.2)
     turns.add(short)
     assert played(turns, 2) == [short, short]
 
 
 def test_who_is_due_first_does_not_get_more_than_a_fair_share():
-    turns = waiting(Work("", "hurried", 0.0), Work("", "patient", 60.0))
+    turns = waiting(work_of("", "hurried", 1.0), work_of("", "patient", 60.0))
     had = Counter(work.session_id for work in played(turns, 400))
     assert abs(had["hurried"] - had["patient"]) <= SLACK_S / PASS_S + 1
 
 
 def test_time_that_was_not_wanted_is_not_saved_up():
-    idle, busy = Work("idle", "a"), Work("busy", "b")
+    idle, busy = work_of("idle", "a"), work_of("busy", "b")
     turns = waiting(idle, busy)
     played(turns, 10)
     turns.remove(idle)
@@ -84,10 +80,10 @@ def test_time_that_was_not_wanted_is_not_saved_up():
 
 
 def test_who_goes_and_comes_back_has_had_what_it_had():
-    greedy, modest = Work("greedy", "a"), Work("modest", "b", due=9.0)
+    greedy, modest = work_of("greedy", "a"), work_of("modest", "b", due=9.0)
     turns, had = waiting(greedy, modest), Counter()
     for _ in range(200):
-        work = turns.next()
+        work = turns.next(0.0)
         turns.charge(work, PASS_S)
         had[work.key] += 1
         turns.remove(work)  # its frame is done, and the next one comes at once
@@ -97,9 +93,9 @@ def test_who_goes_and_comes_back_has_had_what_it_had():
 
 def test_who_wants_little_goes_first_though_others_come_and_go():
     """Each frame of the greedy is over, and its next one not there yet, when the modest's comes."""
-    turns, greedy, modest = Turns(), Work("greedy", "a", due=0.0), Work("modest", "b", due=9.0)
+    turns, greedy, modest = Turns(), work_of("greedy", "a", due=1.0), work_of("modest", "b", due=9.0)
     turns.add(modest)
-    turns.charge(turns.next(), PASS_S)
+    turns.charge(turns.next(0.0), PASS_S)
     turns.remove(modest)
     for _ in range(5):
         turns.add(greedy)
@@ -114,38 +110,69 @@ def test_who_wants_little_goes_first_though_others_come_and_go():
 
 
 def test_who_leads_goes_first_by_as_much():
-    turns, greedy, modest = Turns(), Work("greedy", "a"), Work("modest", "b")
+    turns, greedy, modest = Turns(), work_of("greedy", "a"), work_of("modest", "b")
     for work, number in ((modest, 1), (greedy, 8)):
         turns.add(work)
         for _ in range(number):
             turns.charge(work, PASS_S)
         turns.remove(work)
-    lead_s = turns.lead("modest", "b", "greedy", "a")
-    assert lead_s == -turns.lead("greedy", "a", "modest", "b") == pytest.approx(8 * PASS_S)
+    lead_s = turns.lead(modest, greedy)
+    assert lead_s == -turns.lead(greedy, modest) == pytest.approx(8 * PASS_S)
+    assert turns.order([greedy, modest]) == [modest, greedy]
     turns.add(modest)
     turns.add(greedy)
     first = [work.key for work in played(turns, 30)].index("greedy")
     assert abs(first * PASS_S - lead_s) <= SLACK_S + PASS_S
-    assert turns.lead("modest", "b", "modest", "new") == 0.0
-    assert turns.lead("nobody", "b", "nobody", "new") == 0.0
+    assert turns.lead(work_of("nobody", "b"), work_of("nobody", "new")) == 0.0
 
 
 def test_who_is_refused_for_the_sake_of_others_soon_goes_before_them():
-    turns = waiting(Work("greedy", "a"))
-    assert turns.lead("new", "b", "greedy", "a") == turns.lead("greedy", "c", "greedy", "a") == 0.0
+    greedy, new, sibling = work_of("greedy", "a"), work_of("new", "b"), work_of("greedy", "c")
+    turns = waiting(greedy)
+    turns.order([greedy, new, sibling])
+    assert turns.lead(new, greedy) == turns.lead(sibling, greedy) == 0.0
     played(turns, 10)
-    assert turns.lead("new", "b", "greedy", "a") == turns.lead("greedy", "c", "greedy", "a") == pytest.approx(0.07)
+    assert turns.lead(new, greedy) == turns.lead(sibling, greedy) == pytest.approx(0.07)
     played(turns, 100)
-    assert turns.lead("new", "b", "greedy", "a") == pytest.approx(CREDIT_S)
+    assert turns.lead(new, greedy) == pytest.approx(CREDIT_S)
+
+
+def test_work_that_was_begun_is_not_put_off_for_that_of_equals():
+    turns = waiting(*(work_of("", f"s{number}", 1.0 - number / 100, expected_s=0.3) for number in range(5)))
+    order = []
+    while len(turns):
+        order.append(work := turns.next(0.0))
+        turns.charge(work, 0.06)
+        if work.had_s > 0.29:
+            turns.remove(work)
+    assert [order[i : i + 5] for i in range(0, 25, 5)] == [[order[i]] * 5 for i in range(0, 25, 5)]
+
+
+def test_short_work_goes_before_long_work_that_was_begun():
+    turns = waiting(long := work_of("", "long", 60.0, expected_s=4.0))
+    assert played(turns, 5) == [long] * 5
+    turns.add(short := work_of("", "short", 0.2, expected_s=0.02))
+    assert played(turns, 3) == [short] * 3
+
+
+def test_work_that_was_begun_and_is_about_to_be_due_goes_first():
+    ends, goes_on = work_of("much", "a", due=1.0), work_of("little", "b", due=2.0)
+    turns = waiting(ends, goes_on)
+    turns.charge(ends, PASS_S)
+    for _ in range(20):
+        turns.charge(ends, PASS_S)
+    assert turns.next(1.0 - 4 * PASS_S) is goes_on
+    assert turns.next(1.0 - 2 * PASS_S) is turns.next(1.0 + 2 * PASS_S) is ends
+    assert turns.next(1.1) is goes_on
 
 
 def test_of_those_who_left_only_so_many_are_remembered():
     turns = Turns()
     for number in range(KNOWN + 100):
-        for work in (Work(f"key {number}", "its session"), Work("", f"session {number}")):
+        for work in (work_of(f"key {number}", "its session"), work_of("", f"session {number}")):
             turns.add(work)
             turns.charge(work, PASS_S)
             turns.remove(work)
     assert len(turns._keys._had_s) == len(turns._sessions) == len(turns._sessions[""]._had_s) == KNOWN
     with pytest.raises(IndexError):
-        turns.next()
+        turns.next(0.0)
