@@ -23,6 +23,7 @@ from service.alone import check_alone  # noqa: E402
 from service.arriving.arrival import Arrival  # noqa: E402
 from service.arriving.doors import Door, capacity_check, check_head, check_local, host_check  # noqa: E402
 from service.arriving.frames import Frames  # noqa: E402
+from service.arriving.giving_way import GivesWay, Line  # noqa: E402
 from service.arriving.hanging_up import HangingUp  # noqa: E402
 from service.arriving.limits import BodyLimit  # noqa: E402
 from service.deciding.admission import Admission  # noqa: E402
@@ -110,6 +111,7 @@ def create_app(
     )
     app.state.gateway = gateway
     problems.install(app)
+    app.add_middleware(GivesWay, line=Line(lambda: gateway.admission.busy))
     app.add_middleware(HangingUp)
     app.add_middleware(BodyLimit, limit=settings.max_body_bytes, timeout_s=settings.body_timeout_s)
     app.add_middleware(Door, check=capacity_check(gateway.admission, gateway.sessions.in_use))

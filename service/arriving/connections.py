@@ -13,7 +13,7 @@ from uvicorn.protocols.http.httptools_impl import HttpToolsProtocol
 HEAD_BYTES = 64 * 1024
 """What of a head is taken before it is whole; `service.arriving.doors` judges it then."""
 HEADERS = 256
-PIPELINED = 32
+PIPELINED = 4
 """Requests that are taken on a connection beside the one that is being answered."""
 PIECES, PIECE_BYTES = 1024, 64
 """From so many pieces on, those of a body have so many bytes on average."""

@@ -78,6 +78,11 @@ class Admission:
         self._frame = Typical(FIRST_GUESS_S)
         self._of_session: OrderedDict[str, Typical] = OrderedDict()
 
+    @property
+    def busy(self) -> bool:
+        """Whether frames are in hand."""
+        return bool(self._in_hand)
+
     def check(self, key: str, session_id: str, left_s: float) -> None:
         """Refuse a frame that is not expected to be answered in the time that it has left.
 

@@ -1,0 +1,134 @@
+"""Whatever is asked for gives way to frames, however much of it there is."""
+
+from __future__ import annotations
+
+import asyncio
+import re
+import time
+from collections import OrderedDict, deque
+from collections.abc import Callable
+
+from starlette.datastructures import Headers
+from starlette.types import ASGIApp, Message, Receive, Scope, Send
+
+AT_A_TIME = 2
+"""Requests that are answered at a time."""
+EVERY_S = 0.05
+"""How often one begins while frames are in hand."""
+TURN_S = 0.25
+"""After which a request that still waits for its client, or the database, holds up no other."""
+_LOOK_S = 0.004
+"""How often it is looked whether frames are in hand."""
+_NEVER_WAIT = re.compile(r"/healthz|/v1/live/.*|/v1/sessions/[^/]+/(frames|messages|standby)")
+
+
+class Turn:
+    """The place of a request among those that wait, and then its turn."""
+
+    def __init__(self, line: Line, party: str) -> None:
+        self._line, self.party = line, party
+        self.began: asyncio.Future[None] = asyncio.get_running_loop().create_future()
+        self._end: asyncio.TimerHandle | None = None
+
+    def begin(self) -> None:
+        """It may go on."""
+        self.began.set_result(None)
+        self._end = asyncio.get_running_loop().call_later(TURN_S, self.end)
+
+    def end(self) -> None:
+        """Let the next one begin; again and again does no harm."""
+        if self._end is not None:
+            self._end.cancel()
+            self._end = None
+            self._line.ended()
+
+
+class Line:
+    """Requests that wait: each party's in the order in which they came, and the parties by turns.
+
+    Parameters
+    ----------
+    busy : callable
+        Whether frames are in hand.
+    """
+
+    def __init__(self, busy: Callable[[], bool]) -> None:
+        self._busy = busy
+        self._waiting: OrderedDict[str, deque[Turn]] = OrderedDict()
+        self._at_work = 0
+        self._latest = -1.0
+        self._look: asyncio.TimerHandle | None = None
+
+    async def turn(self, party: str) -> Turn:
+        """A turn of a party, once it has come."""
+        turn = Turn(self, party)
+        self._waiting.setdefault(party, deque()).append(turn)
+        self._go_on()
+        try:
+            await turn.began
+        except asyncio.CancelledError:
+            turn.end()
+            raise
+        return turn
+
+    def ended(self) -> None:
+        """A turn is over."""
+        self._at_work -= 1
+        self._go_on()
+
+    def _go_on(self) -> None:
+        while self._waiting and self._at_work < AT_A_TIME:
+            now = time.perf_counter()
+            if self._busy() and now < self._latest + EVERY_S:
+                if self._look is None:
+                    self._look = asyncio.get_running_loop().call_later(_LOOK_S, self._look_again)
+                return
+            turn = self._next()
+            if not turn.began.done():  # it was not given up
+                self._latest = now
+                self._at_work += 1
+                turn.begin()
+
+    def _next(self) -> Turn:
+        party, turns = self._waiting.popitem(last=False)
+        turn = turns.popleft()
+        if turns:
+            self._waiting[party] = turns  # behind the others
+        return turn
+
+    def _look_again(self) -> None:
+        self._look = None
+        self._go_on()
+
+
+class GivesWay:
+    """Middleware that lets requests other than frames and messages in by turns: few at a time, and seldom while frames
+    are in hand. So nobody's openings, logs, pages or mistakes take the time that frames need. Parties, which are told
+    apart by their credentials, or else by their addresses, have the same number of turns. An answer in parts gives way
+    after each.
+    """
+
+    def __init__(self, app: ASGIApp, line: Line) -> None:
+        self._app = app
+        self._line = line
+
+    async def __call__(self, scope: Scope, receive: Receive, send: Send) -> None:
+        if scope["type"] != "http" or _NEVER_WAIT.fullmatch(scope["path"]):
+            await self._app(scope, receive, send)
+            return
+        party = Headers(scope=scope).get("authorization") or (scope.get("client") or ("",))[0]
+        turn = await self._line.turn(party)
+
+        async def in_parts(message: Message) -> None:
+            nonlocal turn
+            if not message.get("more_body", False):
+                await send(message)
+                return
+            turn.end()
+            await send(message)
+            turn = await self._line.turn(party)
+
+        try:
+            await self._app(scope, receive, in_parts)
+        finally:
+            turn.end()

@@ -1,0 +1,153 @@
+"""Requests other than frames and messages are let in by turns."""
+
+import asyncio
+import contextlib
+
+import pytest
+from starlette.responses import PlainTextResponse, StreamingResponse
+
+from service.arriving import giving_way
+from service.arriving.giving_way import AT_A_TIME, EVERY_S, GivesWay, Line
+from tests.service.conftest import EGO, serve
+
+
+class Frames:
+    """Whether frames are in hand, as a test has it."""
+
+    in_hand = False
+
+    def __call__(self):
+        return self.in_hand
+
+
+class Requests:
+    """Requests through the middleware, each answered once it is let."""
+
+    def __init__(self, line, app=None):
+        self.begun = []
+        self.let = asyncio.Event()
+        self._app = GivesWay(app or self._answer, line)
+
+    async def _answer(self, scope, receive, send):
+        self.begun.append(scope["path"])
+        await self.let.wait()
+        await PlainTextResponse("done")(scope, receive, send)
+
+    def ask(self, path, credential="", send=None):
+        headers = [(b"authorization", credential.encode())] if credential else []
+        scope = {"type": "http", "method": "GET", "path": path, "headers": headers, "client": ("192.0.2.1", 1)}
+        return asyncio.create_task(self._app(scope, self._receive, send or self._drop))
+
+    async def _receive(self):
+        await asyncio.Event().wait()
+
+    async def _drop(self, message):
+        pass
+
+
+async def settled():
+    for _ in range(10):
+        await asyncio.sleep(0)
+
+
+async def test_few_requests_are_answered_at_a_time_and_parties_take_turns():
+    requests = Requests(Line(Frames()))
+    asked = [requests.ask(f"/greedy/{number}", "Bearer greedy") for number in range(20)]
+    asked += [requests.ask("/modest", "Bearer modest"), requests.ask("/stranger")]
+    await settled()
+    assert requests.begun == ["/greedy/0", "/greedy/1"][:AT_A_TIME]
+    requests.let.set()
+    await asyncio.gather(*asked)
+    assert {"/modest", "/stranger"} <= set(requests.begun[: AT_A_TIME + 4])
+    assert len(requests.begun) == 22
+
+
+@pytest.mark.parametrize("path", ["/healthz", "/v1/sessions/abc/frames", "/v1/sessions/abc/messages", "/v1/live/abc"])
+async def test_frames_and_what_lasts_wait_for_nobody(path):
+    requests, frames = Requests(line := Line(Frames())), Frames()
+    others = [requests.ask("/slow") for _ in range(5)]
+    await settled()
+    line._busy, frames.in_hand = frames, True
+    asked = requests.ask(path)
+    await settled()
+    assert path in requests.begun
+    requests.let.set()
+    await asyncio.gather(asked, *others)
+
+
+async def test_while_frames_are_in_hand_requests_begin_seldom_but_do():
+    frames = Frames()
+    requests = Requests(Line(frames))
+    requests.let.set()
+    frames.in_hand = True
+    loop = asyncio.get_running_loop()
+    began = loop.time()
+    await asyncio.gather(*(requests.ask("/page") for _ in range(5)))
+    assert loop.time() - began >= 4 * EVERY_S
+    late = [requests.ask("/page") for _ in range(50)]
+    await settled()
+    frames.in_hand = False
+    await asyncio.wait_for(asyncio.gather(*late), 25 * EVERY_S)
+
+
+async def test_who_waits_for_its_client_holds_up_nobody_for_long(monkeypatch):
+    monkeypatch.setattr(giving_way, "TURN_S", 0.05)
+    requests = Requests(Line(Frames()))
+    asked = [requests.ask(f"/slow/{number}") for number in range(3 * AT_A_TIME)]
+    await asyncio.sleep(0.2)
+    assert len(requests.begun) == 3 * AT_A_TIME
+    requests.let.set()
+    await asyncio.gather(*asked)
+
+
+async def test_who_goes_away_leaves_its_place():
+    requests = Requests(line := Line(Frames()))
+    asked = [requests.ask(f"/page/{number}") for number in range(AT_A_TIME + 2)]
+    await settled()
+    for gone in (asked[0], asked[-1]):
+        gone.cancel()
+        with contextlib.suppress(asyncio.CancelledError):
+            await gone
+    await settled()
+    assert requests.begun == [f"/page/{number}" for number in range(AT_A_TIME + 1)]
+    requests.let.set()
+    await asyncio.gather(*asked[1:-1])
+    assert not line._waiting
+    assert line._at_work == 0
+
+
+async def test_an_answer_in_parts_gives_way_after_each():
+    async def parts():
+        for _ in range(3):
+            yield b"part"
+
+    reading = asyncio.Event()
+
+    async def unread(message):
+        if message.get("body") == b"part":
+            await reading.wait()
+
+    async def streaming(scope, receive, send):
+        if scope["path"] == "/log":
+            await StreamingResponse(parts())({**scope, "asgi": {"spec_version": "2.4"}}, receive, send)
+        else:
+            requests.begun.append(scope["path"])
+            await PlainTextResponse("done")(scope, receive, send)
+
+    requests = Requests(Line(Frames()), streaming)
+    logs = [requests.ask("/log", send=unread) for _ in range(2 * AT_A_TIME)]
+    await settled()
+    await asyncio.wait_for(requests.ask("/page"), 1)
+    reading.set()
+    await asyncio.gather(*logs)
+
+
+async def test_a_gateway_answers_pages_while_frames_are_in_hand(messages, benign):
+    async with serve() as served:
+        session = await served.open(latency_budget_ms=2000.0, gather_ms=0)
+        ego = served.ego(session)
+        with served.gateway.admission.frame("", "another", 1e9, 1.0):
+            pages = [served.http.get("/openapi.json") for _ in range(4)]
+            *answers, answer = await asyncio.gather(*pages, ego.post_frame(0, messages[EGO], benign))
+        assert [page.status_code for page in answers] == [200] * 4
+        assert answer.source == "consensus"
