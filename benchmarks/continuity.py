@@ -18,6 +18,7 @@ import subprocess
 import sys
 import tempfile
 from collections.abc import AsyncIterator, Awaitable, Callable
+from functools import partial
 from pathlib import Path
 
 import torch
@@ -36,8 +37,10 @@ Happening = Callable[[], Awaitable[None]]
 
 
 @contextlib.asynccontextmanager
-async def behind_proxy(folder: Path, url: str) -> AsyncIterator[tuple[GatewayClient, dict[str, Happening]]]:
-    async with proxied(CONFIG, folder, url, KEY, 2) as gateways, gateways.client() as client:
+async def behind_proxy(
+    folder: Path, url: str
+) -> AsyncIterator[tuple[Callable[[], GatewayClient], dict[str, Happening]]]:
+    async with proxied(CONFIG, folder, url, KEY, 2) as gateways:
 
         async def rolling() -> None:
             for number in range(2):
@@ -47,11 +50,11 @@ async def behind_proxy(folder: Path, url: str) -> AsyncIterator[tuple[GatewayCli
         async def kill() -> None:
             await gateways.restart(0, gently=False)
 
-        yield client, {"one process killed": kill, "rolling restart": rolling}
+        yield gateways.client, {"one process killed": kill, "rolling restart": rolling}
 
 
 @contextlib.asynccontextmanager
-async def on_ray(folder: Path, url: str) -> AsyncIterator[tuple[GatewayClient, dict[str, Happening]]]:
+async def on_ray(folder: Path, url: str) -> AsyncIterator[tuple[Callable[[], GatewayClient], dict[str, Happening]]]:
     port, log = free_port(), folder / "log"
 
     async def said(text: str) -> None:
@@ -66,7 +69,8 @@ async def on_ray(folder: Path, url: str) -> AsyncIterator[tuple[GatewayClient, d
         process = subprocess.Popen(command, env=environment, stdout=out, stderr=out)
     try:
         await said("version 0 at")
-        async with GatewayClient(f"http://127.0.0.1:{port}") as client:
+        connect = partial(GatewayClient, f"http://127.0.0.1:{port}")
+        async with connect() as client:
 
             async def rolling() -> None:
                 process.send_signal(signal.SIGHUP)
@@ -79,7 +83,7 @@ async def on_ray(folder: Path, url: str) -> AsyncIterator[tuple[GatewayClient, d
                     os.kill(int(told["gateway"].split("-")[-2]), signal.SIGKILL)
                     break
 
-            yield client, {"one process killed": kill, "rolling restart": rolling}
+            yield connect, {"one process killed": kill, "rolling restart": rolling}
     finally:
         process.terminate()
         process.wait(60)
@@ -90,8 +94,8 @@ async def main(given: argparse.Namespace) -> list[str]:
     engine = behind_proxy if given.engine == "proxy" else on_ray
     with tempfile.TemporaryDirectory(prefix="robosac-") as name:
         url = given.database_url or f"sqlite:///{name}/robosac.db"
-        async with engine(Path(name), url) as (client, happenings):
-            traffic = Traffic(client, prepare(4), given.rate, given.budget_ms)
+        async with engine(Path(name), url) as (connect, happenings):
+            traffic = Traffic(connect, prepare(4), given.rate, given.budget_ms)
             await traffic.open(given.sessions, DEFENSE)
             traffic.begin("warming up")
             await asyncio.sleep(given.seconds)
@@ -107,6 +111,7 @@ async def main(given: argparse.Namespace) -> list[str]:
                 await asyncio.sleep(given.seconds)
             await traffic.stop()
             wrong, writers = await traffic.check()
+    print(f"{given.sessions} sessions, one frame of each in {1 / given.rate:g} s")
     for phase in traffic.phases:
         told = phase.as_dict()
         shares = ", ".join(

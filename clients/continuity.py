@@ -10,7 +10,7 @@ from __future__ import annotations
 import asyncio
 import time
 from collections import Counter
-from collections.abc import Mapping, Sequence
+from collections.abc import Callable, Mapping, Sequence
 from contextlib import AsyncExitStack
 from dataclasses import dataclass, field
 from itertools import groupby
@@ -70,15 +70,18 @@ class Traffic:
 
     Parameters
     ----------
-    gateway : GatewayClient
+    connect : callable
+        Makes a client; every session has its own, as its vehicles have connections of their own.
     bodies : mapping of vehicle to Bodies
     rate_hz : float
         Frames a second of each session.
     budget_ms : float
     """
 
-    def __init__(self, gateway: GatewayClient, bodies: Mapping[str, Bodies], rate_hz: float, budget_ms: float) -> None:
-        self._gateway = gateway
+    def __init__(
+        self, connect: Callable[[], GatewayClient], bodies: Mapping[str, Bodies], rate_hz: float, budget_ms: float
+    ) -> None:
+        self._connect = connect
         self._bodies = bodies
         self._rate_hz = rate_hz
         self._budget_ms = budget_ms
@@ -90,11 +93,12 @@ class Traffic:
 
     async def open(self, sessions: int, defense: Mapping[str, Any]) -> None:
         """Open sessions and begin to drive them, one after another within a period."""
-        for _ in range(sessions):
-            opened = await self._gateway.open_session(
-                EGO, TEAM, defense=defense, latency_budget_ms=self._budget_ms, gather_ms=self._budget_ms / 2
-            )
-            self.sessions.append(Driven(str(defense["kind"]), opened))
+        async with self._connect() as gateway:
+            for _ in range(sessions):
+                opened = await gateway.open_session(
+                    EGO, TEAM, defense=defense, latency_budget_ms=self._budget_ms, gather_ms=self._budget_ms / 2
+                )
+                self.sessions.append(Driven(str(defense["kind"]), opened))
         for number, session in enumerate(self.sessions):
             delay_s = number / len(self.sessions) / self._rate_hz
             self._driving.append(asyncio.create_task(self._drive(session, delay_s)))
@@ -119,22 +123,24 @@ class Traffic:
     async def check(self) -> tuple[list[str], list[list[str]]]:
         """What is wrong with the sessions' logs, and which processes decided in each, one after another."""
         wrong, writers = [], []
-        for number, session in enumerate(self.sessions):
-            ego = session.ego(self._gateway)
-            found = [complaint for line in await ego.audit_lines() for complaint in session.follow(line)]
-            found += [f"frame {frame} was acknowledged and is not in the log" for frame in session.acknowledged]
-            if (await ego.state())["audit_head"] != session.head:
-                found.append("the log does not end where the session says")
-            wrong += [f"session {number}: {complaint}" for complaint in found]
-            names = [r["gateway"] for r in await ego.audit() if r["event"] == "frame_answered"]
-            writers.append([name for name, _ in groupby(names)])
+        async with self._connect() as gateway:
+            for number, session in enumerate(self.sessions):
+                ego = session.ego(gateway)
+                found = [complaint for line in await ego.audit_lines() for complaint in session.follow(line)]
+                found += [f"frame {frame} was acknowledged and is not in the log" for frame in session.acknowledged]
+                if (await ego.state())["audit_head"] != session.head:
+                    found.append("the log does not end where the session says")
+                wrong += [f"session {number}: {complaint}" for complaint in found]
+                names = [r["gateway"] for r in await ego.audit() if r["event"] == "frame_answered"]
+                writers.append([name for name, _ in groupby(names)])
         return wrong, writers
 
     async def _drive(self, session: Driven, delay_s: float) -> None:
-        ego = session.ego(self._gateway)
         tokens = session.opened.teammate_tokens
-        team = {name: self._gateway.vehicle(session.opened.session_id, name, tokens[name]) for name in TEAM}
         async with AsyncExitStack() as stack:
+            gateway = await stack.enter_async_context(self._connect())
+            ego = session.ego(gateway)
+            team = {name: gateway.vehicle(session.opened.session_id, name, tokens[name]) for name in TEAM}
             standing = [await stack.enter_async_context(mate.standing_by()) for mate in team.values()]
             await asyncio.gather(*(stand.standing.wait() for stand in standing))
             start, latest = time.monotonic() + delay_s, time.monotonic() + delay_s

@@ -65,7 +65,7 @@ async def test_sessions_go_on_while_one_process_is_restarted_and_the_other_is_ki
         async with gateways.client() as client:
             refused = await client._http.get("/metrics")
             assert refused.status_code == 404
-            traffic = Traffic(client, prepare(2), rate_hz=3.0, budget_ms=20_000.0)
+            traffic = Traffic(gateways.client, prepare(2), rate_hz=3.0, budget_ms=20_000.0)
             await traffic.open(4, DEFENSE)
             traffic.begin("both")
             await asyncio.sleep(1.0)

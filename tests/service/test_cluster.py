@@ -7,6 +7,7 @@ import signal
 import subprocess
 import sys
 import time
+from functools import partial
 from importlib.util import find_spec
 
 import httpx
@@ -39,7 +40,7 @@ async def test_what_the_router_cannot_see_is_refused():
 
 @contextlib.asynccontextmanager
 async def served(url, tmp_path):
-    """A cluster of two replicas on this machine; the process that runs it, and a client."""
+    """A cluster of two replicas on this machine; the process that runs it, and what makes a client."""
     port, log = free_port(), tmp_path / "log"
     command = [sys.executable, "-c", SERVE, "--cluster", "--replicas", "2", "--port", str(port)]
     environment = os.environ | {"ROBOSAC_DATABASE_URL": url}
@@ -51,8 +52,7 @@ async def served(url, tmp_path):
             assert process.poll() is None, log.read_text()
             assert time.monotonic() < end, log.read_text()
             await asyncio.sleep(0.2)
-        async with GatewayClient(f"http://127.0.0.1:{port}") as client:
-            yield process, client
+        yield process, partial(GatewayClient, f"http://127.0.0.1:{port}")
     finally:
         process.send_signal(signal.SIGTERM)
         assert process.wait(60) == 0
@@ -68,8 +68,8 @@ async def answered_since(traffic, frames):
 
 @pytest.mark.skipif(find_spec("ray") is None, reason="Ray is not installed")
 async def test_sessions_go_on_when_a_replica_is_killed_and_the_database_restarted(postgres, tmp_path):  # noqa: F811
-    async with served(await postgres.new_database(), tmp_path) as (_, client):
-        traffic = Traffic(client, prepare(2), rate_hz=2.0, budget_ms=20_000.0)
+    async with served(await postgres.new_database(), tmp_path) as (_, connect), connect() as client:
+        traffic = Traffic(connect, prepare(2), rate_hz=2.0, budget_ms=20_000.0)
         await traffic.open(4, DEFENSE)
         traffic.begin("both")
         await answered_since(traffic, 2)
