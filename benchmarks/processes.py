@@ -22,12 +22,14 @@ from pathlib import Path
 import torch
 from rich.console import Console
 
-from clients.load_test import Load, prepare, run_load
+from clients.client import GatewayClient
+from clients.load_test import EGO, TEAM, Bodies, Load, prepare, run_load
 from clients.proxied import proxied
 
 CONFIG = Path(__file__).parents[1] / "deploy" / "haproxy.cfg"
 KEY = "a-key-of-the-benchmark"
 PERIOD_US = 10_000
+FRAMES = 8
 GROUPS = Path("/sys/fs/cgroup")
 
 
@@ -56,10 +58,22 @@ def at_most(core: float | None, pids: list[int]) -> Iterator[None]:
             group.rmdir()
 
 
+async def boxes_of(client: GatewayClient, bodies: Bodies, sessions: int) -> list[str]:
+    """The boxes of the same frames in each of some sessions without a defence, whose answers depend on nothing else."""
+    told = []
+    for _ in range(sessions):
+        opened = await client.open_session(EGO, TEAM, defense={"kind": "none"}, latency_budget_ms=20_000.0)
+        ego = client.vehicle(opened.session_id, EGO, opened.ego_token)
+        answers = [await ego.post_frame_body(bodies.numbered(frame)) for frame in range(FRAMES)]
+        told.append(json.dumps([answer.boxes.tolist() for answer in answers]))
+        await ego.close()
+    return told
+
+
 async def measure(
     processes: int, seconds: float, egos: int, core: float | None, database_url: str | None
 ) -> dict[str, object]:
-    bodies = prepare(False, 3, Console(stderr=True), 8)
+    bodies = prepare(False, 3, Console(stderr=True), FRAMES)
     with tempfile.TemporaryDirectory(prefix="robosac-") as name:
         url = database_url or f"sqlite:///{name}/robosac.db"
         async with proxied(CONFIG, Path(name), url, KEY, processes) as gateways, gateways.client() as client:
@@ -67,6 +81,7 @@ async def measure(
             with at_most(core, [process.pid for process in gateways.processes]):
                 figures = await run_load(client, Load("closed", egos, False), bodies, seconds, 20_000.0)
             used = [process.cpu_s() - was for process, was in zip(gateways.processes, before, strict=True)]
+            boxes = await boxes_of(client, bodies, egos)
             memory = [process.peak_memory_mib() for process in gateways.processes]
             client_s = time.process_time() - own
     told = figures.as_dict()
@@ -81,6 +96,7 @@ async def measure(
         "cpu_ms_a_frame": sum(used) * 1e3 / told["frames"],
         "memory_mib": memory,
         "latency_ms": told["latency_ms"],
+        "boxes": boxes,
     }
 
 
@@ -90,10 +106,14 @@ async def main(seconds: float, egos: int, rounds: int, core: float | None, datab
     for _ in range(rounds):  # in turn, as the machine changes its mind
         for processes, results in found.items():
             results.append(await measure(processes, seconds, egos, core, database_url))
-            print(json.dumps(results[-1]), flush=True)
+            print(json.dumps({name: value for name, value in results[-1].items() if name != "boxes"}), flush=True)
     for name in ("fps", "cpu_ms_a_frame"):
         one, two = (sorted(float(str(result[name])) for result in found[n])[rounds // 2] for n in (1, 2))
         print(f"{name}: 1 process {one:.1f}, 2 processes {two:.1f}, ratio {two / one:.2f}")
+    boxes = {text for results in found.values() for result in results for text in result["boxes"]}
+    print(
+        f"the boxes of {FRAMES} frames are {'equal' if len(boxes) == 1 else 'NOT EQUAL'} in all sessions of all rounds"
+    )
     print(f"cores: {os.cpu_count()}, load: {os.getloadavg()[0]:.1f}")
 
 

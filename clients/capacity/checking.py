@@ -1,4 +1,4 @@
-"""The model against what was measured: predicted from single egos in an open loop, compared with all other loads."""
+"""The model against what was measured: predicted from single egos, compared with all other loads."""
 
 from __future__ import annotations
 

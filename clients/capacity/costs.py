@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from collections import Counter, defaultdict
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
 from pathlib import Path
@@ -213,10 +214,11 @@ class Costs:
 
 
 def calibration(report: Report) -> list[MeasuredLoad]:
-    """The loads that costs are fitted to: those in an open loop with the fewest egos, where hardly a frame waits."""
-    opened = [load for load in report.loads if load.loop == "open"]
-    fewest = min((load.egos for load in opened), default=0)
-    return [load for load in opened if load.egos == fewest]
+    """The loads that costs are fitted to, where hardly a frame waits for another: those of a single ego in a closed
+    loop, and those in an open loop with the fewest egos.
+    """
+    fewest = min((load.egos for load in report.loads if load.loop == "open"), default=0)
+    return [load for load in report.loads if load.egos == (1 if load.loop == "closed" else fewest)]
 
 
 def costs_of(report: Report) -> Costs:
@@ -225,12 +227,12 @@ def costs_of(report: Report) -> Costs:
     Raises
     ------
     ValueError
-        If it has no open loop without and with an attacker.
+        If nothing can be fitted to loads without and with an attacker.
     """
     loads = calibration(report)
     by_attack = {at: [load for load in loads if load.attacked is at] for at in (False, True)}
     if not all(by_attack.values()):
-        raise ValueError("the report has no open loops without and with an attacker to take the costs from")
+        raise ValueError("the report has no loads of single egos, without and with an attacker, to take the costs from")
 
     def used(name: str) -> Line | None:
         points = [
@@ -242,6 +244,9 @@ def costs_of(report: Report) -> Costs:
 
     tested = [(load.teammates, steps, of) for load in loads for steps, of in load.by_steps.items()]
     frames = [of.frames for _, _, of in tested]
+    counts: defaultdict[tuple[bool, int], Counter[int]] = defaultdict(Counter)
+    for load in loads:
+        counts[load.attacked, load.teammates].update({steps: of.frames for steps, of in load.by_steps.items()})
     return Costs(
         kind=report.kind,
         teams=tuple(sorted({load.teammates for load in loads})),
@@ -249,7 +254,7 @@ def costs_of(report: Report) -> Costs:
         latency_ms=Line.through([(team, steps, of.latency_ms, of.frames) for team, steps, of in tested]),
         used={name: used(name) for name in MEASURED},
         spread=float(np.average([of.engine_spread_ms / of.engine_ms for _, _, of in tested], weights=frames)),
-        steps={(at.attacked, at.teammates): {n: of.frames for n, of in at.by_steps.items()} for at in loads},
+        steps=counts,
         receive_ms=float(np.mean([load.stages_ms.get("receive", 0.0) for load in loads])),
         store_ms=float(np.mean([load.stages_ms.get("store", 0.0) for load in loads])),
     )

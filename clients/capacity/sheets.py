@@ -67,7 +67,7 @@ def checks_sheet(found: Sequence[Check]) -> Sheet:
         label = [load.loop, str(load.teammates), str(load.egos), "PGD" if load.attacked else "none", one.figure]
         rows.append([*label, f"{one.predicted:.1f}", f"{one.measured:.1f}", f"{one.off:+.0%}"])
     columns = ["loop", "team", "egos", "attack", "figure", "model", "measured", "off"]
-    return Sheet("Predicted from single egos in an open loop", columns, rows)
+    return Sheet("Predicted from single egos", columns, rows)
 
 
 def city_sheet(days: Mapping[str, Any], scenario: Scenario) -> Sheet:

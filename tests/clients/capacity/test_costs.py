@@ -20,8 +20,10 @@ def test_costs_are_what_the_report_was_made_from():
 
 def test_costs_come_from_loads_in_which_nothing_waits():
     loads = calibration(Report.model_validate(a_report()))
-    assert {(load.loop, load.egos) for load in loads} == {("open", 1)}
-    assert len(loads) == 4
+    assert {(load.loop, load.egos) for load in loads} == {("open", 1), ("closed", 1)}
+    assert len(loads) == 8
+    loads = calibration(Report.model_validate(a_report(egos=(2, 4))))
+    assert {(load.loop, load.egos) for load in loads} == {("open", 2)}
 
 
 def test_no_cost_is_below_zero():

@@ -31,12 +31,20 @@ def test_the_plan_is_that_of_the_report_and_the_scenario():
         assert f"| {label} | {day['shares']['tested']:.3%} |" in page
 
 
-def test_the_check_is_that_of_the_report():
-    assert checks_sheet(checks(REPORT)).markdown() in (FOLDER / "check.md").read_text()
+@pytest.mark.parametrize("folder", [FOLDER, FOLDER / "two"])
+def test_the_check_is_that_of_the_report(folder):
+    report = read_report(folder / "load_test.json")
+    assert checks_sheet(checks(report)).markdown() in (folder / "check.md").read_text()
 
 
-@pytest.mark.parametrize("figure", ["disk bytes a frame", "audit bytes a frame", "frames a second"])
-def test_the_model_is_near_what_was_measured(figure):
-    found = [one for one in checks(REPORT) if one.figure == figure]
-    assert len(found) > 4
+@pytest.mark.parametrize(
+    ("folder", "figures"),
+    [
+        (FOLDER, {"disk bytes a frame", "audit bytes a frame", "frames a second"}),
+        (FOLDER / "two", {"disk bytes a frame", "audit bytes a frame"}),
+    ],
+)
+def test_the_model_is_near_what_was_measured(folder, figures):
+    found = [one for one in checks(read_report(folder / "load_test.json")) if one.figure in figures]
+    assert len(found) > 4 * len(figures)
     assert not [(one.load, one.off) for one in found if not one.holds]
