@@ -32,7 +32,7 @@ logger = logging.getLogger(__name__)
 
 T = TypeVar("T")
 
-LEAST = 0.5
+LEAST = 0.8
 """Part of what a frame is expected to take that it takes at least, however little is tested."""
 
 

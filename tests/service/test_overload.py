@@ -7,6 +7,7 @@ import pytest
 
 from robosac import wire
 from service.deciding.admission import MARGIN_S, SESSION_FRAMES, Admission
+from service.engine import Engine
 from service.errors import Kind, Refused
 from service.turns import Turns, Work
 from tests.service.conftest import EGO, problem, serve
@@ -214,3 +215,34 @@ def test_one_stall_teaches_nothing():
         admission.check("", "any", 0.1)
     with admission.frame("", "one", 100.0, 0.2) as work:
         assert work.due == pytest.approx(99.999)
+
+
+class Slow:
+    """A session whose frames take so many steps of sleep."""
+
+    def __init__(self, steps, step_s):
+        self._steps, self._step_s = steps, step_s
+
+    def decide_in_steps(self, *_, **__):
+        for _ in range(self._steps):
+            time.sleep(self._step_s)
+            yield
+        return "decided"
+
+
+async def test_a_frame_that_others_held_up_until_it_cannot_be_in_time_is_refused_before_it_is_begun():
+    engine = Engine(1)
+    try:
+        dear = Work("dear", "s", math.inf, expected_s=0.05)
+        first = asyncio.create_task(engine.decide(Slow(15, 0.02), 0, None, {}, 0, None, work=dear))
+        await asyncio.sleep(0)
+        late = Work("late", "s", time.perf_counter() + 0.12, expected_s=0.1)
+        with pytest.raises(Refused, match="the time that this one had") as refused:
+            await engine.decide(Slow(5, 0.02), 0, None, {}, 0, None, work=late)
+        assert refused.value.kind is Kind.OVERLOADED
+        assert late.had_s == 0
+        assert (await first).result == "decided"
+        nobodys_fault = Work("alone", "s", time.perf_counter() + 0.01, expected_s=0.1)
+        assert (await engine.decide(Slow(2, 0.02), 0, None, {}, 0, None, work=nobodys_fault)).result == "decided"
+    finally:
+        engine.stop()
