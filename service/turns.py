@@ -166,6 +166,7 @@ class Turns:
         for work in works:
             self._keys.know(work.key)
             self._sessions.setdefault(work.key, _Shares()).know(work.session_id)
+            self._sessions.move_to_end(work.key)
         self._forget()
         claims = []
         for key, of_key in self._by_key(works).items():
@@ -190,7 +191,7 @@ class Turns:
         self._forget()
 
     def lead(self, work: Work, other: Work) -> float:
-        """How much more one had than the other until now; seconds, negative where it had less.
+        """How much less one had than the other until now; seconds, negative where it had more.
 
         Between keys the keys' shares count, within a key those of its sessions.
         """

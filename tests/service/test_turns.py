@@ -174,5 +174,8 @@ def test_of_those_who_left_only_so_many_are_remembered():
             turns.charge(work, PASS_S)
             turns.remove(work)
     assert len(turns._keys._had_s) == len(turns._sessions) == len(turns._sessions[""]._had_s) == KNOWN
+    oldest = next(iter(turns._sessions))
+    asked = [work_of("fresh", "s"), work_of(oldest, "s")]
+    assert set(turns.order(asked)) == set(asked)
     with pytest.raises(IndexError):
         turns.next(0.0)
