@@ -78,7 +78,8 @@ def _all_of(members: tuple[int, ...], size: int) -> BoolArray:
 def _some_of(posterior: Posterior, here: IntArray, decoded: BoolArray) -> BoolArray:
     """Answers, and groups of unresolved teammates beside each subset of cleared ones decoded before: so a test is
     evidence twice, by the pairs with the ego and with that subset. Where there is none yet, groups beside nobody and
-    beside the least suspected. While somebody is in doubt, an answer holds no more than can be witnesses afterwards.
+    beside the least suspected. While somebody is in doubt, an answer holds no more than can be witnesses afterwards, or
+    all who are cleared.
     """
     suspicion = posterior.marginals()
     good = cleared(suspicion)
@@ -87,6 +88,9 @@ def _some_of(posterior: Posterior, here: IntArray, decoded: BoolArray) -> BoolAr
     doubtful[here] = unresolved(suspicion)[here]
     groups, doubt = _groups(posterior, doubtful)
     counts = _answer_sizes(suspicion[ranked[:WITNESSES] if doubt >= WORTH_WITNESSES else ranked])
+    everybody_cleared = int(good[here].sum())
+    if everybody_cleared:
+        counts = np.union1d(counts, [everybody_cleared])
     answers = np.zeros((len(counts), len(suspicion)), dtype=bool)
     for row, count in zip(answers, counts, strict=True):
         row[ranked[:count]] = True

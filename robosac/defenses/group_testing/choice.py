@@ -9,12 +9,17 @@ from robosac.defenses.group_testing.distribution import BoolArray
 from robosac.defenses.group_testing.geometry import crowd
 from robosac.defenses.group_testing.knowledge import Knowledge
 from robosac.defenses.group_testing.memory import CHANGE_REPEAT, EGO_REPEAT, PAIR_REPEAT, keys
-from robosac.defenses.group_testing.posterior import Posterior
+from robosac.defenses.group_testing.posterior import EXACT, Posterior
 
 GAIN = 0.26
 GAIN_SCALE = 2.0
 HARM = 0.35
 """Average precision that m benign messages add, ``GAIN (1 - exp(-m / GAIN_SCALE))``, and that an attacker takes."""
+MORE_GAIN = 0.09
+MORE_SCALE = 4.5
+"""What messages beyond `EXACT` add besides, ``MORE_GAIN (1 - exp(-(m - EXACT) / MORE_SCALE))``: in scenes of twenty
+cars AP50 grows by .05 and AP70 by .12 from six messages to twenty.
+"""
 INFORMATION_VALUE = 0.06
 """What a bit about who attacks is worth, in the unit of utility."""
 TEST_COST = 0.004
@@ -28,7 +33,9 @@ _CERTAIN = 1e-12
 
 def gain(sizes: FloatArray | IntArray) -> FloatArray:
     """What the answer of so many benign messages is worth above the ego's own."""
-    return GAIN * (1.0 - np.exp(-np.asarray(sizes, dtype=np.float64) / GAIN_SCALE))
+    m = np.asarray(sizes, dtype=np.float64)
+    more: FloatArray = MORE_GAIN * (1.0 - np.exp(-np.maximum(m - EXACT, 0.0) / MORE_SCALE))
+    return GAIN * (1.0 - np.exp(-m / GAIN_SCALE)) + more
 
 
 def utility(posterior: Posterior, subsets: BoolArray) -> FloatArray:

@@ -53,7 +53,13 @@ def conclude(found: Findings, answer: Hypothesis) -> None:
     _leave_alone(found, answer)
     _clear(found)
     for name in found.team:
-        counts = dict.fromkeys({lie.counts_as for lie in blamed[name]}, 1) | {"conflict": conflicts[name]}
+        counts = {"conflict": conflicts[name]}
+        for kind in {lie.counts_as for lie in blamed[name]}:
+            of_kind = [lie for lie in blamed[name] if lie.counts_as == kind]
+            places = [found.placed(lie.place) for lie in of_kind]
+            counts[kind] = found.lies.counting(name, kind, places, found.known.memory.frame)
+            if any(lie.said for lie in of_kind):
+                counts[kind] = 1
         weight = found.lies.add(name, counts)
         if weight:
             _accuse(found, name, weight, blamed[name], conflicts[name])
@@ -86,8 +92,8 @@ def _conflicts(found: Findings, answer: Hypothesis) -> dict[str, int]:
     memory, counts = found.known.memory, {}
     for name in found.team:
         places = [found.placed(box[:2]) for box in claims.boxes[claims.in_conflict(name, found.unheard)]]
-        new = found.lies.new_conflicts(name, places, memory.frame)
-        counts[name] = len(places) if found.calm else new
+        once = None if found.calm else 1
+        counts[name] = found.lies.counting(name, "conflict", places, memory.frame, once)
     return counts
 
 

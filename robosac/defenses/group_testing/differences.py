@@ -10,7 +10,7 @@ from collections.abc import Collection, Mapping, Sequence
 import numpy as np
 
 from robosac.boxes import FloatArray, IntArray, pairwise_iou
-from robosac.defenses.group_testing.claims import SUPPORTS, WEIGHTY, two_witnesses
+from robosac.defenses.group_testing.claims import DENIES, SUPPORTS, WEIGHTY, two_witnesses
 from robosac.defenses.group_testing.distribution import BoolArray
 from robosac.defenses.group_testing.objects import AWAY, CERTAIN, PLACED_SCORE, SHOWN_SCORE, THERE_SCORE, Lie, Shown
 
@@ -52,7 +52,7 @@ def effects(joined: Shown, without: Shown, suspects: Sequence[str]) -> list[Lie]
     lost, own = without.boxes[which], without.own(suspects)[:, which].min(axis=0)
     drop = without.odds_at(lost[:, :2]) - joined.odds_at(lost[:, :2])
     taken = np.flatnonzero((lost[:, 5] >= CRISP_SCORE) & (drop >= GONE_EFFECT))
-    found += [Lie("gone", lost[i, :2], bool(own[i] >= SUPPORTS)) for i in taken]
+    found += [Lie("gone", lost[i, :2], bool(own[i] >= SUPPORTS), said=bool(own[i] <= DENIES)) for i in taken]
     found += [Lie("gone", without.boxes[i, :2], alone=True) for i in gone_alone(joined, without, suspects)]
     away, aside, other = joined.away(suspects), joined.away(suspects, across=True), without.away(suspects)
     for index in np.flatnonzero((away >= AWAY) & (joined.boxes[:, 5] >= PLACED_SCORE) & ~ghosts):

@@ -28,16 +28,20 @@ class Rule:
     """At each of these levels, when first reached, the logarithm of the likelihood ratio that it adds to suspicion."""
     malice: bool = True
     """Whether somebody is named for it; else it has innocent causes, too."""
+    times: int | None = None
+    """One place counts so often in `PLACE_FRAMES` frames, as an honest mistake about one thing stays where it is; None:
+    always.
+    """
 
 
 RULES: Mapping[str, Rule] = {
     "ghost": Rule(1.5, 1, 0.5, 3.0, ((1.0, 5.0), (2.0, 2.0), (3.0, 3.0))),
-    "gone": Rule(1.5, 1, 0.5, 3.0, ((1.0, 2.5), (2.0, 3.0), (3.0, 4.0))),
-    "moved": Rule(1.0, 1, 0.3, 2.0, ((0.7, 2.0), (1.4, 3.0), (2.1, 4.0))),
+    "gone": Rule(1.5, 1, 0.5, 3.0, ((1.0, 2.5), (2.0, 3.0), (3.0, 4.0)), times=2),
+    "moved": Rule(1.0, 1, 0.3, 2.0, ((0.7, 2.0), (1.4, 3.0), (2.1, 4.0)), times=2),
     "late": Rule(1.0, 1, 0.3, 2.0, ((0.7, 2.0), (1.4, 3.0), (2.1, 4.0)), malice=False),
     "alone": Rule(1.0, 1, 0.3, 2.0, ((0.7, 2.0), (1.4, 3.0), (2.1, 4.0)), malice=False),
-    "veiled": Rule(1.25, 1, 0.5, 3.0, ((0.75, 2.5), (1.5, 2.5), (2.25, 4.0))),
-    "conflict": Rule(1.0, 3, 0.5, 6.0, ((3.0, 2.0), (4.5, 4.0), (6.0, 4.0))),
+    "veiled": Rule(1.25, 1, 0.5, 3.0, ((0.75, 2.5), (1.5, 2.5), (2.25, 4.0)), times=2),
+    "conflict": Rule(1.0, 3, 0.5, 6.0, ((3.0, 2.0), (4.5, 4.0), (6.0, 4.0)), times=3),
 }
 QUIET_FRAMES = 9
 LONGEST_QUIET = 24
@@ -49,10 +53,8 @@ RECENT_FRAMES = 3
 QUIET_M = 3.0
 """Places nearer than this are one, metres."""
 MOST_QUIET = 32
-CONFLICT_FRAMES = 50
-"""Of a place over which somebody differs from all others it is counted once in so many frames: an honest mistake about
-one thing stays where it is.
-"""
+PLACE_FRAMES = 50
+"""See `Rule.times`."""
 
 
 @dataclass
@@ -63,8 +65,9 @@ class Lies:
     """By teammate and kind: the level, and the highest since it was 0."""
     quiet: list[tuple[float, float, int, int]] = field(default_factory=list)
     """Places left alone: x, y (world, metres), the frame of the session until which, and for how many frames."""
-    conflicts: dict[str, list[tuple[float, float, int]]] = field(default_factory=dict)
-    """By teammate: places over which it differed from all others: x, y (world, metres), and the frame of the session.
+    places: dict[str, dict[str, list[tuple[float, float, int, int]]]] = field(default_factory=dict)
+    """By teammate and kind: where it told a lie: x, y (world, metres), the frame of the session in which it first
+    counted, and how often it has counted since.
     """
     left_out: dict[str, int] = field(default_factory=dict)
     """By teammate: the frame of the session in which an answer was last decoded without it, to see what it does."""
@@ -92,20 +95,31 @@ class Lies:
             del self.levels[teammate]
         return weight
 
-    def new_conflicts(self, teammate: str, places: Sequence[FloatArray], frame: int) -> int:
-        """How many of the places (2,), world, over which it differs from all others are not known yet; as many as count
-        are known from now on.
+    def counting(
+        self, teammate: str, kind: str, places: Sequence[FloatArray], frame: int, times: int | None = None
+    ) -> int:
+        """How many of the places (2,), world, of a teammate's lies of a kind in this frame count; see `Rule.times`,
+        which ``times`` is in the stead of. They are known from now on, of new ones as many as count in a frame.
         """
-        known = [entry for entry in self.conflicts.get(teammate, ()) if frame - entry[2] < CONFLICT_FRAMES]
-        new = 0
+        rule = RULES[kind]
+        times = rule.times if times is None else times
+        if times is None:
+            return len(places)
+        known = [entry for entry in self.places.get(teammate, {}).get(kind, ()) if frame - entry[2] < PLACE_FRAMES]
+        count = 0
         for place in places:
-            if new < RULES["conflict"].most and not any(_near(x, y, place) for x, y, _ in known):
-                known.append((round(float(place[0]), 2), round(float(place[1]), 2), frame))
-                new += 1
-        self.conflicts.pop(teammate, None)
+            at = next((i for i, (x, y, _, _) in enumerate(known) if _near(x, y, place)), None)
+            if at is not None:
+                x, y, first, told = known[at]
+                if told < times:
+                    known[at] = (x, y, first, told + 1)
+                    count += 1
+            elif count < rule.most:
+                known.append((round(float(place[0]), 2), round(float(place[1]), 2), frame, 1))
+                count += 1
         if known:
-            self.conflicts[teammate] = known[-MOST_QUIET:]
-        return new
+            self.places.setdefault(teammate, {})[kind] = known[-MOST_QUIET:]
+        return count
 
     def worst(self, teammate: str) -> float:
         """The level of the kind nearest to being named for, as a share, whether or not somebody is named for it."""
@@ -130,7 +144,7 @@ class Lies:
     def forget(self, teammate: str) -> None:
         """It left."""
         self.levels.pop(teammate, None)
-        self.conflicts.pop(teammate, None)
+        self.places.pop(teammate, None)
         self.left_out.pop(teammate, None)
         self.audited.pop(teammate, None)
 
@@ -139,7 +153,10 @@ class Lies:
         return {
             "levels": {name: {kind: list(pair) for kind, pair in of.items()} for name, of in self.levels.items()},
             "quiet": [list(entry) for entry in self.quiet],
-            "conflicts": {name: [list(entry) for entry in of] for name, of in self.conflicts.items()},
+            "places": {
+                name: {kind: [list(entry) for entry in entries] for kind, entries in of.items()}
+                for name, of in self.places.items()
+            },
             "left_out": self.left_out,
             "audited": self.audited,
         }
@@ -151,8 +168,11 @@ class Lies:
             {name: {kind: (float(a), float(b)) for kind, (a, b) in of.items()} for name, of in state["levels"].items()},
             [(float(x), float(y), int(until), int(frames)) for x, y, until, frames in state["quiet"]],
             {
-                str(name): [(float(x), float(y), int(frame)) for x, y, frame in of]
-                for name, of in state.get("conflicts", {}).items()  # not in the states of older versions
+                str(name): {
+                    kind: [(float(x), float(y), int(first), int(told)) for x, y, first, told in entries]
+                    for kind, entries in of.items()
+                }
+                for name, of in state.get("places", {}).items()  # not in the states of older versions
             },
             {str(name): int(frame) for name, frame in state["left_out"].items()},
             {str(name): int(frame) for name, frame in state.get("audited", {}).items()},  # nor is this

@@ -62,6 +62,8 @@ class Lie:
     """Whether a vehicle is moved along itself only, or many are a little, as by a message that is late."""
     alone: bool = False
     """Whether a single witness supports the vehicle that is gone: one word against one."""
+    said: bool = False
+    """Whether the message of whoever is behind it says so, too: that a vehicle that it removes is not there."""
 
     @property
     def counts_as(self) -> str:

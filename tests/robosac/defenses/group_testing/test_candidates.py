@@ -66,20 +66,28 @@ def test_witnesses_decoded_before_are_in_every_group_test(halfway):
     assert ((alone & ~doubtful).sum(axis=1) == 0).any()
 
 
-def test_answers_are_small_while_somebody_is_in_doubt(halfway):
-    good = halfway.marginals() < UNRESOLVED[0]
-
-    def largest_answer():
+def test_answers_are_small_or_hold_all_cleared_while_somebody_is_in_doubt(halfway):
+    def sizes():
+        good = halfway.marginals() < UNRESOLVED[0]
         found = candidates(halfway, np.ones(20, dtype=bool), NOTHING)
-        return max(row.sum() for row in found if not (row & ~good).any())
+        return {int(row.sum()) for row in found if not (row & ~good).any()}, int(good.sum())
 
-    assert largest_answer() == WITNESSES
+    found, cleared = sizes()
+    assert cleared == 8
+    assert max(found - {cleared}) == WITNESSES
+    assert cleared in found
     for index in range(8, 18):
         learn(halfway, np.arange(20) == index, -9.0)
     for index in (18, 19):
         learn(halfway, np.arange(20) == index, 12.0)
-    good = halfway.marginals() < UNRESOLVED[0]
-    assert largest_answer() > MOST_WITNESSES
+    found, cleared = sizes()
+    assert max(found - {cleared}) > MOST_WITNESSES
+
+
+def test_where_nobody_is_cleared_no_answer_is_empty():
+    doubtful = Posterior(KINDS, 0.5, 0.25, [f"v{i:02d}" for i in range(20)])
+    assert not (doubtful.marginals() < UNRESOLVED[0]).any()
+    assert candidates(doubtful, np.ones(20, dtype=bool), NOTHING).any(axis=1).all()
 
 
 def test_what_only_rounding_tells_apart_stays_in_order():

@@ -4,12 +4,12 @@ import pytest
 from robosac.answers import Verdict
 from robosac.boxes import pose_matrix
 from robosac.defenses import Outcome
-from robosac.defenses.group_testing.choice import DEPENDENCE, expected_information
+from robosac.defenses.group_testing.choice import DEPENDENCE, GAIN, GAIN_SCALE, expected_information, gain
 from robosac.defenses.group_testing.evidence import Evidence
 from robosac.defenses.group_testing.geometry import followed
 from robosac.defenses.group_testing.knowledge import Knowledge
 from robosac.defenses.group_testing.memory import CHANGE_REPEAT, Memory, identity, keys
-from robosac.defenses.group_testing.posterior import Posterior
+from robosac.defenses.group_testing.posterior import EXACT, Posterior
 from tests.robosac.defenses.group_testing.conversing import SEEN, TEAM, make_model
 
 MODEL = make_model()
@@ -22,6 +22,15 @@ NONE = np.zeros((0, len(TEAM)), dtype=bool)
 def bits(memory, subsets=SINGLES, decoded=NONE, *, ego_sees=True):
     known = Knowledge(MODEL, POSTERIOR, memory)
     return expected_information(known, subsets, decoded, ego_sees=ego_sees)
+
+
+def test_larger_answers_are_worth_more_also_beyond_the_calibrated_teams():
+    sizes = np.arange(64)
+    worth = gain(sizes)
+    assert (np.diff(worth) > 0).all()
+    few = sizes <= EXACT
+    np.testing.assert_allclose(worth[few], GAIN * (1 - np.exp(-sizes[few] / GAIN_SCALE)))
+    assert worth[20] - worth[EXACT] == pytest.approx(0.09, abs=0.02)
 
 
 def test_what_was_decoded_in_the_frame_before_promises_more():

@@ -38,19 +38,24 @@ class World:
         L of the place, the ego's under "".
     shows : callable
         A subset -> the boxes (n, 6) that its fusion shows there.
+    speed : float
+        At which all of them drive, metres a frame.
     """
 
-    def __init__(self, said, shows):
+    def __init__(self, said, shows, speed=0.0):
         known = {name: [(x, y, YES) for x, y in SEEN[:, :2]] for name in (EGO, *TEAM)}
         for name, value in said.items():
             known[name].append((*PLACE, value))
         self.testimony = saying(known)
         self.shows = shows
+        self.speed = speed
 
     def judge(self, subset, _, frame):
         boxes = np.vstack([SEEN, self.shows(subset)])
         told = {"testimony": self.testimony, "alone": SEEN}
-        return Outcome(subset, 0.93, Verdict.CONSENSUS, boxes, SEEN, np.eye(4), frame, **told)
+        pose = np.eye(4)
+        pose[0, 3] = self.speed * frame
+        return Outcome(subset, 0.93, Verdict.CONSENSUS, boxes, SEEN, pose, frame, **told)
 
     def play(self, frames, defense=DEFENSE, quiet=0):
         """Decisions, and the boxes of each subset decoded, of frames after some in which nobody lies."""
@@ -86,6 +91,10 @@ GHOST = World({"car-2": NO, "car-3": NO, LIAR: YES}, with_liar(CAR, CAR[:0]))
 ERASED = World({"car-2": YES, "car-3": YES, "rsu": YES, LIAR: NO}, erased)
 NEAR, ASIDE = CAR + [0, 0.1, 0, 0, 0, 0], CAR + [0, 1.6, 0, 0, 0, 0]
 MOVED = World({"car-2": YES, "car-3": YES, "rsu": YES}, with_liar(ASIDE, NEAR))
+DRIVING_MOVED = World({"car-2": YES, "car-3": YES, "rsu": YES}, with_liar(ASIDE, NEAR), speed=1.0)
+VEILED = World({"car-2": NO, "car-3": NO, LIAR: NO}, with_liar(CAR, CAR[:0]))
+DRIVING_VEILED = World({"car-2": NO, "car-3": NO, LIAR: NO}, with_liar(CAR, CAR[:0]), speed=1.0)
+UNSAID = World({"car-2": YES, "car-3": YES, "rsu": YES}, erased)
 
 
 def there(decision, tested, boxes):
@@ -94,7 +103,7 @@ def there(decision, tested, boxes):
     return [(judged, row) for judged, row in rows if np.hypot(*(row[:2] - PLACE)) < 4.0]
 
 
-@pytest.mark.parametrize(("world", "kind"), [(GHOST, "ghost"), (ERASED, "gone"), (MOVED, "moved")])
+@pytest.mark.parametrize(("world", "kind"), [(GHOST, "ghost"), (ERASED, "gone"), (DRIVING_MOVED, "moved")])
 def test_who_lies_about_an_object_is_named_and_nobody_else(world, kind):
     met = world.play(10)
     assert {name for decision, _ in met for name in decision.named} == {LIAR}
@@ -108,7 +117,17 @@ def test_who_lies_about_an_object_is_named_and_nobody_else(world, kind):
     assert audited
     for item in audited:
         assert set(item["kinds"]) == {kind}
-        assert item["places"][0] == pytest.approx(PLACE, abs=2.0)
+        assert item["places"][0] == pytest.approx(PLACE + [world.speed * item["frame"], 0.0], abs=2.0)
+
+
+@pytest.mark.parametrize("kind", ["moved", "veiled", "gone"])
+def test_who_is_wrong_about_one_thing_only_is_left_out_and_not_named(kind):
+    met = {"moved": MOVED, "veiled": VEILED, "gone": UNSAID}[kind].play(60)
+    assert not any(decision.named for decision, _ in met)
+    assert any(
+        kind in item["kinds"] for item in met[-1][0].state["memory"]["evidence"][LIAR] if item["test"] == "objects"
+    )
+    assert any(LIAR not in decision.accepted for decision, _ in met)
 
 
 @pytest.mark.parametrize(("world", "done"), [(GHOST, "invented"), (ERASED, "removed"), (MOVED, "displaced")])
@@ -356,11 +375,8 @@ def test_a_ghost_is_blamed_beside_few_others_too():
     assert "ghost" in concluded(GHOST, ("car-2", "car-3", LIAR), ("car-2", "car-3")).lies.levels[LIAR]
 
 
-VEILED = World({"car-2": NO, "car-3": NO, LIAR: NO}, with_liar(CAR, CAR[:0]))
-
-
-def test_who_denies_its_own_ghost_is_named_too():
-    met = VEILED.play(12)
+def test_who_denies_its_own_ghosts_is_named_too():
+    met = DRIVING_VEILED.play(12)
     assert {name for decision, _ in met for name in decision.named} == {LIAR}
     items = [item for item in met[-1][0].state["memory"]["evidence"][LIAR] if item["test"] == "objects"]
     assert {kind for item in items for kind in item["kinds"]} == {"veiled"}

@@ -6,9 +6,9 @@ import numpy as np
 import pytest
 
 from robosac.defenses.group_testing.lies import (
-    CONFLICT_FRAMES,
     LONGEST_QUIET,
     MOST_QUIET,
+    PLACE_FRAMES,
     QUIET_FRAMES,
     QUIET_M,
     RULES,
@@ -125,28 +125,50 @@ def test_places_of_long_ago_are_forgotten_and_the_latest_kept():
     assert len(lies.quiet) == 1
 
 
-def test_a_place_of_conflict_counts_once():
-    lies, most = Lies(), RULES["conflict"].most
-    assert lies.new_conflicts("a", [HERE], 0) == 1
-    assert lies.new_conflicts("a", [HERE + [QUIET_M - 0.1, 0.0]], CONFLICT_FRAMES - 1) == 0
-    assert lies.new_conflicts("a", [HERE], CONFLICT_FRAMES) == 1
-    assert lies.new_conflicts("b", [HERE], 1) == 1
-    many = [HERE + [10.0 * i, 0.0] for i in range(1, 2 * most)]
-    assert lies.new_conflicts("a", many, CONFLICT_FRAMES) == most
-    assert lies.new_conflicts("a", many, CONFLICT_FRAMES) == len(many) - most  # those that did not count
+def test_a_place_of_conflict_counts_so_often():
+    lies, rule = Lies(), RULES["conflict"]
+    near = HERE + [QUIET_M - 0.1, 0.0]
+    counted = [lies.counting("a", "conflict", [near if frame else HERE], frame) for frame in range(rule.times + 2)]
+    assert counted == [1] * rule.times + [0, 0]
+    assert lies.counting("a", "conflict", [HERE], PLACE_FRAMES) == 1
+    assert lies.counting("b", "conflict", [HERE], 1) == 1
+    assert lies.counting("a", "moved", [HERE], 1) == 1
 
 
-def test_no_mistake_about_one_thing_names_anybody():
+def test_where_a_place_counts_once_it_counts_once():
     lies = Lies()
-    for frame in range(300):
-        lies.add("a", {"conflict": lies.new_conflicts("a", [HERE], frame)})
-        assert lies.worst("a") < 1.0
-    assert lies.worst("a") < 1.0
+    assert [lies.counting("a", "conflict", [HERE], frame, 1) for frame in range(3)] == [1, 0, 0]
+
+
+def test_of_many_places_as_many_become_known_as_count_in_a_frame():
+    lies, most = Lies(), RULES["conflict"].most
+    many = [HERE + [10.0 * i, 0.0] for i in range(2 * most)]
+    assert lies.counting("a", "conflict", many, 0, 1) == most
+    assert lies.counting("a", "conflict", many, 1, 1) == most  # those that did not count
+    assert lies.counting("a", "conflict", many, 2, 1) == 0
+
+
+def test_ghosts_count_always():
+    lies = Lies()
+    assert [lies.counting("a", "ghost", [HERE], frame) for frame in range(5)] == [1] * 5
+    assert not lies.places
+
+
+@pytest.mark.parametrize("kind", [kind for kind, rule in RULES.items() if rule.times is not None])
+@pytest.mark.parametrize("often", [1, 2, 3, 7])
+def test_no_mistake_about_one_thing_names_anybody(kind, often):
+    lies = Lies()
+    for frame in range(0, 300, often):
+        lies.add("a", {kind: lies.counting("a", kind, [HERE], frame)})
+        assert lies.guilt("a") < 1.0
+        for _ in range(often - 1):
+            lies.add("a", {})
 
 
 def test_what_is_remembered_survives_json():
     lies = Lies()
-    lies.new_conflicts("a", [HERE], 3)
+    lies.counting("a", "conflict", [HERE], 3)
+    lies.counting("a", "moved", [HERE + 1.0], 4)
     lies.add("a", {"ghost": 1, "conflict": 3})
     lies.add("b", {"moved": 1})
     lies.leave_alone(HERE, 7)
