@@ -10,15 +10,12 @@ from __future__ import annotations
 
 import asyncio
 import os
-import platform
-import re
 import sys
 import tempfile
 import time
 from collections.abc import Mapping, Sequence
 from contextlib import AsyncExitStack
 from dataclasses import dataclass
-from pathlib import Path
 from typing import Annotated, Any
 
 import torch
@@ -29,6 +26,7 @@ from rich.progress import track
 from clients import trial
 from clients.client import GatewayClient, VehicleClient
 from clients.errors import GatewayError
+from clients.machine import machine, pace
 from clients.measured import Figures, Load
 from clients.metering import CountingTransport, Meter
 from clients.simulation import Fleet
@@ -109,9 +107,12 @@ async def run_load(
         while len(egos) < work.egos:
             egos.append(await new_ego(gateway, budget_ms, bodies.team, defense))
             stack.push_async_callback(egos[-1].close)
+        cold = await meter.frames() if meter else []
         for index in range(WARM_UP_FRAMES):
             for ego in egos:
                 await ego.post_frame_body(bodies.numbered(index))
+        run.figures.placed = _placed(cold, await meter.frames(), len(egos)) if meter else None
+        run.figures.pace = await asyncio.to_thread(pace) if meter else None
         records = [await _last_record(ego) for ego in egos] if meter else []
         before = await meter.read() if meter else None
         run.started = time.perf_counter()
@@ -124,6 +125,12 @@ async def run_load(
             logs = [await _log_bytes(ego, since) for ego, since in zip(egos, records, strict=True)]
             run.figures.used["audit_bytes"] = sum(logs) / frames if frames else None
     return run.figures
+
+
+def _placed(before: Sequence[int], after: Sequence[int], egos: int) -> list[int] | None:
+    """Egos of each gateway, by how many frames it answered while they warmed up; None if others sent some, too."""
+    placed = [(b - a) // WARM_UP_FRAMES for a, b in zip(before, after, strict=True)]
+    return placed if sum(placed) == egos else None
 
 
 async def _last_record(ego: VehicleClient) -> int:
@@ -259,14 +266,8 @@ def main(  # the options of a command line
         results = trial.run(run_all(folder), console, "The load test")
     sizes = {team: len(bodies[False, team].numbered(0)) for team in teams}
     show(console, results, sizes[teams[0]], budget_ms)
-    machine = {
-        "platform": platform.platform(),
-        "processor": _processor(),
-        "python": sys.version.split()[0],
-        "cores": os.cpu_count(),
-    }
     report: Mapping[str, Any] = {
-        "machine": machine,
+        "machine": machine(),
         "processes": len(process or [url]),
         "bytes_a_frame": sizes[teams[0]],
         "body_bytes": {str(team): size for team, size in sizes.items()},
@@ -278,15 +279,6 @@ def main(  # the options of a command line
     if any(not figures.latencies_ms for figures in results):
         console.print("[red]A load got no answer at all.[/red]")
         sys.exit(1)
-
-
-def _processor() -> str:
-    """Its name, as Linux has it, or else as Python knows it."""
-    try:
-        found = re.search(r"^model name\s*: (.*)$", Path("/proc/cpuinfo").read_text(), re.MULTILINE)
-    except OSError:
-        found = None
-    return found[1] if found else platform.processor()
 
 
 def _defense(kind: str, teammates: int) -> Mapping[str, Any]:

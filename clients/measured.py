@@ -3,13 +3,14 @@
 from __future__ import annotations
 
 from collections import Counter, defaultdict
-from collections.abc import Mapping
+from collections.abc import Mapping, Sequence
 from dataclasses import asdict, dataclass, field
 from typing import Any
 
 import numpy as np
 
 from clients import trial
+from clients.machine import Pace
 from robosac.answers import FrameAnswer
 
 WAITS = ("receive", "gather", "queue", "total", "store")
@@ -50,6 +51,10 @@ class Figures:
     stages: defaultdict[str, list[float]] = field(default_factory=lambda: defaultdict(list))
     used: Mapping[str, float | None] = field(default_factory=dict)
     """What an answered frame cost, see `clients.metering`; empty if it was not metered."""
+    placed: Sequence[int] | None = None
+    """Egos that fell to each gateway; None if it is not known."""
+    pace: Pace | None = None
+    """Of the machine, just before; None if it was not metered."""
 
     def add(self, answer: FrameAnswer, latency_ms: float) -> None:
         """Count an answer."""
@@ -78,6 +83,8 @@ class Figures:
             "sampling_steps_mean": float(np.mean(self.steps)) if answered else None,
             "by_steps": {str(steps): self._tested(steps) for steps in sorted(set(self.steps))},
             "used_a_frame": dict(self.used),
+            "placed": self.placed,
+            "pace": None if self.pace is None else asdict(self.pace),
             "errors": dict(self.errors),
             "stages_ms": {stage: float(np.median(values)) for stage, values in self.stages.items()},
         }

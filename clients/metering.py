@@ -3,11 +3,13 @@
 from __future__ import annotations
 
 import math
+import os
 import sqlite3
 import time
 from collections.abc import Sequence
 from contextlib import closing
 from dataclasses import dataclass
+from pathlib import Path
 
 import httpx
 from prometheus_client.parser import text_string_to_metric_families
@@ -15,7 +17,7 @@ from prometheus_client.parser import text_string_to_metric_families
 from clients.client import LIMITS
 from clients.errors import GatewayUnreachable
 
-CPU = "process_cpu_seconds"
+CPU, FRAMES = "process_cpu_seconds", "robosac_frames"
 LINE_BYTES = len("HTTP/1.1 200 OK\r\n\r\n")
 """About what a request or an answer has beside its header fields and its body."""
 
@@ -47,6 +49,8 @@ class Reading:
     """Of all gateway processes; NaN where one does not tell."""
     client_cpu_s: float
     """Of this process."""
+    machine_cpu_s: float
+    """Of everything on this machine; NaN where the system does not tell."""
     disk_bytes: float
     """The database's size; NaN where it cannot be seen from here."""
     sent_bytes: int
@@ -57,6 +61,7 @@ class Reading:
         spent = {
             "gateway_cpu_ms": (self.gateway_cpu_s - earlier.gateway_cpu_s) * 1e3,
             "client_cpu_ms": (self.client_cpu_s - earlier.client_cpu_s) * 1e3,
+            "machine_cpu_ms": (self.machine_cpu_s - earlier.machine_cpu_s) * 1e3,
             "disk_bytes": self.disk_bytes - earlier.disk_bytes,
             "sent_bytes": self.sent_bytes - earlier.sent_bytes,
             "received_bytes": self.received_bytes - earlier.received_bytes,
@@ -89,10 +94,24 @@ class Meter:
         GatewayUnreachable
             If a gateway does not tell its metrics.
         """
-        async with httpx.AsyncClient(trust_env=False) as http:
-            cpu_s = math.fsum([await _cpu_s(http, url) for url in self.gateways])
+        cpu_s = math.fsum([samples[0] if samples else math.nan for samples in await self._samples(CPU)])
         sent, received = self.transport.sent_bytes, self.transport.received_bytes
-        return Reading(cpu_s, time.process_time(), self._disk_bytes(), sent, received)
+        return Reading(cpu_s, time.process_time(), _machine_cpu_s(), self._disk_bytes(), sent, received)
+
+    async def frames(self) -> list[int]:
+        """How many frames each gateway has answered.
+
+        Raises
+        ------
+        GatewayUnreachable
+            If a gateway does not tell its metrics.
+        """
+        return [int(sum(samples)) for samples in await self._samples(FRAMES)]
+
+    async def _samples(self, name: str) -> list[list[float]]:
+        """Of each gateway, the values of a metric."""
+        async with httpx.AsyncClient(trust_env=False) as http:
+            return [await _samples(http, url, name) for url in self.gateways]
 
     def _disk_bytes(self) -> float:
         """Pages of a SQLite file, those that are still in its write-ahead log included."""
@@ -109,10 +128,19 @@ class Meter:
         return float(pages * size)
 
 
-async def _cpu_s(http: httpx.AsyncClient, url: str) -> float:
+def _machine_cpu_s() -> float:
+    """Time that all cores together have worked, as Linux tells it (proc_stat(5)): user, nice, system, irq, softirq."""
+    try:
+        user, nice, system, _, _, irq, softirq = map(int, Path("/proc/stat").read_text().split(maxsplit=8)[1:8])
+    except (OSError, ValueError):
+        return math.nan
+    return (user + nice + system + irq + softirq) / os.sysconf("SC_CLK_TCK")
+
+
+async def _samples(http: httpx.AsyncClient, url: str, name: str) -> list[float]:
     try:
         text = (await http.get(f"{url}/metrics")).raise_for_status().text
     except httpx.HTTPError as error:
         raise GatewayUnreachable(f"GET {url}/metrics: {type(error).__name__} {error}") from error
-    found = [family.samples[0].value for family in text_string_to_metric_families(text) if family.name == CPU]
-    return found[0] if found else math.nan
+    families = [family for family in text_string_to_metric_families(text) if family.name == name]
+    return [sample.value for family in families for sample in family.samples if not sample.name.endswith("_created")]

@@ -14,7 +14,8 @@ from scipy.optimize import nnls
 
 from clients.capacity.queueing import Service
 
-MEASURED = ("gateway_cpu_ms", "client_cpu_ms", "disk_bytes", "sent_bytes", "received_bytes", "audit_bytes")
+TIMES = ("gateway_cpu_ms", "client_cpu_ms", "machine_cpu_ms")
+MEASURED = (*TIMES, "disk_bytes", "sent_bytes", "received_bytes", "audit_bytes")
 Positive = Field(gt=0, allow_inf_nan=False)
 
 
@@ -27,6 +28,15 @@ class Tested(BaseModel):
     engine_ms: float = Positive
     engine_spread_ms: float = Field(ge=0, allow_inf_nan=False)
     latency_ms: float = Positive
+
+
+class MeasuredPace(BaseModel):
+    """Of the machine, before a load: see `clients.machine.Pace`."""
+
+    model_config = ConfigDict(frozen=True)
+
+    alone_ms: float = Positive
+    together_ms: float = Positive
 
 
 class MeasuredLoad(BaseModel):
@@ -46,6 +56,25 @@ class MeasuredLoad(BaseModel):
     used_a_frame: dict[str, float | None]
     stages_ms: dict[str, float]
     errors: dict[str, int]
+    placed: list[int] | None = None
+    """Egos of each process; None where it is not known."""
+    pace: MeasuredPace | None = None
+    """None in reports of older versions, and where costs were not measured."""
+
+    def slowness(self, reference_ms: float | None, others: float) -> float:
+        """By how much more processor time a computation takes in this load than at the reference's pace on a core
+        beside which none works.
+
+        Parameters
+        ----------
+        reference_ms : float or None
+            `MeasuredPace.alone_ms` of the reference; None: not known.
+        others : float
+            Share of the other cores that work at the same time; they share caches and power.
+        """
+        if self.pace is None or reference_ms is None:
+            return 1.0
+        return (self.pace.alone_ms + (self.pace.together_ms - self.pace.alone_ms) * others) / reference_ms
 
 
 class MeasuredMachine(BaseModel):
@@ -147,6 +176,8 @@ class Costs:
     """How many frames tested so many hypotheses, by whether there was an attacker, and by the teammates."""
     receive_ms: float
     store_ms: float
+    pace_ms: float | None
+    """Of the machine, as `MeasuredPace.alone_ms`, to which times are reduced; None where it was not measured."""
 
     def check_team(self, teammates: int) -> None:
         """Refuse a number of teammates of whose cost nothing is known.
@@ -234,27 +265,55 @@ def costs_of(report: Report) -> Costs:
     if not all(by_attack.values()):
         raise ValueError("the report has no loads of single egos, without and with an attacker, to take the costs from")
 
+    paces = [load.pace.alone_ms for load in loads if load.pace is not None]
+    pace_ms = float(np.median(paces)) if len(paces) == len(loads) else None
+    slow = [load.slowness(pace_ms, _others(report, load)) for load in loads]
+
     def used(name: str) -> Line | None:
         points = [
-            (load.teammates, load.sampling_steps_mean, cost, load.frames)
-            for load in loads
+            (load.teammates, load.sampling_steps_mean, cost / (slower if name in TIMES else 1.0), load.frames)
+            for load, slower in zip(loads, slow, strict=True)
             if (cost := load.used_a_frame.get(name)) is not None
         ]
         return Line.through(points) if len(points) == len(loads) else None
 
-    tested = [(load.teammates, steps, of) for load in loads for steps, of in load.by_steps.items()]
-    frames = [of.frames for _, _, of in tested]
+    tested = [
+        (load.teammates, steps, of, slower)
+        for load, slower in zip(loads, slow, strict=True)
+        for steps, of in load.by_steps.items()
+    ]
+    frames = [of.frames for _, _, of, _ in tested]
     counts: defaultdict[tuple[bool, int], Counter[int]] = defaultdict(Counter)
     for load in loads:
         counts[load.attacked, load.teammates].update({steps: of.frames for steps, of in load.by_steps.items()})
     return Costs(
         kind=report.kind,
         teams=tuple(sorted({load.teammates for load in loads})),
-        engine_ms=Line.through([(team, steps, of.engine_ms, of.frames) for team, steps, of in tested]),
-        latency_ms=Line.through([(team, steps, of.latency_ms, of.frames) for team, steps, of in tested]),
+        engine_ms=Line.through([(team, steps, of.engine_ms / slower, of.frames) for team, steps, of, slower in tested]),
+        latency_ms=Line.through(
+            [(team, steps, of.latency_ms / slower, of.frames) for team, steps, of, slower in tested]
+        ),
         used={name: used(name) for name in MEASURED},
-        spread=float(np.average([of.engine_spread_ms / of.engine_ms for _, _, of in tested], weights=frames)),
+        spread=float(np.average([of.engine_spread_ms / of.engine_ms for _, _, of, _ in tested], weights=frames)),
         steps=counts,
         receive_ms=float(np.mean([load.stages_ms.get("receive", 0.0) for load in loads])),
         store_ms=float(np.mean([load.stages_ms.get("store", 0.0) for load in loads])),
+        pace_ms=pace_ms,
     )
+
+
+def _others(report: Report, load: MeasuredLoad) -> float:
+    gateway_ms, machine_ms = (load.used_a_frame.get(name) for name in ("gateway_cpu_ms", "machine_cpu_ms"))
+    if gateway_ms is None or machine_ms is None:
+        return 0.0
+    return others_at_work(load.fps, gateway_ms, machine_ms, report.processes, report.machine.cores)
+
+
+def others_at_work(fps: float, gateway_ms: float, machine_ms: float, processes: int, cores: int) -> float:
+    """Share of the other cores that work while a gateway's process does, from the processor time that a frame takes of
+    all gateways and of the whole machine.
+    """
+    if cores == 1:
+        return 0.0
+    working = fps * (machine_ms - gateway_ms / processes) / 1e3
+    return min(1.0, max(0.0, working / (cores - 1)))

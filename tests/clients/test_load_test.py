@@ -1,10 +1,11 @@
 import json
+import sys
 
 import pytest
 import typer
 from typer.testing import CliRunner
 
-from clients.load_test import Bodies, main
+from clients.load_test import Bodies, _placed, main
 from clients.measured import Figures, Load
 from robosac import wire
 
@@ -47,9 +48,19 @@ def test_a_short_run_measures_every_load(tmp_path):
         assert report["bytes_a_frame"] < used["sent_bytes"] < report["bytes_a_frame"] + 2000
         assert 1000 < used["audit_bytes"] < 20_000
         assert 0 < used["gateway_cpu_ms"] < 2000
+        if sys.platform == "linux":
+            assert used["gateway_cpu_ms"] + used["client_cpu_ms"] < used["machine_cpu_ms"] + 100  # it counts in 10 ms
+        assert load["placed"] == [load["egos"]]
+        assert all(milliseconds > 0 for milliseconds in load["pace"].values())
         assert {"receive", "queue", "prepare", "hypotheses", "total"} <= set(load["stages_ms"])
         if load["loop"] == "open":
             assert load["frames"] == load["egos"] * 3
+
+
+def test_egos_are_placed_where_their_first_frames_were_answered():
+    assert _placed([10, 4], [19, 7], 4) == [3, 1]
+    assert _placed([0], [3 * 4 + 1], 4) == [4]  # somebody else's frame, too
+    assert _placed([0, 0], [9, 9], 4) is None
 
 
 def test_refused_frames_count_as_not_answered_in_time():

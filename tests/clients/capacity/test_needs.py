@@ -2,8 +2,8 @@ from dataclasses import replace
 
 import pytest
 
-from clients.capacity.checking import checks, predicted_fps
-from clients.capacity.costs import Report, costs_of
+from clients.capacity.checking import MOST_BUSY, OVERLAP, checks, predicted_fps
+from clients.capacity.costs import MeasuredPace, Report, costs_of, others_at_work
 from clients.capacity.needs import Machine, Scenario, needs_of, on_the_wire, patience_ms
 from clients.capacity.queueing import one_server_late
 from tests.clients.capacity.reports import a_report
@@ -84,14 +84,85 @@ def test_a_budget_that_nothing_fits_into_is_refused():
         needs_of(COSTS, replace(CITY, budget_ms=30), MACHINE)
 
 
+LOCKED = 1e3 / 28.5 * OVERLAP
+"""Frames a second of a process that has always some to do."""
+
+
 def test_predictions_have_the_bounds_of_queues():
     one = next(load for load in REPORT.loads if load.loop == "closed" and not load.attacked and load.teammates == 5)
     assert predicted_fps(COSTS, one, 1, 2) == pytest.approx(1e3 / 37)  # as long as a frame takes by itself
     many = one.model_copy(update={"egos": 100})
-    assert predicted_fps(COSTS, many, 1, 64) == pytest.approx(1e3 / 28.5, rel=1e-3)  # the interpreter's lock
-    assert predicted_fps(COSTS, many, 2, 64) == pytest.approx(2e3 / 28.5, rel=1e-3)
-    assert predicted_fps(COSTS, many, 2, 1) == pytest.approx(1e3 / 32.5)  # the processor
+    assert predicted_fps(COSTS, many, 1, 64) == pytest.approx(LOCKED, rel=1e-3)  # the interpreter's lock
+    assert predicted_fps(COSTS, many, 2, 64) == pytest.approx(2 * LOCKED, rel=1e-3)
+    assert predicted_fps(COSTS, many, 2, 1) == pytest.approx(MOST_BUSY * 1e3 / 32.5)  # the processor
     assert predicted_fps(COSTS, many.model_copy(update={"rate_hz": 0.1}), 2, 64) == pytest.approx(10)
+
+
+MANY = REPORT.loads[0].model_copy(
+    update={"loop": "closed", "egos": 100, "teammates": 5, "rate_hz": None, "sampling_steps_mean": 1.0}
+)
+
+
+def test_egos_are_where_they_fell():
+    placed = MANY.model_copy(update={"placed": [100, 0]})
+    assert predicted_fps(COSTS, placed, 2, 64) == pytest.approx(LOCKED, rel=1e-3)
+    spread = placed.model_copy(update={"placed": [40, 60]})
+    assert predicted_fps(COSTS, spread, 2, 64) == pytest.approx(2 * LOCKED, rel=1e-3)
+
+
+def with_costs(change):
+    """A report whose loads are changed; what a frame takes of the machine is known in it."""
+    report = a_report()
+    for load in report["loads"]:
+        load["used_a_frame"]["machine_cpu_ms"] = load["used_a_frame"]["gateway_cpu_ms"] + 4.0
+        change(load)
+    return Report.model_validate(report)
+
+
+def test_what_else_works_on_the_machine_takes_processor_time_too():
+    def change(load):
+        load["used_a_frame"]["machine_cpu_ms"] += 6.0
+
+    assert predicted_fps(costs_of(with_costs(change)), MANY, 2, 1) == pytest.approx(MOST_BUSY * 1e3 / 38.5)
+
+
+def at_pace(load, alone, together):
+    load["pace"] = {"alone_ms": alone, "together_ms": together}
+    slower = alone / 2.0
+    for times in (load["used_a_frame"], *load["by_steps"].values()):
+        times |= {name: value * slower for name, value in times.items() if name.endswith("_ms")}
+
+
+def test_times_are_those_of_the_machines_pace():
+    def change(load):
+        at_pace(load, *((4.0, 4.0) if load["loop"] == "open" else (2.0, 2.0)))
+
+    costs = costs_of(with_costs(change))
+    assert costs.pace_ms == 3.0  # half of the loads were measured at twice the pace of the others
+    assert costs.used["gateway_cpu_ms"].at(5, 1) == pytest.approx(28.5 * 3 / 2)
+    slow = MANY.model_copy(update={"pace": costs_pace(6.0, 6.0)})
+    assert predicted_fps(costs, slow, 2, 64) == pytest.approx(2 * LOCKED / 3, rel=1e-3)
+
+
+def costs_pace(alone, together):
+    return MeasuredPace(alone_ms=alone, together_ms=together)
+
+
+def test_the_more_cores_work_the_slower_each_is():
+    costs = costs_of(with_costs(lambda load: at_pace(load, 2.0, 2.0)))
+    shared = MANY.model_copy(update={"pace": costs_pace(2.0, 3.0)})
+    assert predicted_fps(costs, shared, 1, 64) == pytest.approx(LOCKED, rel=0.02)  # hardly any of the others works
+    assert predicted_fps(costs, shared, 2, 2) == pytest.approx(
+        MOST_BUSY * 2e3 / 32.5 / 1.5, rel=0.03
+    )  # both cores do, nearly all the time
+    alone = MANY.model_copy(update={"egos": 1, "placed": [1, 0], "pace": costs_pace(2.0, 3.0)})
+    assert 1e3 / 37 / 1.3 < predicted_fps(costs, alone, 2, 2) < 1e3 / 37
+
+
+def test_a_machine_of_one_core_has_no_others():
+    assert others_at_work(100.0, 5.0, 50.0, 1, 1) == 0.0
+    assert others_at_work(100.0, 10.0, 15.0, 2, 2) == 1.0
+    assert others_at_work(50.0, 10.0, 12.0, 1, 3) == pytest.approx(0.05)
 
 
 def test_only_what_costs_were_not_fitted_to_is_checked():
