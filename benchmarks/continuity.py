@@ -3,8 +3,9 @@
 ``python benchmarks/continuity.py --engine proxy --database-url URL [--restart-database 'pg_ctl restart ...']``
 
 Vehicles post their own messages, teammates stand by. Phase by phase it is told what share of the frames was tested,
-answered from all messages, and in time, and the longest time from an answer of a session to its next. At the end every
-log is checked: what was acknowledged, its chain, and that one process at a time decided. Exits with 1 if any is wrong.
+answered from all messages, and in time, the longest time from an answer of a session to its next, and the longest that
+a session that asked waited for an answer. At the end every log is checked: what was acknowledged, its chain, and that
+one process at a time decided. Exits with 1 if any is wrong.
 """
 
 from __future__ import annotations
@@ -118,7 +119,8 @@ async def main(given: argparse.Namespace) -> list[str]:
             f"{each.replace('_', ' ')} {told[f'{each}_share']:.1%}" for each in ("tested", "whole", "in_time")
         )
         rest = {each: told[each] for each in ("asked", "answered", "untold", "sent_again", "refused")}
-        print(f"{phase.name}: {shares}, longest gap {phase.longest_gap_s:.1f} s, {rest}")
+        times = f"longest gap {phase.longest_gap_s:.1f} s, wait {phase.longest_wait_s:.2f} s"
+        print(f"{phase.name}: {shares}, {times}, {rest}")
     print(f"processes that decided, one after another: {[len(names) for names in writers]}")
     moves = 8
     return wrong + affinity(writers, moves)

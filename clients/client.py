@@ -36,8 +36,10 @@ __all__ = [
 DEFAULT_TIMEOUT_S = 30.0
 LIMITS = httpx.Limits(max_connections=None, max_keepalive_connections=256)
 AGAIN_FOR_S, AGAIN_FIRST_S, AGAIN_EVERY_S = 1.0, 0.02, 0.2
-"""How long a request is sent again where a gateway process ends and another takes it, and with which pauses."""
-DRAINING = "urn:robosac:problem:draining"
+"""How long a request is sent again where a gateway process ends and another takes it, or the database is away for a
+moment, and with which pauses.
+"""
+DRAINING, STORE_UNAVAILABLE = "urn:robosac:problem:draining", "urn:robosac:problem:store-unavailable"
 SILENCE_S = 40.0
 """A stream on which nothing came for so long is broken."""
 API_KEY_VARIABLE = "ROBOSAC_API_KEY"
@@ -226,10 +228,12 @@ class GatewayClient:
 
 
 def _is_to_be_sent_again(response: httpx.Response, method: str, path: str) -> bool:
-    """Whether a gateway process that is about to end has done nothing, or a proxy lost one before its answer."""
-    if response.status_code == HTTPStatus.SERVICE_UNAVAILABLE:
-        return _refusal(response).type == DRAINING
-    return response.status_code == HTTPStatus.BAD_GATEWAY and _counts_once(method, path)
+    """Whether a gateway process that is about to end has done nothing; or, of what counts once, whether a proxy lost a
+    process before its answer, or the database was away.
+    """
+    why = _refusal(response).type if response.status_code == HTTPStatus.SERVICE_UNAVAILABLE else None
+    lost = response.status_code == HTTPStatus.BAD_GATEWAY or why == STORE_UNAVAILABLE
+    return why == DRAINING or (lost and _counts_once(method, path))
 
 
 def _counts_once(method: str, path: str) -> bool:

@@ -49,6 +49,8 @@ class Phase:
     sent_again: int = 0
     longest_gap_s: float = 0.0
     """From an answer to the next of the same session."""
+    longest_wait_s: float = 0.0
+    """From the first frame that a session asks for after an answer to its next answer, to that frame or a later one."""
     refused: Counter[str] = field(default_factory=Counter)
 
     def as_dict(self) -> dict[str, Any]:
@@ -144,15 +146,18 @@ class Traffic:
             standing = [await stack.enter_async_context(mate.standing_by()) for mate in team.values()]
             await asyncio.gather(*(stand.standing.wait() for stand in standing))
             start, latest = time.monotonic() + delay_s, time.monotonic() + delay_s
+            waiting_since: float | None = None
             while not self._over:
                 frame, session.next_frame = session.next_frame, session.next_frame + 1
                 due = start + frame / self._rate_hz
                 await asyncio.sleep(max(due - time.monotonic(), 0.0))
                 phase, before = self.phase, sum(len(stand.sent_again) for stand in standing)
+                waiting_since = waiting_since or time.monotonic()
                 if await self._frame(session, ego, team, frame, phase):
                     now = time.monotonic()
                     phase.longest_gap_s = max(phase.longest_gap_s, now - latest)
-                    latest = now
+                    phase.longest_wait_s = max(phase.longest_wait_s, now - waiting_since)
+                    latest, waiting_since = now, None
                 phase.sent_again += sum(len(stand.sent_again) for stand in standing) - before
                 start = max(start, time.monotonic() - (frame + 1) / self._rate_hz)  # what is late delays what follows
 

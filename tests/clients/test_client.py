@@ -2,7 +2,7 @@ import httpx
 import numpy as np
 import pytest
 
-from clients.client import FrameAnswer, GatewayClient
+from clients.client import STORE_UNAVAILABLE, FrameAnswer, GatewayClient
 from clients.errors import (
     AccessDenied,
     FrameConflict,
@@ -50,6 +50,52 @@ async def test_a_refusal_without_a_problem_is_still_one():
     async with gateway(lambda _: httpx.Response(502, text="<html>")) as client:
         with pytest.raises(GatewayUnavailable, match="502"):
             await client.detectors()
+
+
+@pytest.mark.parametrize(
+    ("status", "problem", "path", "again"),
+    [
+        (503, "draining", "/v1/sessions", True),
+        (503, "draining", "/v1/sessions/s/frames", True),
+        (503, "store-unavailable", "/v1/sessions/s/frames", True),
+        (503, "store-unavailable", "/v1/sessions/s/messages", True),
+        (503, "store-unavailable", "/v1/sessions", False),  # nobody knows whether the session was opened
+        (503, "overloaded", "/v1/sessions/s/frames", False),
+        (502, "", "/v1/sessions/s/frames", True),
+        (502, "", "/v1/sessions", False),
+        (500, "internal-error", "/v1/sessions/s/frames", False),
+    ],
+)
+async def test_what_does_no_harm_is_sent_again(status, problem, path, again):
+    asked = []
+
+    def answer(request):
+        asked.append(request.url.path)
+        if len(asked) > 2:
+            return httpx.Response(200)
+        return httpx.Response(status, json={"type": f"urn:robosac:problem:{problem}"})
+
+    async with gateway(answer) as client:
+        if again:
+            assert (await client._request("POST", path)).is_success
+        else:
+            with pytest.raises(GatewayUnavailable):
+                await client._request("POST", path)
+    assert asked == [path] * (3 if again else 1)
+
+
+async def test_nothing_is_sent_again_for_ever(monkeypatch):
+    monkeypatch.setattr("clients.client.AGAIN_FOR_S", 0.1)
+    asked = []
+
+    def answer(_):
+        asked.append(1)
+        return httpx.Response(503, json={"type": STORE_UNAVAILABLE})
+
+    async with gateway(answer) as client:
+        with pytest.raises(GatewayUnavailable, match="store-unavailable"):
+            await client._request("POST", "/v1/sessions/s/frames")
+    assert 2 <= len(asked) <= 4
 
 
 @pytest.mark.parametrize("error", [httpx.ConnectError("refused"), httpx.ReadTimeout("slow")])
