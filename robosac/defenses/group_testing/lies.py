@@ -105,8 +105,11 @@ class Lies:
         times = rule.times if times is None else times
         if times is None:
             return len(places)
-        known = [entry for entry in self.places.get(teammate, {}).get(kind, ()) if frame - entry[2] < PLACE_FRAMES]
-        count = 0
+        fresh = {
+            each: [entry for entry in entries if frame - entry[2] < PLACE_FRAMES]
+            for each, entries in self.places.pop(teammate, {}).items()
+        }
+        known, count = fresh.pop(kind, []), 0
         for place in places:
             at = next((i for i, (x, y, _, _) in enumerate(known) if _near(x, y, place)), None)
             if at is not None:
@@ -117,8 +120,9 @@ class Lies:
             elif count < rule.most:
                 known.append((round(float(place[0]), 2), round(float(place[1]), 2), frame, 1))
                 count += 1
-        if known:
-            self.places.setdefault(teammate, {})[kind] = known[-MOST_QUIET:]
+        fresh = {each: entries for each, entries in {**fresh, kind: known[-MOST_QUIET:]}.items() if entries}
+        if fresh:
+            self.places[teammate] = fresh
         return count
 
     def worst(self, teammate: str) -> float:

@@ -148,6 +148,16 @@ def test_of_many_places_as_many_become_known_as_count_in_a_frame():
     assert lies.counting("a", "conflict", many, 2, 1) == 0
 
 
+def test_places_of_long_ago_are_forgotten():
+    lies = Lies()
+    lies.counting("a", "moved", [HERE], 0)
+    lies.counting("a", "conflict", [HERE], 10)
+    lies.counting("a", "conflict", [], PLACE_FRAMES)
+    assert set(lies.places["a"]) == {"conflict"}
+    lies.counting("a", "conflict", [], PLACE_FRAMES + 10)
+    assert not lies.places
+
+
 def test_ghosts_count_always():
     lies = Lies()
     assert [lies.counting("a", "ghost", [HERE], frame) for frame in range(5)] == [1] * 5
