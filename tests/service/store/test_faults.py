@@ -15,6 +15,7 @@ from types import SimpleNamespace
 import pytest
 from sqlalchemy import event, exc
 
+from clients.client import AGAIN_FOR_S
 from clients.crash_test.driven import Driven
 from clients.errors import GatewayUnavailable
 from robosac.audit.verification import verify
@@ -28,6 +29,12 @@ CLOCK_MS = 20
 """What the ego's clock may see more than the gateway's."""
 LATE_S = 0.5
 """What a busy machine may take longer than promised."""
+
+
+@pytest.fixture(autouse=True)
+def _one_try(monkeypatch):
+    """Frames are not sent again, so that each fault is seen."""
+    monkeypatch.setattr("clients.client.AGAIN_FOR_S", 0.0)
 
 
 class Ego:
@@ -186,6 +193,18 @@ async def test_an_error_at_each_statement_of_a_decision_in_turn(tmp_path, good_f
             assert breaking.count > at
             breaking.arm(None)
             await ego.check()
+
+
+async def test_a_frame_that_met_an_error_is_sent_again(tmp_path, good_frame, monkeypatch):
+    monkeypatch.setattr("clients.client.AGAIN_FOR_S", AGAIN_FOR_S)
+    async with serve(database_url=f"sqlite:///{tmp_path}/robosac.db", keep_frames=1) as served:
+        breaking = Breaking(served.gateway.store._database)
+        ego = await Ego.of(served, good_frame)
+        breaking.arm(2)
+        assert await ego.post()
+        assert breaking.count > 2
+        breaking.arm(None)
+        await ego.check()
 
 
 class Wire:
