@@ -83,5 +83,6 @@ async def test_sessions_go_on_while_one_process_is_restarted_and_the_other_is_ki
     for phase in traffic.phases:
         told = phase.as_dict()
         assert phase.answered >= 4, told
+        assert 0 < phase.longest_wait_s < phase.longest_gap_s + 0.1, told  # it waits since its last answer at most
         assert (phase.whole, phase.tested) == (phase.answered, phase.answered), told
         assert phase.answered + phase.refused["decided, the answer lost"] == phase.asked, told

@@ -135,11 +135,12 @@ def at_pace(load, alone, together):
 
 def test_times_are_those_of_the_machines_pace():
     def change(load):
-        at_pace(load, *((4.0, 4.0) if load["loop"] == "open" else (2.0, 2.0)))
+        at_pace(load, *((4.0, 4.0) if load["attacked"] else (2.0, 2.0)))
 
     costs = costs_of(with_costs(change))
     assert costs.pace_ms == 3.0  # half of the loads were measured at twice the pace of the others
     assert costs.used["gateway_cpu_ms"].at(5, 1) == pytest.approx(28.5 * 3 / 2)
+    assert costs.used["audit_bytes"].at(5, 1) == pytest.approx(1600)
     slow = MANY.model_copy(update={"pace": costs_pace(6.0, 6.0)})
     assert predicted_fps(costs, slow, 2, 64) == pytest.approx(2 * LOCKED / 3, rel=1e-3)
 

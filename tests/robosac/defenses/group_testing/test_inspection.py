@@ -13,9 +13,10 @@ from robosac.defenses.group_testing.conclusions import conclude
 from robosac.defenses.group_testing.evidence import Evidence
 from robosac.defenses.group_testing.findings import Findings
 from robosac.defenses.group_testing.knowledge import Knowledge
-from robosac.defenses.group_testing.lies import Lies
+from robosac.defenses.group_testing.lies import RULES, Lies
 from robosac.defenses.group_testing.memory import Memory
 from robosac.defenses.group_testing.posterior import Posterior
+from robosac.defenses.group_testing.steadiness import Steadiness
 from tests.robosac.defenses.group_testing.conversing import TEAM, make_model, run_frame
 from tests.robosac.testifying import saying
 
@@ -401,3 +402,18 @@ def test_who_moves_a_vehicle_along_itself_may_be_late_and_is_not_named():
     last, _ = met[-1]
     assert LIAR not in last.accepted
     assert last.suspicion[LIAR] > 0.5
+
+
+@pytest.mark.parametrize(("calm", "times"), [(1.0, RULES["conflict"].times), (0.1, 1)])
+def test_a_conflict_over_one_place_counts_once_beside_an_ego_that_flickers(calm, times, monkeypatch):
+    monkeypatch.setattr(Steadiness, "calm", calm)
+    alone_with_it = World({"car-2": YES, "car-3": YES, "rsu": YES, LIAR: NO}, lambda _: CAR)
+    found = Findings(knowledge(), Lies(), tuple(TEAM), ())
+    counted = []
+    for frame in range(5):
+        found.known.memory.frame = frame
+        found.learn(alone_with_it.judge(tuple(TEAM), None, frame))
+        before = found.lies.levels.get(LIAR, {}).get("conflict", (0.0, 0.0))[0]
+        conclude(found, tuple(TEAM))
+        counted.append(found.lies.levels.get(LIAR, {}).get("conflict", (0.0, 0.0))[0] > before)
+    assert counted == [True] * times + [False] * (5 - times)
