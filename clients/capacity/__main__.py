@@ -13,8 +13,9 @@ from rich.console import Console
 
 from clients import trial
 from clients.capacity.checking import WITHIN, Check, checks
-from clients.capacity.costs import Costs, costs_of, read_report
+from clients.capacity.costs import Costs, costs_of
 from clients.capacity.needs import Machine, Needs, Scenario, needs_of
+from clients.capacity.report import read_report
 from clients.capacity.sheets import Sheet, checks_sheet, city_sheet, needs_sheets, page
 from robosac.cli.blame import blaming
 from robosac.extras import need

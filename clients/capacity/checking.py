@@ -6,8 +6,9 @@ import math
 from collections.abc import Iterator
 from dataclasses import dataclass
 
-from clients.capacity.costs import TIMES, Costs, MeasuredLoad, Report, calibration, costs_of, others_at_work
+from clients.capacity.costs import TIMES, Costs, calibration, costs_of, others_at_work
 from clients.capacity.queueing import closed_rate
+from clients.capacity.report import MeasuredLoad, Report
 
 WITHIN = 0.2
 """How far a prediction may be off, of what was measured."""

@@ -30,7 +30,7 @@ class Rule:
     """Whether somebody is named for it; else it has innocent causes, too."""
     times: int | None = None
     """One place counts so often in `PLACE_FRAMES` frames, as an honest mistake about one thing stays where it is; None:
-    always.
+    always. A lie that the sender's own message tells, too, counts always (`objects.Lie.said`).
     """
 
 

@@ -7,9 +7,10 @@ import pytest
 import simpy
 
 from clients.capacity.city import KINDS, City, Day, Table, _evenly, simulate_day, traffic
-from clients.capacity.costs import Report, costs_of
+from clients.capacity.costs import costs_of
 from clients.capacity.needs import Scenario
 from clients.capacity.replica import Outcomes, Replica, work_of
+from clients.capacity.report import Report
 from tests.clients.capacity.reports import a_report
 
 COSTS = costs_of(Report.model_validate(a_report(teams=(5,))))

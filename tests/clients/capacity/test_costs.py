@@ -2,7 +2,8 @@ import json
 
 import pytest
 
-from clients.capacity.costs import Line, Report, calibration, costs_of, read_report
+from clients.capacity.costs import Line, calibration, costs_of
+from clients.capacity.report import Report, read_report
 from tests.clients.capacity.reports import CPU, ENGINE, LATENCY, a_report
 
 

@@ -3,9 +3,10 @@ from dataclasses import replace
 import pytest
 
 from clients.capacity.checking import MOST_BUSY, OVERLAP, checks, predicted_fps
-from clients.capacity.costs import MeasuredPace, Report, costs_of, others_at_work
+from clients.capacity.costs import costs_of, others_at_work
 from clients.capacity.needs import Machine, Scenario, needs_of, on_the_wire, patience_ms
 from clients.capacity.queueing import one_server_late
+from clients.capacity.report import MeasuredPace, Report
 from tests.clients.capacity.reports import a_report
 
 REPORT = Report.model_validate(a_report())

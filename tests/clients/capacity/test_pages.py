@@ -6,8 +6,9 @@ from pathlib import Path
 import pytest
 
 from clients.capacity.checking import checks
-from clients.capacity.costs import costs_of, read_report
+from clients.capacity.costs import costs_of
 from clients.capacity.needs import Machine, Scenario, needs_of
+from clients.capacity.report import read_report
 from clients.capacity.sheets import checks_sheet, needs_sheets
 
 FOLDER = Path(__file__).parents[3] / "docs" / "capacity"

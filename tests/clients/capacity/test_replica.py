@@ -4,9 +4,10 @@ import numpy as np
 import pytest
 import simpy
 
-from clients.capacity.costs import Report, costs_of
+from clients.capacity.costs import costs_of
 from clients.capacity.needs import Scenario
 from clients.capacity.replica import Outcomes, Replica, Work, simulate, work_of
+from clients.capacity.report import Report
 from tests.clients.capacity.reports import a_report
 
 COSTS = costs_of(Report.model_validate(a_report()))
