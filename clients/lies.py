@@ -59,7 +59,8 @@ class Lies:
             f"Lies about single objects: told in {rates['held']:.1%} of {rates['object_frames']} object frames, "
             f"at most {rates['longest']} in a row"
         ]
-        parts += [f"{name} in {rates[name]:.1%}" for name in ("flagged", "confirmed") if rates[name] is not None]
+        shares = {"flagged": "flagged", "confirmed": "confirmed", "single_witness": "told on the word of one"}
+        parts += [f"{said} in {rates[name]:.1%}" for name, said in shares.items() if rates[name] is not None]
         named = (
             f"all attackers named in {rates['shown_named']} of {rates['sequences_shown']} sequences in which one shows"
         )

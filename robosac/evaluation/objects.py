@@ -18,7 +18,9 @@ MATCH_IOU = 0.3
 """A box finds a vehicle from this IoU on."""
 NEAR_M = 2.0
 """A box centred so near to a lie shows it."""
-CONFIRMED, REPAIRED, CONTRADICTED = "confirmed", "repaired", "contradicted"
+CONFIRMED, REPAIRED, SINGLE, DISPUTED = TOLD_AS = "confirmed", "repaired", "single_witness", "disputed"
+"""How a box stands that tells a lie, the surest first."""
+CONTRADICTED = "contradicted"
 
 
 @dataclass(frozen=True)
@@ -56,8 +58,10 @@ class Judged:
     """Whether the answer tells it, too."""
     flagged: bool | None = None
     """Whether the answer says that it is contradicted, or repairs it; None from a defence that does not know."""
-    confirmed: bool | None = None
-    """Whether the answer tells it as confirmed; None from a defence that does not know, and of erased vehicles."""
+    told_as: str | None = None
+    """How the surest box stands that tells it (`TOLD_AS`), empty if none does; None from a defence that does not know,
+    and of erased vehicles.
+    """
 
 
 def judge(lies: Sequence[Lie], shown: Shown, truth: FloatArray, ideal: FloatArray) -> tuple[Judged, ...]:
@@ -119,8 +123,8 @@ def _erased(lie: Lie, shown: Shown) -> Judged:
 def _with_standing(lie: Lie, shown: Shown, telling: Sequence[int], flagged: bool) -> Judged:
     if shown.standing is None:
         return Judged(lie.number, bool(telling))
-    confirmed = any(shown.standing[index] == CONFIRMED for index in telling)
-    return Judged(lie.number, bool(telling), flagged, confirmed)
+    standing = {shown.standing[index] for index in telling}
+    return Judged(lie.number, bool(telling), flagged, next((status for status in TOLD_AS if status in standing), ""))
 
 
 def _apart(box: FloatArray, boxes: FloatArray) -> FloatArray:
@@ -188,8 +192,10 @@ class ObjectHistory:
             held=sum(lie.holds for lie in lies),
             flag_known=sum(lie.flagged is not None for lie in lies),
             flagged=sum(bool(lie.flagged) for lie in lies),
-            standing_known=sum(lie.confirmed is not None for lie in lies),
-            confirmed=sum(bool(lie.confirmed) for lie in lies),
+            standing_known=sum(lie.told_as is not None for lie in lies),
+            confirmed=sum(lie.told_as == CONFIRMED for lie in lies),
+            single_witness=sum(lie.told_as == SINGLE for lie in lies),
+            disputed=sum(lie.told_as == DISPUTED for lie in lies),
         )
 
 
@@ -202,6 +208,8 @@ class Tally(NamedTuple):
     flagged: int
     standing_known: int
     confirmed: int
+    single_witness: int
+    disputed: int
 
 
 def object_rates(histories: Iterable[ObjectHistory]) -> dict[str, Any] | None:
@@ -210,7 +218,8 @@ def object_rates(histories: Iterable[ObjectHistory]) -> dict[str, Any] | None:
     Returns
     -------
     dict
-        ``object_frames``; ``held``, ``flagged``, ``confirmed``: shares of them, None where the defence does not know;
+        ``object_frames``; ``held``, ``flagged``: shares of them; ``confirmed``, ``single_witness``, ``disputed``:
+        shares of them in which the lie is told so, None where the defence does not know;
         ``longest``: most successive frames in which a lie holds; ``frames_to_flag``, ``frames_to_name``: means;
         ``sequences_shown``: sequences in which a lie holds in the undefended fusion at all; ``shown_named``: those of
         them in which all attackers were named.
@@ -227,7 +236,10 @@ def object_rates(histories: Iterable[ObjectHistory]) -> dict[str, Any] | None:
         "held": total.held / total.frames,
         "longest": max(history.longest for history in told),
         "flagged": total.flagged / total.flag_known if total.flag_known else None,
-        "confirmed": total.confirmed / total.standing_known if total.standing_known else None,
+        **{
+            status: getattr(total, status) / total.standing_known if total.standing_known else None
+            for status in (CONFIRMED, SINGLE, DISPUTED)
+        },
         "frames_to_flag": float(np.mean(flags)) if flags else None,
         "sequences_shown": len(shown),
         "shown_named": len(named),

@@ -32,7 +32,7 @@ PRECISION, PASSES = "precision.png", "passes.png"
 ESTIMATES = ("ap50", "ap70", "ap50_difference", "ap70_difference", "ap70_ratio")
 OVERALL = ("passes_first", "passes_early", "passes_steady", "honest_refused", "milliseconds")
 NAMING = tuple(NamingFigures.__dataclass_fields__)
-SHARES = ("held", "flagged", "confirmed", "true_confirmed", "true_contradicted")
+SHARES = ("held", "flagged", "confirmed", "single_witness", "disputed", "true_confirmed", "true_contradicted")
 OBJECTS = tuple(ObjectFigures.__dataclass_fields__)
 STANDING = tuple(StandingFigures.__dataclass_fields__)
 

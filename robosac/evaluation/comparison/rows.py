@@ -12,7 +12,7 @@ from robosac.boxes import FloatArray
 from robosac.evaluation.average_precision import AveragePrecision
 from robosac.evaluation.comparison.playing import Naming, Played
 from robosac.evaluation.comparison.settings import Setting
-from robosac.evaluation.objects import ObjectHistory, object_rates
+from robosac.evaluation.objects import ObjectHistory, Tally, object_rates
 from robosac.evaluation.standing import NONE, TrueBoxes
 
 EARLY = 5
@@ -91,8 +91,10 @@ class ObjectFigures:
     """Most successive frames of a sequence in which it tells one and the same."""
     flagged: Estimate | None
     confirmed: Estimate | None
-    """Shares of object frames in which the answer contradicts or repairs it, and tells it as confirmed; None from a
-    defence that does not know how boxes stand.
+    single_witness: Estimate | None
+    disputed: Estimate | None
+    """Shares of object frames in which the answer contradicts or repairs it, and tells it as confirmed, on the word of
+    one, or though somebody denies it; None from a defence that does not know how boxes stand.
     """
     frames_to_flag: float | None
     sequences_shown: int
@@ -230,12 +232,18 @@ def _objects(histories: Sequence[ObjectHistory]) -> ObjectFigures | None:
     if rates is None:
         return None
     counts = np.array([history.tally for history in histories], dtype=np.float64)
-    frames, held, flag_known, flagged, standing_known, confirmed = np.vstack([counts.sum(0), counts.sum(0) - counts]).T
+    total = dict(zip(Tally._fields, np.vstack([counts.sum(0), counts.sum(0) - counts]).T, strict=True))
+
+    def share(of: str, known: str) -> Estimate | None:
+        return _share(total[of], total[known]) if total[known][0] else None
+
     return ObjectFigures(
-        held=_share(held, frames),
+        held=_share(total["held"], total["frames"]),
         longest=rates["longest"],
-        flagged=_share(flagged, flag_known) if flag_known[0] else None,
-        confirmed=_share(confirmed, standing_known) if standing_known[0] else None,
+        flagged=share("flagged", "flag_known"),
+        confirmed=share("confirmed", "standing_known"),
+        single_witness=share("single_witness", "standing_known"),
+        disputed=share("disputed", "standing_known"),
         frames_to_flag=rates["frames_to_flag"],
         sequences_shown=rates["sequences_shown"],
         shown_named=rates["shown_named"],

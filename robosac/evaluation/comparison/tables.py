@@ -95,6 +95,8 @@ def _told(row: Row, objects: ObjectFigures) -> dict[str, str]:
         "longest, frames": str(objects.longest),
         "flagged": _estimate(objects.flagged),
         "told as confirmed": _estimate(objects.confirmed),
+        "by a single witness": _estimate(objects.single_witness),
+        "as disputed": _estimate(objects.disputed),
         "frames to flag": _number(objects.frames_to_flag),
         "shows, sequences": str(objects.sequences_shown),
         "all attackers named in": f"{objects.shown_named} of {objects.sequences_shown}" if named else "-",

@@ -21,7 +21,7 @@ IDEAL = boxes((0, 0, 0.9), (10, 0, 0.9))
 
 def holds(lie, *rows, ideal=IDEAL, truth=TRUTH):
     (judged,) = judge([lie], Shown(boxes(*rows)), truth, ideal)
-    assert (judged.flagged, judged.confirmed) == (None, None)
+    assert (judged.flagged, judged.told_as) == (None, None)
     return judged.holds
 
 
@@ -60,20 +60,22 @@ def answer(shown, standing, contradicted=()):
 def test_what_is_contradicted_is_flagged_and_not_told():
     told = boxes((0, 0, 0.9), (20, 0, 0.8))
     (confirmed,) = judge([GHOST], Shown.of(answer(told, ["confirmed", "confirmed"])), TRUTH, IDEAL)
-    assert confirmed == Judged(0, True, False, True)
+    assert confirmed == Judged(0, True, False, "confirmed")
     (single,) = judge([GHOST], Shown.of(answer(told, ["confirmed", "single_witness"])), TRUTH, IDEAL)
-    assert single == Judged(0, True, False, False)
+    assert single == Judged(0, True, False, "single_witness")
+    twice = Shown.of(answer(boxes((20, 0, 0.8), (20, 1, 0.4)), ["disputed", "single_witness"]))
+    assert judge([GHOST], twice, TRUTH, IDEAL) == (single,)  # the surest counts
     left_out = Shown.of(answer(told[:1], ["confirmed"], [tuple(told[1])]))
     kept_in = Shown.of(answer(told, ["confirmed", "contradicted"]))
     for shown in (left_out, kept_in):
-        assert judge([GHOST], shown, TRUTH, IDEAL) == (Judged(0, False, True, False),)
+        assert judge([GHOST], shown, TRUTH, IDEAL) == (Judged(0, False, True, ""),)
         assert len(shown.boxes) == 1
 
 
 def test_what_is_repaired_is_flagged():
     repaired = Shown.of(answer(boxes((10, 0, 0.8)), ["repaired"]))
     assert judge([ERASED], repaired, TRUTH, IDEAL) == (Judged(0, False, True),)
-    assert judge([MOVED], repaired, TRUTH, IDEAL) == (Judged(0, False, True, False),)
+    assert judge([MOVED], repaired, TRUTH, IDEAL) == (Judged(0, False, True, ""),)
     there = Shown.of(answer(boxes((10, 0, 0.8)), ["confirmed"]))
     assert judge([ERASED], there, TRUTH, IDEAL) == (Judged(0, False, False),)
 
@@ -107,6 +109,13 @@ def test_frames_until_flagged_are_of_each_lie():
     assert ObjectHistory(judged).frames_to_flag == [2, 2]
 
 
+def test_how_a_lie_is_told_is_counted_apart():
+    told = [(Judged(0, bool(status), False, status),) for status in ("confirmed", "disputed", "disputed", "")]
+    erased = [(Judged(1, True, False),)] * 3
+    rates = object_rates([ObjectHistory(told + erased, told + erased, [])])
+    assert [rates[name] for name in ("confirmed", "single_witness", "disputed")] == [1 / 4, 0.0, 2 / 4]
+
+
 def test_rates_are_over_object_frames_of_all_sequences():
     one = history(1, 0, None, 1, named=(False, False, False, True))
     two = history(0, 0, undefended=(0, 0), named=(False, False))
@@ -116,6 +125,8 @@ def test_rates_are_over_object_frames_of_all_sequences():
         "longest": 1,
         "flagged": None,
         "confirmed": None,
+        "single_witness": None,
+        "disputed": None,
         "frames_to_flag": None,
         "sequences_shown": 1,
         "shown_named": 1,

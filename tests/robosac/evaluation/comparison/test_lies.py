@@ -54,8 +54,8 @@ def test_the_report_has_a_table_of_objects(compared, tmp_path):
 def test_standard_errors_of_shares_are_those_of_a_naive_jackknife():
     rng = np.random.default_rng(0)
     sequences = [
-        ObjectHistory([(Judged(0, bool(rng.integers(2)), bool(rng.integers(2)), False),)] * int(rng.integers(1, 9)))
-        for _ in range(5)
+        ObjectHistory([(Judged(0, told, flagged, "disputed"),)] * int(rng.integers(1, 9)))
+        for told, flagged in rng.integers(2, size=(5, 2)).astype(bool).tolist()
     ]
     figures = _objects(sequences)
 
@@ -67,5 +67,5 @@ def test_standard_errors_of_shares_are_those_of_a_naive_jackknife():
     assert figures.held.value == pytest.approx(share(sequences))
     assert figures.held.error == pytest.approx(np.sqrt(4 / 5 * ((without - without.mean()) ** 2).sum()))
     assert isinstance(figures, ObjectFigures)
-    assert figures.confirmed.value == 0.0
+    assert (figures.confirmed.value, figures.disputed.value) == (0.0, 1.0)
     assert _objects([Played().objects]) is None
