@@ -28,6 +28,8 @@ CONFLICT_OWN, CONFLICT_SUM = 4.5, 10.0
 """L of one, and the sum of all others' the other way, from which on they are in conflict."""
 AROUND_M = 0.6
 """L of a box is the greatest within so far along and across of its centre: a place a little off is no denial."""
+LEANS = -1.0
+"""All others lean against a box if the sum of L without those who vouch for it is so low."""
 _STEPS = np.array([[0.0, 0.0], [1.0, 0.0], [-1.0, 0.0], [0.0, 1.0], [0.0, -1.0]])
 
 
@@ -73,6 +75,15 @@ class Claims:
     def denying(self) -> BoolArray:
         """Who (witnesses, n) denies which box."""
         return self.likelihood <= DENIES
+
+    @cached_property
+    def rest(self) -> FloatArray:
+        """What the others say of each box (n,): the sum of L without the teammate who supports it, or without the two
+        who do most.
+        """
+        supports = np.sort(np.where(self.supporting[1:], self.likelihood[1:], 0.0), axis=0)
+        rest: FloatArray = self.likelihood.sum(axis=0) - supports[-2:].sum(axis=0)
+        return rest
 
     def in_conflict(self, witness: str, unheard: Collection[str]) -> BoolArray:
         """Boxes (n,) over which a witness says the contrary of all others that are heard: its L is at least 4.5 one

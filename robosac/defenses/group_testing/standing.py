@@ -8,7 +8,7 @@ import numpy as np
 
 from robosac.answers import Standing, Support
 from robosac.boxes import FloatArray
-from robosac.defenses.group_testing.claims import DENIES, SUPPORTS
+from robosac.defenses.group_testing.claims import DENIES, LEANS, SUPPORTS
 from robosac.defenses.group_testing.differences import AWAY_EFFECT, gone, gone_alone
 from robosac.defenses.group_testing.objects import Shown
 from robosac.defenses.protocol import EGO, JudgedBox
@@ -26,8 +26,8 @@ def judge(answer: Shown, decoded: Sequence[Shown]) -> Judged:
     2. A box that is out of place is taken from the part of the answer that has it nearest to its place.
     3. A vehicle that a part of the answer shows, and the answer has lost although it stands by testimony, is taken from
        there. Of the answer without one teammate the word of one witness is enough, if nobody else denies it.
-    4. Any other box is ``confirmed`` by the ego, or by two teammates whom nobody denies; ``disputed`` if somebody
-       denies it; else ``single_witness``.
+    4. Any other box is ``confirmed`` by the ego. Else it is ``disputed`` if somebody denies it, or all others together
+       lean against it (`Claims.rest`); ``confirmed`` by two teammates; or ``single_witness``.
 
     Parameters
     ----------
@@ -69,7 +69,9 @@ def _judged(shown: Shown, index: int, status: Standing | None) -> JudgedBox:
     claims = shown.claims
     said = list(zip(claims.witnesses, claims.likelihood[:, index].tolist(), strict=True))
     witnesses = tuple(name for name, value in said if value >= SUPPORTS)
-    deniers = tuple(name for name, value in said if value <= DENIES)
+    leaning = EGO not in witnesses and claims.rest[index] <= LEANS
+    least = max(LEANS, min(value for _, value in said)) if leaning else DENIES
+    deniers = tuple(name for name, value in said if value <= least)
     if status is None:
         if EGO in witnesses or (len(witnesses) >= 2 and not deniers):
             status = Standing.CONFIRMED

@@ -93,3 +93,19 @@ def test_no_boxes_make_no_claims():
 def test_the_ego_or_two_teammates_are_two_witnesses():
     speaking = np.array([[1, 0, 0, 0], [0, 1, 1, 0], [0, 0, 1, 0]], dtype=bool)
     assert two_witnesses(speaking).tolist() == [True, False, True, False]
+
+
+@pytest.mark.parametrize(
+    ("said", "rest"),
+    [
+        ((-2.0, YES, YES), -2.0),
+        ((-2.0, YES, YES, YES), 4.0),  # two may lie together, a third is believed
+        ((-2.0, YES, 2.0), 0.0),
+        ((-0.5, -0.6, YES), -1.1),
+        ((0.0, YES, YES, -5.0), -5.0),
+        ((4.0, YES, -1.0), 3.0),
+        ((0.0, 0.0, 0.0), 0.0),
+    ],
+)
+def test_what_the_rest_say_is_without_those_who_vouch(said, rest):
+    assert claim(*said).rest.tolist() == [pytest.approx(rest, abs=0.1)]

@@ -231,6 +231,11 @@ def test_with_the_liar_in_the_answer_a_box_is_repaired(world, inspections):
         ({}, Standing.SINGLE_WITNESS),
         ({"car-2": YES, "rsu": NO}, Standing.DISPUTED),
         ({"car-2": YES, "car-3": YES, "rsu": NO}, Standing.DISPUTED),
+        ({EGO: -2.0, "car-2": YES, "car-3": YES}, Standing.DISPUTED),
+        ({EGO: -0.5, "rsu": -0.6, "car-2": YES, "car-3": YES}, Standing.DISPUTED),
+        ({EGO: -2.0, "car-2": YES}, Standing.DISPUTED),
+        ({EGO: -0.5, "car-2": YES, "car-3": YES}, Standing.CONFIRMED),
+        ({EGO: YES, "car-2": -2.0}, Standing.CONFIRMED),
         ({"car-2": NO, "rsu": NO}, Standing.CONTRADICTED),
     ],
 )
@@ -240,7 +245,8 @@ def test_a_box_stands_on_what_is_said_of_it(said, status):
     ((judged, _),) = there(decision, tested, boxes)
     assert judged.support.status is status
     assert set(judged.support.witnesses) == {name for name, value in said.items() if value > 0}
-    assert set(judged.support.deniers) == {name for name, value in said.items() if value < 0}
+    least = max(-1.0, min(said.values(), default=0.0)) if status is Standing.DISPUTED else NO
+    assert set(judged.support.deniers) == {name for name, value in said.items() if value <= least}
     everywhere = [other.support for other in decision.objects if other is not judged]
     assert {each.status for each in everywhere} == {Standing.CONFIRMED}
     assert all(set(each.witnesses) == {EGO, *TEAM} for each in everywhere)
