@@ -1,0 +1,35 @@
+"""The command that measures all ratios: one part of it, briefly."""
+
+import os
+import subprocess
+import sys
+from pathlib import Path
+
+ROOT = Path(__file__).parents[1]
+
+
+def run(*options):
+    command = [sys.executable, str(ROOT / "benchmarks" / "ratios.py"), *options]
+    return subprocess.run(command, capture_output=True, text=True, env=os.environ | {"COLUMNS": "200"}, check=False)
+
+
+def test_a_part_is_a_table_of_ratios(tmp_path):
+    page = tmp_path / "speed.md"
+    done = run("--only", "once", "--turns", "3", "--out", str(page))
+    assert done.returncode == 0, done.stderr
+    lines = page.read_text().splitlines()
+    assert lines[0] == "# Speed"
+    assert lines[2].startswith("Written by `python benchmarks/ratios.py --only once`")
+    (row,) = [line.split("|") for line in lines if "encoded and warped for each" in line]
+    assert float(row[2]) > 2.0  # seven hypotheses, and the ego alone: encoding six scans for each is most of the work
+    kept = page.read_text()
+    again = run("--only", "once", "--out", str(page))
+    assert again.returncode == 2
+    assert "--force overwrites it" in again.stderr
+    assert page.read_text() == kept
+
+
+def test_an_unknown_part_is_named():
+    done = run("--only", "nonsense")
+    assert done.returncode == 2
+    assert "nonsense: not one of once, v2xsim" in " ".join(done.stderr.split())
