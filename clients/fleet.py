@@ -28,7 +28,7 @@ from robosac.answers import FrameAnswer, Reason
 from robosac.attacks import CAMPAIGN_HELP
 from robosac.cli.blame import blaming
 from robosac.cli.options import check_attack, load_data, load_detector
-from robosac.detectors import DEFAULT_DETECTOR
+from robosac.detectors import DEFAULT_DETECTOR, Detector
 from robosac.evaluation.frames import another_scene
 from robosac.recording.truth import Truth
 from robosac.scenes import DATA_HELP, DEFAULT_DATA, SOURCES, first_scenes
@@ -59,6 +59,7 @@ class FleetOptions:
     api_key: str | None = field(default=None, repr=False)
     data: str = DEFAULT_DATA
     truth: bool = False
+    dtype: str | None = None
 
 
 class _Screen:
@@ -121,15 +122,15 @@ class _Screen:
 class _Vehicle:
     """One vehicle: its own connection to the gateway, and its place in each ego's session."""
 
-    def __init__(self, vehicle_id: str, gateway: GatewayClient, *, truth: bool = False) -> None:
+    def __init__(self, vehicle_id: str, gateway: GatewayClient, options: FleetOptions) -> None:
         self.vehicle_id = vehicle_id
         self.gateway = gateway
-        self._tells = truth
+        self._tells, self._dtype = options.truth, options.dtype
         self._at: dict[str, VehicleClient] = {}
 
     def enrol(self, ego_id: str, session: OpenedSession) -> None:
         token = session.ego_token if ego_id == self.vehicle_id else session.teammate_tokens[self.vehicle_id]
-        self._at[ego_id] = self.gateway.vehicle(session.session_id, self.vehicle_id, token)
+        self._at[ego_id] = self.gateway.vehicle(session.session_id, self.vehicle_id, token, dtype=self._dtype)
 
     async def leave(self) -> None:
         await self._at[self.vehicle_id].close()
@@ -197,8 +198,7 @@ async def run_fleet(options: FleetOptions, console: Console) -> FleetSummary:
 
 async def _run_scene(options: FleetOptions, fleet: Fleet, summary: FleetSummary, screen: _Screen) -> None:
     vehicles = {
-        name: _Vehicle(name, GatewayClient(options.url, options.api_key), truth=options.truth)
-        for name in fleet.scene.agents
+        name: _Vehicle(name, GatewayClient(options.url, options.api_key), options) for name in fleet.scene.agents
     }
     try:
         for ego_id in fleet.egos:
@@ -261,6 +261,9 @@ def main(  # the options of a command line
     report: Annotated[Path | None, typer.Option(help="Folder for summary.json and example.png.")] = None,
     data: Annotated[str, typer.Option(help=DATA_HELP)] = DEFAULT_DATA,
     truth: Annotated[bool, typer.Option("--truth", help="Let egos tell what is true, for recordings.")] = False,
+    dtype: Annotated[
+        str | None, typer.Option(help="Narrower type in which maps are sent, as the detector takes: int8.")
+    ] = None,
     api_key: trial.ApiKey = None,
     force: trial.Force = False,
 ) -> None:
@@ -270,7 +273,9 @@ def main(  # the options of a command line
     trial.make_folder(report, "--report", REPORT, force, for_pictures=True)
     with blaming("--attack", ValueError):
         campaign = attacks.load_campaign(attack)
-    check_attack(campaign, load_detector(detector))
+    own = load_detector(detector)
+    check_attack(campaign, own)
+    _check_dtype(dtype, own)
     load_data(data)
     chosen = {"attacker_ratio": attacker_ratio, "sampling_budget": sampling_budget, "collaborators": collaborators}
     asked = _asked(defense, {name: value for name, value in chosen.items() if value is not None})
@@ -291,8 +296,16 @@ def main(  # the options of a command line
         api_key=api_key,
         data=data,
         truth=truth,
+        dtype=dtype,
     )
     close_run(options, trial.run(run_fleet(options, console), console, "The fleet", ValueError), console)
+
+
+def _check_dtype(dtype: str | None, detector: Detector) -> None:
+    taken = {name for tensors in detector.info.tensors.values() for spec in tensors.values() for name in spec.narrower}
+    if dtype is not None and dtype not in taken:
+        choices = ", ".join(sorted(taken)) or "none"
+        raise typer.BadParameter(f"{detector.info.name} takes {choices}, not {dtype}", param_hint="--dtype")
 
 
 def _asked(defense: str | None, given: dict[str, Any]) -> dict[str, Any] | None:

@@ -18,7 +18,7 @@ from clients.receipts import ReceiptBook
 from clients.standby import Standby
 from robosac import wire
 from robosac.answers import FrameAnswer, LogReceipt, Typed
-from robosac.detectors import Message
+from robosac.detectors import Message, narrow
 from robosac.possession import HEADER, make_proof
 from robosac.recording.truth import Truth
 from robosac.signatures import sign
@@ -75,8 +75,10 @@ class VehicleClient:
         key: Ed25519PrivateKey | None = None,
         receipts: ReceiptBook | None = None,
         events: Any = None,
+        dtype: str | None = None,
     ) -> None:
         self._key = key
+        self._dtype = dtype
         self._events = events
         self._standby: Standby | None = None
         self._receipts = receipts
@@ -113,7 +115,7 @@ class VehicleClient:
 
     async def send(self, frame: int, message: Message) -> None:
         """As a teammate: post the own message for a frame."""
-        await self.send_body(wire.pack_message(frame, self.vehicle_id, message, self.signature(frame, message)))
+        await self.send_body(self._packed(frame, message))
 
     @contextlib.asynccontextmanager
     async def standing_by(self) -> AsyncIterator[Standby]:
@@ -144,9 +146,7 @@ class VehicleClient:
 
         What is true, where that is known, is for recordings alone.
         """
-        told = None if truth is None else truth.as_fields()
-        signature = self.signature(frame, message)
-        return await self.ask_body(wire.pack_message(frame, self.vehicle_id, message, signature, told))
+        return await self.ask_body(self._packed(frame, message, truth))
 
     async def ask_body(self, body: bytes) -> FrameAnswer:
         """As `ask`, with a body that is packed already."""
@@ -162,12 +162,24 @@ class VehicleClient:
     ) -> FrameAnswer:
         """As the ego: post a whole frame, with the signatures that the teammates gave, and the truth as in `ask`."""
         told = None if truth is None else truth.as_fields()
-        body = wire.pack_frame(frame, ego, teammates, self.signature(frame, ego), signatures, truth=told)
+        own, signed = self._rounded(ego), signatures or {}
+        others = {name: each if name in signed else self._rounded(each) for name, each in teammates.items()}
+        signature = self.signature(frame, own)
+        body = wire.pack_frame(frame, own, others, signature, signatures, truth=told, dtype=self._dtype)
         return await self.post_frame_body(body)
 
     async def post_frame_body(self, body: bytes) -> FrameAnswer:
         """As `post_frame`, with a body that is packed already."""
         return await self._answered("frames", body)
+
+    def _rounded(self, message: Message) -> Message:
+        """A message as the gateway reads it: what is signed is that."""
+        return message if self._dtype is None else narrow.rounded(message, self._dtype)
+
+    def _packed(self, frame: int, message: Message, truth: Truth | None = None) -> bytes:
+        own, told = self._rounded(message), None if truth is None else truth.as_fields()
+        signature = self.signature(frame, own)
+        return wire.pack_message(frame, self.vehicle_id, own, signature, told, self._dtype)
 
     async def state(self) -> Mapping[str, Any]:
         """As the ego: the session's state."""

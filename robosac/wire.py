@@ -1,6 +1,7 @@
 """Messages and frames as msgpack: the one codec, for service and clients alike.
 
-A tensor travels as ``{dtype, shape, data}`` with its bytes little-endian in C order; a pose as 16 numbers, row-major.
+A tensor travels as ``{dtype, shape, data}`` with its bytes little-endian in C order, and as int8 with ``exponents``
+(`robosac.detectors.narrow`); a pose as 16 numbers, row-major.
 What is read is never trusted: sizes and entries are bounded while a body is unpacked, and types, shapes, lengths and
 finiteness are checked against what the detector declares. Each refusal is a `WireError` with a stable code and the
 field it is about.
@@ -18,6 +19,7 @@ import msgpack
 import numpy as np
 
 from robosac.boxes import FloatArray, pose_fault
+from robosac.detectors import narrow
 from robosac.detectors.base import DetectorInfo, Message, Role, TensorSpec
 from robosac.signatures import SIGNATURE_BYTES
 
@@ -80,12 +82,14 @@ def pack_message(
     message: Message,
     signature: bytes | None = None,
     truth: Mapping[str, Any] | None = None,
+    dtype: str | None = None,
 ) -> bytes:
     """The body of a vehicle's own message, with its signature where it has one (`robosac.signatures`).
 
-    An ego may add what is true (`robosac.recording.truth.Truth.as_fields`).
+    An ego may add what is true (`robosac.recording.truth.Truth.as_fields`). Maps go in a narrower type, if one is
+    given, where nothing is lost by it (`robosac.detectors.narrow.rounded`).
     """
-    return pack({"frame": frame, "vehicle_id": vehicle_id, **_message_fields(message, signature, truth)})
+    return pack({"frame": frame, "vehicle_id": vehicle_id, **_message_fields(message, dtype, signature, truth)})
 
 
 def pack_frame(
@@ -96,16 +100,19 @@ def pack_frame(
     signatures: Mapping[str, bytes] | None = None,
     states: Mapping[str, bytes] | None = None,
     truth: Mapping[str, Any] | None = None,
+    dtype: str | None = None,
 ) -> bytes:
-    """The body of a whole frame, with the signatures of those teammates that sign, and the truth as `pack_message`.
+    """The body of a whole frame, with the signatures of those teammates that sign; truth and type as `pack_message`.
 
     Of a frame that is kept, ``states`` may hold what the session remembered ``before`` and ``after`` it, as text
     (`robosac.audit.packing.packed_state`).
     """
     signed = signatures or {}
-    fields = {name: _message_fields(message, signed.get(name)) for name, message in teammates.items()}
+    fields = {name: _message_fields(message, dtype, signed.get(name)) for name, message in teammates.items()}
     known = {"states": dict(states)} if states else {}
-    return pack({"frame": frame, "ego": _message_fields(ego, ego_signature, truth), "teammates": fields, **known})
+    return pack(
+        {"frame": frame, "ego": _message_fields(ego, dtype, ego_signature, truth), "teammates": fields, **known}
+    )
 
 
 def content_digest(frame: int, vehicle_id: str, message: Message) -> str:
@@ -224,15 +231,22 @@ def check_message(payload: Any, info: DetectorInfo, role: Role, path: str = "") 
 
 
 def _message_fields(
-    message: Message, signature: bytes | None, truth: Mapping[str, Any] | None = None
+    message: Message, dtype: str | None, signature: bytes | None, truth: Mapping[str, Any] | None = None
 ) -> dict[str, Any]:
-    tensors = {
-        name: {"dtype": array.dtype.name, "shape": list(array.shape), "data": _little_endian(array)}
-        for name, array in message.tensors.items()
-    }
+    tensors = {name: _tensor_fields(array, dtype) for name, array in message.tensors.items()}
     fields = {"pose": [float(value) for value in message.pose.reshape(-1)], "tensors": tensors}
     more = {"signature": signature, "truth": truth}
     return fields | {name: value for name, value in more.items() if value is not None}
+
+
+def _tensor_fields(array: np.ndarray[Any, np.dtype[Any]], dtype: str | None) -> dict[str, Any]:
+    sent, exponents = array, None
+    if dtype is not None and narrow.is_wider(array, dtype):
+        data, found = narrow.narrowed(array, dtype)
+        if np.array_equal(narrow.widened(data, found, array.dtype.name), array):
+            sent, exponents = data, found
+    fields = {"dtype": sent.dtype.name, "shape": list(sent.shape), "data": _little_endian(sent)}
+    return fields if exponents is None else {**fields, "exponents": exponents.tobytes()}
 
 
 def _little_endian(array: np.ndarray[Any, np.dtype[Any]]) -> bytes:
@@ -241,19 +255,32 @@ def _little_endian(array: np.ndarray[Any, np.dtype[Any]]) -> bytes:
 
 def _tensor(fields: _Fields, spec: TensorSpec) -> np.ndarray[Any, np.dtype[Any]]:
     name = fields.take("dtype", str)
-    if name != spec.dtype:
-        raise WireError("wrong-dtype", fields.at("dtype"), f"must be {spec.dtype!r}, got {_shown(name)}")
+    if name not in (spec.dtype, *spec.narrower):
+        wanted = " or ".join(map(repr, (spec.dtype, *spec.narrower)))
+        raise WireError("wrong-dtype", fields.at("dtype"), f"must be {wanted}, got {_shown(name)}")
     shape = fields.take("shape")
     if not isinstance(shape, list) or not all(type(n) is int for n in shape):
         raise WireError("wrong-type", fields.at("shape"), "must be an array of integers")
     if tuple(shape) != spec.shape:
         raise WireError("wrong-shape", fields.at("shape"), f"must be {list(spec.shape)}, got {_shown(shape)[1:-1]}")
-    dtype = np.dtype(spec.dtype).newbyteorder("<")
+    dtype = np.dtype(name).newbyteorder("<")
     data = fields.take_bytes("data", math.prod(spec.shape) * dtype.itemsize)
     array = np.frombuffer(data, dtype=dtype).reshape(spec.shape)
     if dtype.kind == "f" and not _all_finite(array):
         raise WireError("non-finite", fields.at("data"), "holds NaN or infinity")
-    return array
+    return array if name == spec.dtype else _widened(fields, array, spec)
+
+
+def _widened(
+    fields: _Fields, array: np.ndarray[Any, np.dtype[Any]], spec: TensorSpec
+) -> np.ndarray[Any, np.dtype[Any]]:
+    exponents = None
+    if array.dtype == np.int8:
+        exponents = np.frombuffer(fields.take_bytes("exponents", spec.shape[0]), dtype=np.int8)
+    try:
+        return narrow.widened(array, exponents, spec.dtype)
+    except narrow.NarrowError as error:
+        raise WireError("out-of-range", fields.at("exponents"), str(error)) from error
 
 
 def _all_finite(array: np.ndarray[Any, np.dtype[Any]]) -> bool:

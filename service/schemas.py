@@ -153,6 +153,7 @@ class TensorEntry(_Shown):
 
     dtype: str
     shape: list[int]
+    narrower: list[str] = Field(description="other types that it may be sent in")
 
 
 class CalibrationEntry(BaseModel):

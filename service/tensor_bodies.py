@@ -7,13 +7,14 @@ Schema describes it; lengths of binary are counted in bytes.
 from __future__ import annotations
 
 import base64
+import math
 from collections.abc import Iterator, Mapping, Sequence
 from typing import Any, get_args
 
 import numpy as np
 
 from robosac import wire
-from robosac.detectors import DetectorInfo, Role, TensorSpec
+from robosac.detectors import DetectorInfo, Role, TensorSpec, narrow
 from robosac.recording.truth import MOST_BOXES
 from robosac.signatures import SIGNATURE_BYTES
 from service.arriving.frames import SLACK_BYTES
@@ -121,7 +122,10 @@ def _part(infos: Sequence[DetectorInfo], *roles: Role) -> Schema:
         "properties": {
             "pose": _POSE,
             "tensors": _tensors(infos, roles),
-            "signature": {**_binary(SIGNATURE_BYTES), "description": "Ed25519, of vehicles that sign."},
+            "signature": {
+                **_binary(SIGNATURE_BYTES),
+                "description": "Ed25519, of vehicles that sign.",
+            },
             **truth,
         },
     }
@@ -161,19 +165,22 @@ def _tensor(spec: TensorSpec | None) -> Schema:
     data = _binary()
     said = "numbers, little-endian, C order."
     if spec is not None:
-        dtype["const"], shape["const"] = spec.dtype, list(spec.shape)
-        data = _binary(spec.nbytes)
+        dtypes = [spec.dtype, *spec.narrower]
+        dtype |= {"enum": dtypes} if spec.narrower else {"const": spec.dtype}
+        shape["const"] = list(spec.shape)
+        sizes = [math.prod(spec.shape) * np.dtype(name).itemsize for name in dtypes]
+        data = _binary(min(sizes), max(sizes))
         finite = " None is NaN or infinite." if np.dtype(spec.dtype).kind == "f" else ""
-        said = f"{spec.nbytes:,} bytes: {said}{finite}"
-    return {
-        "type": "object",
-        "required": ["dtype", "shape", "data"],
-        "properties": {"dtype": dtype, "shape": shape, "data": {**data, "description": said[0].upper() + said[1:]}},
-    }
+        said = f"{' or '.join(f'{size:,}' for size in sizes)} bytes: {said}{finite}"
+    properties = {"dtype": dtype, "shape": shape, "data": {**data, "description": said[0].upper() + said[1:]}}
+    if spec is not None and narrow.BYTES in spec.narrower:
+        told = f"With {narrow.BYTES}: a byte for each channel; value = data x 2 to the power of it."
+        properties["exponents"] = {**_binary(spec.shape[0]), "description": told}
+    return {"type": "object", "required": ["dtype", "shape", "data"], "properties": properties}
 
 
-def _binary(length: int | None = None) -> Schema:
-    sized = {} if length is None else {"minLength": length, "maxLength": length}
+def _binary(least: int | None = None, most: int | None = None) -> Schema:
+    sized = {} if least is None else {"minLength": least, "maxLength": most or least}
     return {"type": "string", "format": "binary", "contentMediaType": "application/octet-stream", **sized}
 
 

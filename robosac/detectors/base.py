@@ -8,7 +8,7 @@ costs one fusion and one decoder pass (`PreparedFrame.detect`).
 from __future__ import annotations
 
 from collections.abc import Collection, Mapping
-from dataclasses import dataclass, replace
+from dataclasses import dataclass, field, replace
 from pathlib import Path
 from typing import TYPE_CHECKING, Any, Literal, Protocol, Self, cast, get_args, runtime_checkable
 
@@ -32,6 +32,8 @@ class TensorSpec:
 
     dtype: str
     shape: tuple[int, ...]
+    narrower: tuple[str, ...] = field(default=(), compare=False)
+    """Other types that it may be sent in, see `robosac.detectors.narrow`."""
 
     @property
     def nbytes(self) -> int:

@@ -84,7 +84,7 @@ class EmbeddedDetector(MapFusionDetector):
         self.recipe = recipe
         self._gain = _number(recipe, "feature_gain", np.inf)
         self._score_threshold = _number(recipe, "score_threshold", 1.0)
-        layout = {FEATURES: TensorSpec("float16", (CHANNELS, MAP, MAP))}
+        layout = {FEATURES: TensorSpec("float16", (CHANNELS, MAP, MAP), ("int8",))}
         self.info = DetectorInfo(
             name=self.name,
             tensors={"ego": layout, "teammate": layout},

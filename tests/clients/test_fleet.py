@@ -37,7 +37,7 @@ def options(url, **changes):
 async def test_a_fleet_of_independent_clients_end_to_end(tmp_path):
     console = Console(file=io.StringIO(), width=100)
     async with local_gateway(tmp_path / "gateway.log") as url:
-        chosen = options(url, scenes=2, frames=3, egos=2, report=tmp_path / "report")
+        chosen = options(url, scenes=2, frames=3, egos=2, report=tmp_path / "report", dtype="int8")
         summary = await run_fleet(chosen, console)
     close_run(chosen, summary, console)
     assert summary.frames == 2 * 3 * 2
@@ -100,7 +100,12 @@ def test_a_fleet_without_a_gateway_says_so():
 
 @pytest.mark.parametrize(
     ("option", "complaint"),
-    [("--attack", "give one of bim"), ("--detector", "give one of"), ("--defense", "give one of a2cp, ")],
+    [
+        ("--attack", "give one of bim"),
+        ("--detector", "give one of"),
+        ("--defense", "give one of a2cp, "),
+        ("--dtype", "intersection-mean takes int8, not nonesuch"),
+    ],
 )
 def test_an_unknown_attack_detector_or_defence_is_explained(option, complaint):
     result = CliRunner().invoke(command(main), [option, "nonesuch"])
@@ -193,7 +198,7 @@ async def test_a_gateway_that_does_not_start_shows_its_log(tmp_path, monkeypatch
 async def test_a_teammate_that_is_too_late_goes_on(slug, raised, ego_message):
     problem = {"type": f"urn:robosac:problem:{slug}", "detail": "it said so", "field": "frame"}
     transport = httpx.MockTransport(lambda _: httpx.Response(409, json=problem))
-    vehicle = _Vehicle("rsu", GatewayClient("http://gateway", transport=transport))
+    vehicle = _Vehicle("rsu", GatewayClient("http://gateway", transport=transport), options("http://gateway"))
     vehicle.enrol("car-1", OpenedSession("s", "e", {"rsu": "t"}, "", {}, {}))
     frame = SimpleNamespace(ego_id="car-1", sent={"rsu": ego_message})
     with pytest.raises(FrameConflict) if raised else nullcontext():
@@ -212,7 +217,9 @@ async def test_a_gateway_that_is_slow_for_a_while_is_asked_again(refusals, retry
         return httpx.Response(503, json=problem, headers=headers) if len(requests) <= refusals else receipt
 
     receipt = httpx.Response(202, content=wire.pack({"frame": 0, "vehicle_id": "rsu", "status": "accepted"}))
-    vehicle = _Vehicle("rsu", GatewayClient("http://gateway", transport=httpx.MockTransport(answer)))
+    vehicle = _Vehicle(
+        "rsu", GatewayClient("http://gateway", transport=httpx.MockTransport(answer)), options("http://gateway")
+    )
     vehicle.enrol("car-1", OpenedSession("s", "e", {"rsu": "t"}, "", {}, {}))
     frame = SimpleNamespace(ego_id="car-1", sent={"rsu": ego_message})
     with nullcontext() if asked > refusals else pytest.raises(GatewayUnavailable):

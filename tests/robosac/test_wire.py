@@ -1,3 +1,5 @@
+from dataclasses import replace
+
 import msgpack
 import numpy as np
 import pytest
@@ -7,6 +9,7 @@ from hypothesis import strategies as st
 from robosac import wire
 from robosac.boxes import pose_matrix
 from robosac.detectors import DetectorInfo, Message, TensorSpec
+from robosac.detectors.narrow import rounded
 
 POSE = pose_matrix(1.0, 2.0, 1.7, 0.5)
 INFO = DetectorInfo(
@@ -123,6 +126,53 @@ def test_what_is_wrong_is_named(path, value, code):
     expected = "tensors" if path == "tensors.extra" else path
     assert caught.value.field == expected
     assert caught.value.detail
+
+
+NARROW = replace(INFO, tensors={"teammate": {"features": TensorSpec("float16", (2, 3), ("int8",))}})
+ROUNDED = rounded(Message(POSE, {"features": np.array([[0.1, 2.0, -3.0], [5e-4, 0.0, 1e-3]], np.float16)}), "int8")
+
+
+def test_maps_travel_as_bytes_where_nothing_is_lost_by_it():
+    narrow, wide = (wire.pack_message(0, "car-2", ROUNDED, dtype=dtype) for dtype in ("int8", None))
+    fields = msgpack.unpackb(narrow)["tensors"]["features"]
+    assert (fields["dtype"], len(fields["data"]), len(fields["exponents"])) == ("int8", 6, 2)
+    read = [wire.check_message(wire.read_message(body).payload, NARROW, "teammate") for body in (narrow, wide)]
+    for message in read:
+        assert message.tensors["features"].dtype == np.float16
+        np.testing.assert_array_equal(message.tensors["features"], ROUNDED.tensors["features"])
+    assert len({wire.content_digest(0, "car-2", message) for message in (*read, ROUNDED)}) == 1
+    odd = Message(POSE, {"features": FEATURES + np.float16(0.001)})
+    assert msgpack.unpackb(wire.pack_message(0, "x", odd, dtype="int8"))["tensors"]["features"]["dtype"] == "float16"
+    frame = msgpack.unpackb(wire.pack_frame(0, ROUNDED, {"car-2": odd, "rsu": ROUNDED}, dtype="int8"))
+    sent = (frame["ego"], *frame["teammates"].values())
+    assert [each["tensors"]["features"]["dtype"] for each in sent] == ["int8", "float16", "int8"]
+
+
+@pytest.mark.parametrize(
+    ("changed", "field", "code"),
+    [
+        ({"exponents": KeyError}, "exponents", "missing-field"),
+        ({"exponents": [1, 2]}, "exponents", "wrong-type"),
+        ({"exponents": bytes(3)}, "exponents", "wrong-length"),
+        ({"exponents": bytes([127, 0])}, "exponents", "out-of-range"),
+        ({"data": bytes(12)}, "data", "wrong-length"),
+        ({"dtype": "float32"}, "dtype", "wrong-dtype"),
+    ],
+)
+def test_what_is_wrong_with_a_map_of_bytes_is_named(changed, field, code):
+    fields = msgpack.unpackb(wire.pack_message(0, "car-2", ROUNDED, dtype="int8"))
+    tensor = fields["tensors"]["features"] | changed
+    fields["tensors"]["features"] = {name: value for name, value in tensor.items() if value is not KeyError}
+    with pytest.raises(wire.WireError) as caught:
+        wire.check_message(fields, NARROW, "teammate")
+    assert (caught.value.code, caught.value.field) == (code, f"tensors.features.{field}")
+
+
+def test_maps_of_bytes_are_refused_by_a_detector_that_does_not_take_them():
+    with pytest.raises(wire.WireError, match="must be 'float16', got 'int8'"):
+        wire.check_message(
+            wire.read_message(wire.pack_message(0, "car-2", ROUNDED, dtype="int8")).payload, INFO, "teammate"
+        )
 
 
 def test_an_ego_must_send_its_own_tensors_too():

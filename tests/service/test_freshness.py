@@ -6,6 +6,7 @@ from cryptography.hazmat.primitives.asymmetric.ed25519 import Ed25519PrivateKey
 
 from robosac import wire
 from robosac.detectors import Message
+from robosac.detectors.narrow import rounded
 from robosac.signatures import show_public_key, sign
 from tests.service.conftest import EGO, TEAM, problem, serve
 
@@ -116,6 +117,28 @@ async def test_vehicles_with_keys_must_sign(served, messages):
     assert set(answered["messages"]) == {EGO, "rsu"}
     assert all(set(proof) == {"digest", "signature"} for proof in answered["messages"].values())
     assert [r["reason"] for r in await events(ego, "message_refused")] == ["unauthenticated"] * 7
+
+
+async def test_vehicles_that_sign_may_send_their_maps_as_bytes(served, messages):
+    keys = {name: Ed25519PrivateKey.generate() for name in (EGO, "rsu")}
+    shown = {name: show_public_key(key) for name, key in keys.items()}
+    (layout,) = [each["tensors"]["teammate"] for each in await served.client.detectors()]
+    (dtype,) = layout["features"]["narrower"]
+    session = await served.open(gather_ms=20, defense=NONE, public_keys=shown)
+    tokens = {EGO: session.ego_token, **session.teammate_tokens}
+    unit, ego = (
+        served.client.vehicle(session.session_id, name, tokens[name], keys[name], dtype) for name in ("rsu", EGO)
+    )
+    await unit.send(0, messages["rsu"])
+    asked = await ego.ask(0, messages[EGO])
+    assert asked.accepted == ("rsu",)
+    own, other = (rounded(messages[name], dtype) for name in (EGO, "rsu"))
+    here = served.detector.prepare(own, {"rsu": other}).detect(["rsu"])
+    np.testing.assert_allclose(asked.boxes, here, atol=1e-6)
+    signed = {"rsu": unit.signature(1, other)}
+    whole = await ego.post_frame(1, messages[EGO], {"rsu": other, "car-2": messages["car-2"]}, signed)
+    assert whole.accepted == ("car-2", "rsu")
+    assert len(await events(ego, "message_refused")) == 0
 
 
 async def test_the_ego_cannot_put_words_into_the_mouth_of_a_teammate_that_signs(served, messages, benign):

@@ -109,7 +109,7 @@ class V2XSimDetector(MapFusionDetector):
         self._fast = FastDecoder(self._network)
         self._fusion = FUSIONS[fusion]
         self._score_threshold = float(self.recipe.get("score_threshold", SCORE_THRESHOLD))
-        features = TensorSpec("float32", (CHANNELS, MAP, MAP))
+        features = TensorSpec("float32", (CHANNELS, MAP, MAP), ("float16", "int8"))
         self.info = DetectorInfo(
             name=NAMES[fusion],
             tensors={
