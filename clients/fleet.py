@@ -6,7 +6,7 @@ import asyncio
 import time
 from collections import deque
 from collections.abc import Awaitable, Callable
-from dataclasses import dataclass, field
+from dataclasses import asdict, dataclass, field
 from pathlib import Path
 from typing import Annotated, Any, TypeVar
 
@@ -32,6 +32,7 @@ from robosac.detectors import DEFAULT_DETECTOR, Detector
 from robosac.evaluation.frames import another_scene
 from robosac.recording.truth import Truth
 from robosac.scenes import DATA_HELP, DEFAULT_DATA, SOURCES, first_scenes
+from robosac.wire import Packing
 
 RECENT = 12
 PATIENCE = 5
@@ -59,7 +60,7 @@ class FleetOptions:
     api_key: str | None = field(default=None, repr=False)
     data: str = DEFAULT_DATA
     truth: bool = False
-    dtype: str | None = None
+    packing: Packing | None = None
 
 
 class _Screen:
@@ -125,12 +126,12 @@ class _Vehicle:
     def __init__(self, vehicle_id: str, gateway: GatewayClient, options: FleetOptions) -> None:
         self.vehicle_id = vehicle_id
         self.gateway = gateway
-        self._tells, self._dtype = options.truth, options.dtype
+        self._tells, self._packing = options.truth, options.packing
         self._at: dict[str, VehicleClient] = {}
 
     def enrol(self, ego_id: str, session: OpenedSession) -> None:
         token = session.ego_token if ego_id == self.vehicle_id else session.teammate_tokens[self.vehicle_id]
-        self._at[ego_id] = self.gateway.vehicle(session.session_id, self.vehicle_id, token, dtype=self._dtype)
+        self._at[ego_id] = self.gateway.vehicle(session.session_id, self.vehicle_id, token, packing=self._packing)
 
     async def leave(self) -> None:
         await self._at[self.vehicle_id].close()
@@ -264,6 +265,7 @@ def main(  # the options of a command line
     dtype: Annotated[
         str | None, typer.Option(help="Narrower type in which maps are sent, as the detector takes: int8.")
     ] = None,
+    compress: Annotated[bool, typer.Option("--compress", help="Send maps compressed.")] = False,
     api_key: trial.ApiKey = None,
     force: trial.Force = False,
 ) -> None:
@@ -296,7 +298,7 @@ def main(  # the options of a command line
         api_key=api_key,
         data=data,
         truth=truth,
-        dtype=dtype,
+        packing=Packing(dtype, compress),
     )
     close_run(options, trial.run(run_fleet(options, console), console, "The fleet", ValueError), console)
 
@@ -325,7 +327,7 @@ def close_run(options: FleetOptions, summary: FleetSummary, console: Console) ->
     """Print the summary and write the report where one is wanted."""
     summary.print(console)
     if options.report is not None:
-        settings = {name: value for name, value in vars(options).items() if name not in ("report", "url", "api_key")}
+        settings = {name: value for name, value in asdict(options).items() if name not in ("report", "url", "api_key")}
         picture = summary.write(options.report, settings)
         console.print(f"Report: {options.report / REPORT} and {picture}")
 

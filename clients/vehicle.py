@@ -75,10 +75,10 @@ class VehicleClient:
         key: Ed25519PrivateKey | None = None,
         receipts: ReceiptBook | None = None,
         events: Any = None,
-        dtype: str | None = None,
+        packing: wire.Packing | None = None,
     ) -> None:
         self._key = key
-        self._dtype = dtype
+        self._packing = packing or wire.Packing()
         self._events = events
         self._standby: Standby | None = None
         self._receipts = receipts
@@ -165,7 +165,7 @@ class VehicleClient:
         own, signed = self._rounded(ego), signatures or {}
         others = {name: each if name in signed else self._rounded(each) for name, each in teammates.items()}
         signature = self.signature(frame, own)
-        body = wire.pack_frame(frame, own, others, signature, signatures, truth=told, dtype=self._dtype)
+        body = wire.pack_frame(frame, own, others, signature, signatures, truth=told, packing=self._packing)
         return await self.post_frame_body(body)
 
     async def post_frame_body(self, body: bytes) -> FrameAnswer:
@@ -174,12 +174,13 @@ class VehicleClient:
 
     def _rounded(self, message: Message) -> Message:
         """A message as the gateway reads it: what is signed is that."""
-        return message if self._dtype is None else narrow.rounded(message, self._dtype)
+        dtype = self._packing.dtype
+        return message if dtype is None else narrow.rounded(message, dtype)
 
     def _packed(self, frame: int, message: Message, truth: Truth | None = None) -> bytes:
         own, told = self._rounded(message), None if truth is None else truth.as_fields()
         signature = self.signature(frame, own)
-        return wire.pack_message(frame, self.vehicle_id, own, signature, told, self._dtype)
+        return wire.pack_message(frame, self.vehicle_id, own, signature, told, self._packing)
 
     async def state(self) -> Mapping[str, Any]:
         """As the ego: the session's state."""

@@ -1,7 +1,7 @@
 """Messages and frames as msgpack: the one codec, for service and clients alike.
 
-A tensor travels as ``{dtype, shape, data}`` with its bytes little-endian in C order, and as int8 with ``exponents``
-(`robosac.detectors.narrow`); a pose as 16 numbers, row-major.
+A tensor travels as ``{dtype, shape, data}`` with its bytes little-endian in C order, as int8 with ``exponents``, and
+with ``compression`` as zstd (`robosac.detectors.narrow`); a pose as 16 numbers, row-major.
 What is read is never trusted: sizes and entries are bounded while a body is unpacked, and types, shapes, lengths and
 finiteness are checked against what the detector declares. Each refusal is a `WireError` with a stable code and the
 field it is about.
@@ -30,6 +30,7 @@ MAX_MAP = 1024
 MAX_STRING = 2**16
 MAX_ENTRIES = 2**16
 """Entries of all arrays and maps of a body: small containers by the million would cost far more than their bytes."""
+ZSTD = "zstd"
 SHOWN = 40
 """Characters of a sender's own words that an error repeats."""
 _TYPES = {dict: "a map", list: "an array", str: "a string", bytes: "binary", type(None): "nil"}
@@ -42,7 +43,8 @@ class WireError(ValueError):
     ----------
     code : str
         Stable and machine-readable: ``malformed-msgpack``, ``missing-field``, ``wrong-type``, ``wrong-dtype``,
-        ``wrong-shape``, ``wrong-length``, ``non-finite``, ``bad-pose``, ``out-of-range``, ``unknown-tensor``.
+        ``wrong-shape``, ``wrong-length``, ``bad-compression``, ``non-finite``, ``bad-pose``, ``out-of-range``,
+        ``unknown-tensor``.
     field : str
         Path of the offending part, such as ``tensors.features.data``; empty for the body itself.
     detail : str
@@ -54,6 +56,15 @@ class WireError(ValueError):
         self.code = code
         self.field = field
         self.detail = detail
+
+
+@dataclass(frozen=True)
+class Packing:
+    """How tensors travel; see `robosac.detectors.narrow`."""
+
+    dtype: str | None = None
+    """A narrower type, for tensors that lose nothing by it (`robosac.detectors.narrow.rounded`)."""
+    compress: bool = False
 
 
 @dataclass(frozen=True)
@@ -82,14 +93,13 @@ def pack_message(
     message: Message,
     signature: bytes | None = None,
     truth: Mapping[str, Any] | None = None,
-    dtype: str | None = None,
+    packing: Packing | None = None,
 ) -> bytes:
     """The body of a vehicle's own message, with its signature where it has one (`robosac.signatures`).
 
-    An ego may add what is true (`robosac.recording.truth.Truth.as_fields`). Maps go in a narrower type, if one is
-    given, where nothing is lost by it (`robosac.detectors.narrow.rounded`).
+    An ego may add what is true (`robosac.recording.truth.Truth.as_fields`). By default tensors go as they are.
     """
-    return pack({"frame": frame, "vehicle_id": vehicle_id, **_message_fields(message, dtype, signature, truth)})
+    return pack({"frame": frame, "vehicle_id": vehicle_id, **_message_fields(message, packing, signature, truth)})
 
 
 def pack_frame(
@@ -100,18 +110,18 @@ def pack_frame(
     signatures: Mapping[str, bytes] | None = None,
     states: Mapping[str, bytes] | None = None,
     truth: Mapping[str, Any] | None = None,
-    dtype: str | None = None,
+    packing: Packing | None = None,
 ) -> bytes:
-    """The body of a whole frame, with the signatures of those teammates that sign; truth and type as `pack_message`.
+    """The body of a whole frame, with the signatures of those teammates that sign; truth and packing as `pack_message`.
 
     Of a frame that is kept, ``states`` may hold what the session remembered ``before`` and ``after`` it, as text
     (`robosac.audit.packing.packed_state`).
     """
     signed = signatures or {}
-    fields = {name: _message_fields(message, dtype, signed.get(name)) for name, message in teammates.items()}
+    fields = {name: _message_fields(message, packing, signed.get(name)) for name, message in teammates.items()}
     known = {"states": dict(states)} if states else {}
     return pack(
-        {"frame": frame, "ego": _message_fields(ego, dtype, ego_signature, truth), "teammates": fields, **known}
+        {"frame": frame, "ego": _message_fields(ego, packing, ego_signature, truth), "teammates": fields, **known}
     )
 
 
@@ -231,22 +241,25 @@ def check_message(payload: Any, info: DetectorInfo, role: Role, path: str = "") 
 
 
 def _message_fields(
-    message: Message, dtype: str | None, signature: bytes | None, truth: Mapping[str, Any] | None = None
+    message: Message, packing: Packing | None, signature: bytes | None, truth: Mapping[str, Any] | None = None
 ) -> dict[str, Any]:
-    tensors = {name: _tensor_fields(array, dtype) for name, array in message.tensors.items()}
+    tensors = {name: _tensor_fields(array, packing or Packing()) for name, array in message.tensors.items()}
     fields = {"pose": [float(value) for value in message.pose.reshape(-1)], "tensors": tensors}
     more = {"signature": signature, "truth": truth}
     return fields | {name: value for name, value in more.items() if value is not None}
 
 
-def _tensor_fields(array: np.ndarray[Any, np.dtype[Any]], dtype: str | None) -> dict[str, Any]:
-    sent, exponents = array, None
-    if dtype is not None and narrow.is_wider(array, dtype):
-        data, found = narrow.narrowed(array, dtype)
-        if np.array_equal(narrow.widened(data, found, array.dtype.name), array):
-            sent, exponents = data, found
-    fields = {"dtype": sent.dtype.name, "shape": list(sent.shape), "data": _little_endian(sent)}
-    return fields if exponents is None else {**fields, "exponents": exponents.tobytes()}
+def _tensor_fields(array: np.ndarray[Any, np.dtype[Any]], packing: Packing) -> dict[str, Any]:
+    more: dict[str, Any] = {}
+    sent = array
+    if packing.dtype is not None and narrow.is_wider(array, packing.dtype):
+        bits, exponents = narrow.narrowed(array, packing.dtype)
+        if np.array_equal(narrow.widened(bits, exponents, array.dtype.name), array):
+            sent, more = bits, {} if exponents is None else {"exponents": exponents.tobytes()}
+    data = _little_endian(sent)
+    if packing.compress:
+        data, more = narrow.compressed(data), {**more, "compression": ZSTD}
+    return {"dtype": sent.dtype.name, "shape": list(sent.shape), "data": data, **more}
 
 
 def _little_endian(array: np.ndarray[Any, np.dtype[Any]]) -> bytes:
@@ -264,11 +277,24 @@ def _tensor(fields: _Fields, spec: TensorSpec) -> np.ndarray[Any, np.dtype[Any]]
     if tuple(shape) != spec.shape:
         raise WireError("wrong-shape", fields.at("shape"), f"must be {list(spec.shape)}, got {_shown(shape)[1:-1]}")
     dtype = np.dtype(name).newbyteorder("<")
-    data = fields.take_bytes("data", math.prod(spec.shape) * dtype.itemsize)
+    data = _data(fields, math.prod(spec.shape) * dtype.itemsize)
     array = np.frombuffer(data, dtype=dtype).reshape(spec.shape)
     if dtype.kind == "f" and not _all_finite(array):
         raise WireError("non-finite", fields.at("data"), "holds NaN or infinity")
     return array if name == spec.dtype else _widened(fields, array, spec)
+
+
+def _data(fields: _Fields, length: int) -> bytes:
+    """The bytes of a tensor, expanded if they are compressed."""
+    if "compression" not in fields.value:
+        return fields.take_bytes("data", length)
+    name = fields.take("compression", str)
+    if name != ZSTD:
+        raise WireError("bad-compression", fields.at("compression"), f"must be {ZSTD!r}, got {_shown(name)}")
+    try:
+        return narrow.expanded(fields.take("data", bytes), length)
+    except narrow.NarrowError as error:
+        raise WireError("bad-compression", fields.at("data"), str(error)) from error
 
 
 def _widened(

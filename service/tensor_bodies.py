@@ -162,21 +162,25 @@ def _choices(info: DetectorInfo, roles: Sequence[Role]) -> Iterator[Schema]:
 def _tensor(spec: TensorSpec | None) -> Schema:
     dtype: Schema = {"type": "string", "description": "As numpy calls it."}
     shape: Schema = {"type": "array", "items": {"type": "integer"}}
-    data = _binary()
+    data, plain = _binary(), {}
     said = "numbers, little-endian, C order."
     if spec is not None:
         dtypes = [spec.dtype, *spec.narrower]
         dtype |= {"enum": dtypes} if spec.narrower else {"const": spec.dtype}
         shape["const"] = list(spec.shape)
         sizes = [math.prod(spec.shape) * np.dtype(name).itemsize for name in dtypes]
-        data = _binary(min(sizes), max(sizes))
+        plain = {
+            "if": {"not": {"required": ["compression"]}},
+            "then": {"properties": {"data": _binary(min(sizes), max(sizes))}},
+        }
         finite = " None is NaN or infinite." if np.dtype(spec.dtype).kind == "f" else ""
         said = f"{' or '.join(f'{size:,}' for size in sizes)} bytes: {said}{finite}"
     properties = {"dtype": dtype, "shape": shape, "data": {**data, "description": said[0].upper() + said[1:]}}
     if spec is not None and narrow.BYTES in spec.narrower:
         told = f"With {narrow.BYTES}: a byte for each channel; value = data x 2 to the power of it."
         properties["exponents"] = {**_binary(spec.shape[0]), "description": told}
-    return {"type": "object", "required": ["dtype", "shape", "data"], "properties": properties}
+    properties["compression"] = {"const": wire.ZSTD, "description": "Where `data` is one frame of it, with its length."}
+    return {"type": "object", "required": ["dtype", "shape", "data"], "properties": properties, **plain}
 
 
 def _binary(least: int | None = None, most: int | None = None) -> Schema:

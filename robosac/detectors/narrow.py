@@ -1,4 +1,4 @@
-"""Maps in fewer bits for their way: narrower floats, or bytes with an exponent for each channel.
+"""Maps in fewer bits for their way: narrower floats, or bytes with an exponent for each channel; and compressed bytes.
 
 Nothing after reading knows of it: what is read has the type that the detector declares. Exponents are of two, so a map
 that was rounded once can be narrowed and widened again without another loss: sender and receiver hold the same numbers.
@@ -9,6 +9,7 @@ from __future__ import annotations
 from typing import Any
 
 import numpy as np
+import zstandard
 
 from robosac.detectors.base import Message
 
@@ -16,6 +17,8 @@ BYTES = "int8"
 """The type of maps of bytes."""
 MOST = 127
 """Largest magnitude of a byte."""
+LEVEL = 1
+"""Of compression: higher ones take longer, and save little more."""
 Array = np.ndarray[Any, np.dtype[Any]]
 
 
@@ -72,6 +75,29 @@ def widened(data: Array, exponents: Array | None, dtype: str) -> Array:
         if np.abs(wide).max(initial=0.0) > float(np.finfo(dtype).max):
             raise NarrowError(f"holds values that are too large for {dtype}")
     return wide.astype(dtype)
+
+
+def compressed(data: bytes) -> bytes:
+    """Data as one frame of zstd that tells its length."""
+    return zstandard.ZstdCompressor(level=LEVEL).compress(data)
+
+
+def expanded(data: bytes, length: int) -> bytes:
+    """What `compressed` made of so many bytes.
+
+    Raises
+    ------
+    NarrowError
+        If it is not one frame of zstd, or tells another length; no more than the length is ever held.
+    """
+    try:
+        told = zstandard.frame_content_size(data)
+        if told != length:
+            says = "does not tell its length" if told < 0 else f"tells {told} bytes"
+            raise NarrowError(f"{says}, not {length}")
+        return zstandard.ZstdDecompressor().decompress(data, max_output_size=length, allow_extra_data=False)
+    except zstandard.ZstdError as error:
+        raise NarrowError(f"is not one frame of zstd: {error}") from error
 
 
 def rounded(message: Message, dtype: str) -> Message:

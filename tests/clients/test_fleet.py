@@ -37,7 +37,7 @@ def options(url, **changes):
 async def test_a_fleet_of_independent_clients_end_to_end(tmp_path):
     console = Console(file=io.StringIO(), width=100)
     async with local_gateway(tmp_path / "gateway.log") as url:
-        chosen = options(url, scenes=2, frames=3, egos=2, report=tmp_path / "report", dtype="int8")
+        chosen = options(url, scenes=2, frames=3, egos=2, report=tmp_path / "report", packing=wire.Packing("int8"))
         summary = await run_fleet(chosen, console)
     close_run(chosen, summary, console)
     assert summary.frames == 2 * 3 * 2

@@ -23,7 +23,8 @@ INFO = DetectorInfo(
 MESSAGE = Message(pose_matrix(1.0, 2.0, 1.7, 0.3), {"features": np.ones((2, 3, 3), np.float16)})
 BODIES = [
     wire.pack_message(7, "car-2", MESSAGE, bytes(64)),
-    wire.pack_message(7, "car-2", MESSAGE, bytes(64), dtype="int8"),
+    wire.pack_message(7, "car-2", MESSAGE, bytes(64), packing=wire.Packing("int8")),
+    wire.pack_message(7, "car-2", MESSAGE, bytes(64), packing=wire.Packing(compress=True)),
     wire.pack_frame(7, MESSAGE, {"car-2": MESSAGE, "rsu": MESSAGE}, None, {"rsu": bytes(64)}),
 ]
 fuzzed = settings(max_examples=CASES, deadline=None, suppress_health_check=list(HealthCheck), database=None)
@@ -32,7 +33,7 @@ numbers = st.one_of(st.integers(-(2**63), 2**64 - 1), st.floats(), st.booleans()
 words = st.one_of(
     st.sampled_from(
         ["frame", "vehicle_id", "pose", "tensors", "features", "dtype", "shape", "data", "exponents", "int8"]
-        + ["ego", "teammates"]
+        + ["ego", "teammates", "compression", "zstd"]
     ),
     st.text(max_size=20),
 )
@@ -63,7 +64,7 @@ def read(body: bytes) -> int:
 
 
 def test_the_bodies_that_are_mutated_are_good():
-    assert [read(body) for body in BODIES] == [1, 1, 3]
+    assert [read(body) for body in BODIES] == [1, 1, 1, 3]
 
 
 @fuzzed

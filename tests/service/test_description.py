@@ -235,6 +235,8 @@ def test_the_schemas_of_tensor_bodies_allow_what_the_codec_does(spoil, code):
     assert conforms(sent, whole)
     assert conforms(own, single)
     assert conforms(msgpack.unpackb(wire.pack_message(0, "car-1", TINY_EGO)), single)
+    small = wire.Packing(compress=True)
+    assert conforms(msgpack.unpackb(wire.pack_message(0, "car-2", TINY_TEAMMATE, packing=small)), single)
     assert not conforms(others, single)
     assert conforms(others, tensor_bodies.message_body([TINY, served_info("other")])["schema"])
     assert conforms(others, tensor_bodies.message_body(())["schema"])

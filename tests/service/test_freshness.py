@@ -119,15 +119,16 @@ async def test_vehicles_with_keys_must_sign(served, messages):
     assert [r["reason"] for r in await events(ego, "message_refused")] == ["unauthenticated"] * 7
 
 
-async def test_vehicles_that_sign_may_send_their_maps_as_bytes(served, messages):
+async def test_vehicles_that_sign_may_send_their_maps_as_compressed_bytes(served, messages):
     keys = {name: Ed25519PrivateKey.generate() for name in (EGO, "rsu")}
     shown = {name: show_public_key(key) for name, key in keys.items()}
     (layout,) = [each["tensors"]["teammate"] for each in await served.client.detectors()]
     (dtype,) = layout["features"]["narrower"]
+    packing = wire.Packing(dtype, compress=True)
     session = await served.open(gather_ms=20, defense=NONE, public_keys=shown)
     tokens = {EGO: session.ego_token, **session.teammate_tokens}
     unit, ego = (
-        served.client.vehicle(session.session_id, name, tokens[name], keys[name], dtype) for name in ("rsu", EGO)
+        served.client.vehicle(session.session_id, name, tokens[name], keys[name], packing) for name in ("rsu", EGO)
     )
     await unit.send(0, messages["rsu"])
     asked = await ego.ask(0, messages[EGO])
