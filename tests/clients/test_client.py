@@ -46,6 +46,30 @@ async def test_problems_become_exceptions(status, kind):
     assert "wrong-shape: tensors.x.shape: must be [1]" in str(error)
 
 
+async def test_what_is_not_signed_already_is_rounded_for_its_way(ego_message, benign):
+    bodies = []
+
+    def refuse(request):
+        bodies.append(wire.unpack(request.content))
+        return httpx.Response(422, json=PROBLEM)
+
+    async with gateway(refuse) as client:
+        ego = client.vehicle("s", "car-1", "token", packing=wire.Packing("int8", compress=True))
+        for act in (
+            lambda: ego.post_frame(0, ego_message, benign, {"rsu": bytes(64)}),
+            lambda: ego.ask(0, ego_message),
+            lambda: ego.send(0, ego_message),
+        ):
+            with pytest.raises(InvalidRequest):
+                await act()
+    frame, *own = bodies
+    sent = {"car-1": frame["ego"], **frame["teammates"]}
+    types = {name: each["tensors"]["features"]["dtype"] for name, each in sent.items()}
+    assert types == {name: "float16" if name == "rsu" else "int8" for name in ("car-1", *benign)}
+    assert [each["tensors"]["features"]["dtype"] for each in own] == ["int8"] * 2
+    assert all(each["tensors"]["features"]["compression"] == "zstd" for each in (*sent.values(), *own))
+
+
 async def test_a_refusal_without_a_problem_is_still_one():
     async with gateway(lambda _: httpx.Response(502, text="<html>")) as client:
         with pytest.raises(GatewayUnavailable, match="502"):

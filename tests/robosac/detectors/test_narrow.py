@@ -34,6 +34,15 @@ def test_half_floats_as_bytes_are_near_and_the_same_ever_after(array):
     np.testing.assert_array_equal(wide(once, BYTES), once)
 
 
+@pytest.mark.parametrize("dtype", [np.float16, np.float32])
+def test_the_largest_values_stay_finite(dtype):
+    array = np.full(SHAPE, np.finfo(dtype).max, dtype=dtype)
+    once = wide(array, BYTES)
+    assert np.isfinite(once).all()
+    np.testing.assert_allclose(once, array, rtol=1 / 64)
+    np.testing.assert_array_equal(wide(once, BYTES), once)
+
+
 @given(array=finite(np.float32, 32), dtype=st.sampled_from(["float16", BYTES]))
 @settings(max_examples=200, deadline=None)
 def test_floats_stay_the_same_after_the_first_time(array, dtype):
