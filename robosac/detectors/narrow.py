@@ -103,15 +103,17 @@ def expanded(data: bytes, length: int) -> bytes:
 def rounded(message: Message, dtype: str) -> Message:
     """A message as it is read by whoever gets its maps in a narrower type; a vehicle has to sign this one.
 
-    Tensors that are no floats, or are as narrow, stay as they are.
+    Tensors that are no floats, or are as narrow, stay as they are; and those with NaN or infinity, which a gateway
+    refuses.
     """
     tensors = {
-        name: widened(*narrowed(array, dtype), array.dtype.name) if is_wider(array, dtype) else array
+        name: widened(*narrowed(array, dtype), array.dtype.name) if may_narrow(array, dtype) else array
         for name, array in message.tensors.items()
     }
     return Message(message.pose, tensors)
 
 
-def is_wider(array: Array, dtype: str) -> bool:
-    """Whether an array holds floats of more bits than a type."""
-    return array.dtype.kind == "f" and array.dtype.itemsize > np.dtype(dtype).itemsize
+def may_narrow(array: Array, dtype: str) -> bool:
+    """Whether an array holds floats of more bits than a type, all of them finite."""
+    wider = array.dtype.kind == "f" and array.dtype.itemsize > np.dtype(dtype).itemsize
+    return wider and bool(np.isfinite(array).all())

@@ -28,7 +28,7 @@ def tensor_fields(array: np.ndarray[Any, np.dtype[Any]], packing: Packing) -> di
     """A tensor as it is sent."""
     more: dict[str, Any] = {}
     sent = array
-    if packing.dtype is not None and narrow.is_wider(array, packing.dtype):
+    if packing.dtype is not None and narrow.may_narrow(array, packing.dtype):
         bits, exponents = narrow.narrowed(array, packing.dtype)
         if np.array_equal(narrow.widened(bits, exponents, array.dtype.name), array):
             sent, more = bits, {} if exponents is None else {"exponents": exponents.tobytes()}

@@ -6,6 +6,7 @@ from hypothesis import given, settings
 from hypothesis import strategies as st
 from hypothesis.extra import numpy as arrays
 
+from robosac import wire
 from robosac.boxes import pose_matrix
 from robosac.detectors import Message, load
 from robosac.detectors.narrow import BYTES, MOST, NarrowError, narrowed, rounded, widened
@@ -78,6 +79,16 @@ def test_what_is_no_float_or_as_narrow_stays():
     assert same.tensors["grid"] is grid
     assert same.tensors["half"] is half
     assert rounded(message, BYTES).tensors["grid"] is grid
+
+
+@pytest.mark.parametrize("value", [np.nan, np.inf, -np.inf])
+def test_what_is_not_finite_stays_to_be_refused(value):
+    array = np.ones((2, 3), dtype=np.float16)
+    array[1, 2] = value
+    message = Message(pose_matrix(0, 0, 0, 0), {"map": array})
+    assert rounded(message, BYTES).tensors["map"] is array
+    fields = wire.unpack(wire.pack_message(0, "car-2", message, packing=wire.Packing(BYTES)))["tensors"]["map"]
+    assert fields["dtype"] == "float16"
 
 
 def test_the_shipped_detector_sees_the_same_vehicles():
