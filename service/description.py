@@ -45,10 +45,11 @@ _KEY = "MCowBQYDK2VwAyEA0Z1Jc4mXQ2yq1Jr3T4u5v6w7x8y="
 _DEFENSE = {"kind": "sample_consensus", "attacker_ratio": 0.3, "sampling_budget": 7, "collaborators": 2}
 _TIMING = {"latency_budget_ms": 200.0, "gather_ms": 100.0, "frame_period_ms": 200.0}
 _RECEIPT = {"session": _SESSION, "seq": 2, "head": _HASH, "key_id": "5f2b8c", "signature": "c2lnbmF0dXJl"}
-_FEATURES = {"features": {"dtype": "float16", "shape": [64, 32, 32], "narrower": ["int8"]}}
+_FEATURES = {"features": {"dtype": "float16", "shape": [64, 32, 32]}}
 _DETECTOR = {
     "name": "intersection-mean",
     "tensors": {"ego": _FEATURES, "teammate": _FEATURES},
+    "narrower": {"features": ["int8"]},
     "area_m": [-32.0, -32.0, 32.0, 32.0],
     "cell_m": 2.0,
     "weights_digest": _HASH,

@@ -153,7 +153,6 @@ class TensorEntry(_Shown):
 
     dtype: str
     shape: list[int]
-    narrower: list[str] = Field(description="other types that it may be sent in")
 
 
 class CalibrationEntry(BaseModel):
@@ -179,6 +178,7 @@ class DetectorEntry(_Shown):
 
     name: str
     tensors: dict[Literal["ego", "teammate"], dict[str, TensorEntry]]
+    narrower: dict[str, list[str]] = Field(description="by tensor, other types that it may be sent in")
     area_m: tuple[float, float, float, float] = Field(description="xmin, ymin, xmax, ymax; ego frame, metres")
     cell_m: float
     weights_digest: str = Field(description="SHA-256 of the weights file")
@@ -190,7 +190,11 @@ class DetectorEntry(_Shown):
     @classmethod
     def _with_calibration(cls, shown: object) -> object:
         """A detector says only where the file of its calibration is."""
-        return {**vars(shown), "calibration": CalibrationEntry.of(shown)} if isinstance(shown, DetectorInfo) else shown
+        if not isinstance(shown, DetectorInfo):
+            return shown
+        specs = {name: spec for tensors in shown.tensors.values() for name, spec in tensors.items()}
+        narrower = {name: spec.narrower for name, spec in specs.items() if spec.narrower}
+        return {**vars(shown), "narrower": narrower, "calibration": CalibrationEntry.of(shown)}
 
 
 class DetectorList(BaseModel):

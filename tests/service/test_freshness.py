@@ -122,8 +122,8 @@ async def test_vehicles_with_keys_must_sign(served, messages):
 async def test_vehicles_that_sign_may_send_their_maps_as_compressed_bytes(served, messages):
     keys = {name: Ed25519PrivateKey.generate() for name in (EGO, "rsu")}
     shown = {name: show_public_key(key) for name, key in keys.items()}
-    (layout,) = [each["tensors"]["teammate"] for each in await served.client.detectors()]
-    (dtype,) = layout["features"]["narrower"]
+    (entry,) = await served.client.detectors()
+    (dtype,) = entry["narrower"]["features"]
     packing = wire.Packing(dtype, compress=True)
     session = await served.open(gather_ms=20, defense=NONE, public_keys=shown)
     tokens = {EGO: session.ego_token, **session.teammate_tokens}

@@ -12,6 +12,7 @@ async def test_the_detectors_say_what_to_send(served, detector):
     assert entry["name"] == "intersection-mean"
     assert entry["tensors"]["ego"] == entry["tensors"]["teammate"]
     assert entry["tensors"]["ego"]["features"] == {"dtype": "float16", "shape": [64, 32, 32]}
+    assert entry["narrower"] == {"features": ["int8"]}
     assert entry["area_m"] == [-32, -32, 32, 32]
     assert entry["weights_digest"] == detector.info.weights_digest
 
