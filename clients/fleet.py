@@ -304,7 +304,7 @@ def main(  # the options of a command line
 
 
 def _check_dtype(dtype: str | None, detector: Detector) -> None:
-    taken = {name for tensors in detector.info.tensors.values() for spec in tensors.values() for name in spec.narrower}
+    taken = {name for types in detector.info.narrower.values() for name in types}
     if dtype is not None and dtype not in taken:
         choices = ", ".join(sorted(taken)) or "none"
         raise typer.BadParameter(f"{detector.info.name} takes {choices}, not {dtype}", param_hint="--dtype")

@@ -192,9 +192,7 @@ class DetectorEntry(_Shown):
         """A detector says only where the file of its calibration is."""
         if not isinstance(shown, DetectorInfo):
             return shown
-        specs = {name: spec for tensors in shown.tensors.values() for name, spec in tensors.items()}
-        narrower = {name: spec.narrower for name, spec in specs.items() if spec.narrower}
-        return {**vars(shown), "narrower": narrower, "calibration": CalibrationEntry.of(shown)}
+        return {**vars(shown), "narrower": shown.narrower, "calibration": CalibrationEntry.of(shown)}
 
 
 class DetectorList(BaseModel):

@@ -21,9 +21,7 @@ NONE = "no defence"
 KINDS: dict[str, DefenseSettings] = {
     NONE: Undefended(),
     "static team, in frames without a re-check": StaticTeam(attacker_ratio=0.2, recheck_every=None),
-    "sample consensus: one attacker of five, three sampled, none twice": SampleConsensus(
-        attacker_ratio=0.2, sampling_budget=7, collaborators=3
-    ),
+    "sample consensus, three of five": SampleConsensus(attacker_ratio=0.2, sampling_budget=7, collaborators=3),
     "A2CP": A2CP(),
     "group testing": GroupTestingSettings(),
     "group testing without judging objects": GroupTestingSettings(judge_objects=False),

@@ -65,6 +65,12 @@ class DetectorInfo:
     precision: Precision = "float32"
     """The numbers in which fused maps are decoded. The name ends with ``@PRECISION``, unless that is float32."""
 
+    @property
+    def narrower(self) -> dict[str, tuple[str, ...]]:
+        """By tensor, the other types that it may be sent in; of those that have any."""
+        specs = {name: spec for tensors in self.tensors.values() for name, spec in tensors.items()}
+        return {name: spec.narrower for name, spec in specs.items() if spec.narrower}
+
 
 def split_precision(name: str) -> tuple[str, Precision]:
     """``NAME@PRECISION`` as the name and the precision, float32 where none is named."""
