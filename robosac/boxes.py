@@ -13,6 +13,7 @@ import numpy as np
 
 FloatArray = np.ndarray[tuple[Any, ...], np.dtype[np.floating[Any]]]
 IntArray = np.ndarray[tuple[Any, ...], np.dtype[np.int64]]
+BoolArray = np.ndarray[tuple[Any, ...], np.dtype[np.bool_]]
 
 RIGID_TOLERANCE = 1e-3
 MIN_UPRIGHT = 0.5

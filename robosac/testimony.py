@@ -12,7 +12,7 @@ from functools import cached_property, lru_cache
 
 import numpy as np
 
-from robosac.boxes import FloatArray, IntArray
+from robosac.boxes import BoolArray, FloatArray, IntArray
 
 LIKELIHOOD, X, Y, ALONG, ACROSS = range(5)
 """Layers of a map: L, the vehicle's centre seen from the place's centre (x and y, metres), and logarithms of how far it
@@ -117,18 +117,23 @@ class Testimony:
     def _to_ego(self) -> FloatArray:
         return np.linalg.inv(self.from_ego)
 
-    def sighting(self, points: FloatArray) -> Sighting:
-        """Where each agent sees the vehicles at places (n, 2), ego frame. It means something where L is high."""
-        size = np.array(self.maps.shape[:-3:-1])
+    def sighting(self, points: FloatArray, asked: BoolArray | None = None) -> Sighting:
+        """Where each agent sees the vehicles at places (n, 2), ego frame. It means something where L is high.
+
+        With ``asked`` (agents, n) only those agents are asked, each of its places; of the others it is not a number.
+        """
+        shape = len(self.agents), len(points)
+        who, where = np.nonzero(np.ones(shape, dtype=bool) if asked is None else asked)
+        size = np.array(self.maps.shape[:-3:-1])[:, None]
         cell = 2 * self.half_extent_m / size
-        place = (self.places(points) + self.half_extent_m) / cell
+        place = (_moved(self.from_ego[who], points[where].T) + self.half_extent_m) / cell
         nearest = np.minimum(np.maximum(place.astype(np.int64), 0), size - 1)
-        found = self.maps[np.arange(len(self.agents))[:, None], :, nearest[..., 1], nearest[..., 0]]
-        seen = (nearest + 0.5) * cell - self.half_extent_m + found[..., X : Y + 1]
-        back = self._to_ego
-        centre = seen @ back[:, :2, :2].swapaxes(1, 2) + back[:, None, :2, 2]
-        off = np.exp(found[..., ALONG : ACROSS + 1])
-        return Sighting(centre, off[..., 0], off[..., 1])
+        found = self.maps[who, :, nearest[1], nearest[0]].T
+        seen = (nearest + 0.5) * cell - self.half_extent_m + found[X : Y + 1]
+        centre, off = np.full((*shape, 2), np.nan), np.full((2, *shape), np.nan, dtype=self.maps.dtype)
+        centre[who, where] = _moved(self._to_ego[who], seen).T
+        off[:, who, where] = np.exp(found[ALONG : ACROSS + 1])
+        return Sighting(centre, *off)
 
     def of(self, agents: Collection[str]) -> Testimony:
         """That of some of them alone."""
@@ -143,6 +148,13 @@ class Testimony:
             self.half_extent_m,
             tuple(name for name in self.unread if name in agents),
         )
+
+
+def _moved(planes: FloatArray, points: FloatArray) -> FloatArray:
+    """Points (2, n), each moved as its plane of (n, 3, 3) is."""
+    turn = planes[:, :2].T
+    moved: FloatArray = turn[0] * points[0] + turn[1] * points[1] + turn[2]
+    return moved
 
 
 @lru_cache(maxsize=16)

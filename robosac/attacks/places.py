@@ -4,13 +4,10 @@ from __future__ import annotations
 
 from collections.abc import Sequence
 from dataclasses import dataclass
-from typing import Any
 
 import numpy as np
 
-from robosac.boxes import FloatArray
-
-BoolArray = np.ndarray[tuple[Any, ...], np.dtype[np.bool_]]
+from robosac.boxes import BoolArray, FloatArray
 
 CLEARANCE_M = 5.0
 """From a made-up object to every vehicle, agent and other made-up object."""

@@ -7,12 +7,11 @@ from collections.abc import Callable, Iterable, Mapping
 from dataclasses import asdict, dataclass
 from itertools import pairwise
 from pathlib import Path
-from typing import Any
 
 import numpy as np
 
 from robosac import attacks
-from robosac.boxes import FloatArray
+from robosac.boxes import BoolArray, FloatArray
 from robosac.calibration.messages import held
 from robosac.calibration.verdicts import STRETCH, Stretch, Trial, validation_stretches
 from robosac.defenses.group_testing import Calibration, GroupTesting, GroupTestingSettings
@@ -23,7 +22,6 @@ from robosac.scenes import DEFAULT_DATA, SceneSource, first_scenes
 
 RELIABILITY_EDGES = (0.0, 0.01, 0.05, 0.2, 0.5, 0.8, 0.95, 0.99, 1.0)
 _STREAM = 43
-BoolArray = np.ndarray[tuple[Any, ...], np.dtype[np.bool_]]
 
 
 @dataclass(frozen=True)

@@ -6,9 +6,8 @@ from functools import lru_cache
 
 import numpy as np
 
-from robosac.boxes import FloatArray, IntArray
+from robosac.boxes import BoolArray, FloatArray, IntArray
 from robosac.defenses.group_testing.choice import HARM, gain
-from robosac.defenses.group_testing.distribution import BoolArray
 from robosac.defenses.group_testing.posterior import EXACT, Posterior
 
 SUSPECTS_AT_ONCE = 4

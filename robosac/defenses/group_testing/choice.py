@@ -4,8 +4,7 @@ from __future__ import annotations
 
 import numpy as np
 
-from robosac.boxes import FloatArray, IntArray
-from robosac.defenses.group_testing.distribution import BoolArray
+from robosac.boxes import BoolArray, FloatArray, IntArray
 from robosac.defenses.group_testing.geometry import crowd
 from robosac.defenses.group_testing.knowledge import Knowledge
 from robosac.defenses.group_testing.memory import CHANGE_REPEAT, EGO_REPEAT, PAIR_REPEAT, keys

@@ -12,8 +12,7 @@ from functools import cached_property
 
 import numpy as np
 
-from robosac.boxes import FloatArray
-from robosac.defenses.group_testing.distribution import BoolArray
+from robosac.boxes import BoolArray, FloatArray
 from robosac.testimony import Testimony
 
 SUPPORTS = 3.0
@@ -71,6 +70,11 @@ class Claims:
         """Who (witnesses, n) supports which box."""
         return self.likelihood >= SUPPORTS
 
+    @cached_property
+    def by_box(self) -> tuple[list[list[bool]], list[list[float]]]:
+        """Of each box, who (witnesses,) supports it, and L (witnesses,): plain numbers, to go through one by one."""
+        return self.supporting.T.tolist(), self.likelihood.T.tolist()
+
     @property
     def denying(self) -> BoolArray:
         """Who (witnesses, n) denies which box."""
@@ -85,14 +89,16 @@ class Claims:
         rest: FloatArray = self.likelihood.sum(axis=0) - supports[-2:].sum(axis=0)
         return rest
 
-    def in_conflict(self, witness: str, unheard: Collection[str]) -> BoolArray:
-        """Boxes (n,) over which a witness says the contrary of all others that are heard: its L is at least 4.5 one
-        way, and the sum of theirs 10 the other.
+    def in_conflict(self, unheard: Collection[str]) -> BoolArray:
+        """Over which boxes each witness says the contrary of all others that are heard (witnesses, n): its L is at
+        least 4.5 one way, and the sum of theirs 10 the other.
         """
-        own = self.likelihood[self.witnesses.index(witness)]
-        others = self.without({witness, *unheard}).likelihood.sum(axis=0)
-        against = (np.sign(own) != np.sign(others)) & (np.abs(own) >= CONFLICT_OWN) & (np.abs(others) >= CONFLICT_SUM)
-        return np.asarray(against, dtype=bool)
+        heard = np.array([name not in unheard for name in self.witnesses])[:, None]
+        said = np.where(heard, self.likelihood, 0.0)
+        others = said.sum(axis=0) - said
+        crisp = (np.abs(self.likelihood) >= CONFLICT_OWN) & (np.abs(others) >= CONFLICT_SUM)
+        against: BoolArray = crisp & (self.likelihood * others < 0.0)
+        return against
 
     def contradicted(self, suspects: Collection[str] | None = None, weighty: float = WEIGHTY) -> BoolArray:
         """Which boxes (n,) are contradicted, whoever supports them.

@@ -89,11 +89,12 @@ def _conflicts(found: Findings, answer: Hypothesis) -> dict[str, int]:
         return dict.fromkeys(found.team, 0)
     claims = found.shown[answer].everybody
     claims = claims.of_boxes(claims.boxes[:, 5] >= CONFLICT_SCORE)
-    memory, counts = found.known.memory, {}
+    against = dict(zip(claims.witnesses, claims.in_conflict(found.unheard), strict=True))
+    frame, once = found.known.memory.frame, None if found.calm else 1
+    counts = {}
     for name in found.team:
-        places = [found.placed(box[:2]) for box in claims.boxes[claims.in_conflict(name, found.unheard)]]
-        once = None if found.calm else 1
-        counts[name] = found.lies.counting(name, "conflict", places, memory.frame, once)
+        places = [found.placed(box[:2]) for box in claims.boxes[against[name]]]
+        counts[name] = found.lies.counting(name, "conflict", places, frame, once)
     return counts
 
 

@@ -9,9 +9,8 @@ from collections.abc import Collection, Mapping, Sequence
 
 import numpy as np
 
-from robosac.boxes import FloatArray, IntArray, pairwise_iou
+from robosac.boxes import BoolArray, FloatArray, IntArray, pairwise_iou
 from robosac.defenses.group_testing.claims import DENIES, SUPPORTS, WEIGHTY, two_witnesses
-from robosac.defenses.group_testing.distribution import BoolArray
 from robosac.defenses.group_testing.objects import AWAY, CERTAIN, PLACED_SCORE, SHOWN_SCORE, THERE_SCORE, Lie, Shown
 
 OWN_DENIES = -4.0

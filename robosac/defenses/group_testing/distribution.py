@@ -3,17 +3,15 @@
 from __future__ import annotations
 
 from collections.abc import Sequence
-from typing import Any
 
 import numpy as np
 
-from robosac.boxes import FloatArray, IntArray
+from robosac.boxes import BoolArray, FloatArray, IntArray
 from robosac.defenses.group_testing import sets
 from robosac.defenses.group_testing.blocks import Block, members
 from robosac.defenses.group_testing.model import CELLS, CLEAN
 from robosac.defenses.group_testing.sets import ATTACKS, BENIGN, PLAIN
 
-BoolArray = np.ndarray[tuple[Any, ...], np.dtype[np.bool_]]
 _LIMITS = ((BENIGN, BENIGN), (BENIGN, ATTACKS), (ATTACKS, BENIGN), (PLAIN, PLAIN), (PLAIN, BENIGN), (BENIGN, PLAIN))
 
 _OF_A, _OF_D = 2 - np.array(_LIMITS).T[:, :, None]

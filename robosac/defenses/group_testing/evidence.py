@@ -10,11 +10,10 @@ from typing import Any
 
 import numpy as np
 
-from robosac.boxes import FloatArray
+from robosac.boxes import BoolArray, FloatArray
 from robosac.defenses.group_testing import geometry
 from robosac.defenses.group_testing.choice import DEPENDENCE, UNDILUTED_SIZE
 from robosac.defenses.group_testing.differences import misplaced
-from robosac.defenses.group_testing.distribution import BoolArray
 from robosac.defenses.group_testing.geometry import MIN_WITNESSES, PairMeasure, Said, crowd
 from robosac.defenses.group_testing.knowledge import Knowledge
 from robosac.defenses.group_testing.memory import CHANGE_REPEAT, EGO_REPEAT, PAIR_REPEAT, WORTH_KEEPING, key

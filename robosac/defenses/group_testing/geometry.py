@@ -4,13 +4,10 @@ from __future__ import annotations
 
 from collections.abc import Callable, Mapping
 from dataclasses import dataclass, field
-from typing import Any
 
 import numpy as np
 
-from robosac.boxes import FloatArray, pairwise_iou, to_world
-
-BoolArray = np.ndarray[tuple[Any, ...], np.dtype[np.bool_]]
+from robosac.boxes import BoolArray, FloatArray, pairwise_iou, to_world
 
 WITNESS_SCORE = 0.5
 """Boxes of the smaller fusion from this score on must survive in the larger one."""

@@ -7,7 +7,7 @@ from dataclasses import dataclass, field
 
 import numpy as np
 
-from robosac.defenses.group_testing.distribution import BoolArray
+from robosac.boxes import BoolArray
 from robosac.defenses.group_testing.memory import KeyArray, Memory, identity
 from robosac.defenses.group_testing.model import EvidenceModel
 from robosac.defenses.group_testing.posterior import Posterior

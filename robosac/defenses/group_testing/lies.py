@@ -2,11 +2,10 @@
 
 from __future__ import annotations
 
+import math
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, field
 from typing import Any
-
-import numpy as np
 
 from robosac.boxes import FloatArray
 
@@ -184,4 +183,4 @@ class Lies:
 
 
 def _near(x: float, y: float, place: FloatArray) -> bool:
-    return bool(np.hypot(x - place[0], y - place[1]) < QUIET_M)
+    return math.hypot(x - place[0], y - place[1]) < QUIET_M

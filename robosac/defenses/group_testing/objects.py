@@ -14,9 +14,8 @@ from functools import cached_property
 
 import numpy as np
 
-from robosac.boxes import FloatArray, IntArray
+from robosac.boxes import BoolArray, FloatArray, IntArray
 from robosac.defenses.group_testing.claims import DENIES, SUPPORTS, WEIGHTY, Claims, two_witnesses
-from robosac.defenses.group_testing.distribution import BoolArray
 from robosac.defenses.protocol import Hypothesis
 from robosac.testimony import Testimony
 
@@ -108,9 +107,9 @@ class Hearing:
         enough = np.flatnonzero(total >= STANDING_SUM)
         order = enough[np.argsort(-total[enough], kind="stable")]
         places = self.heard.ego_places()[rows[order], columns[order]]
-        supporting = (over[:, order] >= CERTAIN)[..., None]
-        seen = np.where(supporting, self.heard.sighting(places).centre, 0.0).sum(axis=0)
-        centres: FloatArray = seen / np.maximum(supporting.sum(axis=0), 1)
+        supporting = over[:, order] >= CERTAIN
+        seen = np.nansum(self.heard.sighting(places, supporting).centre, axis=0)
+        centres: FloatArray = seen / np.maximum(supporting.sum(axis=0), 1)[:, None]
         standing: FloatArray = centres[np.hypot(*(centres - places).T) <= REACH_M]
         return standing
 
@@ -146,12 +145,11 @@ class Shown:
         """How far (2, witnesses, n) each box is along and across itself from where a witness sees the vehicle, in units
         of what it may err; not a number where it does not support the box.
         """
-        seen = self._testimony.sighting(self.boxes[:, :2])
+        seen = self._testimony.sighting(self.boxes[:, :2], self.claims.supporting)
         off = seen.centre - self.boxes[None, :, :2]
         cos, sin = np.cos(self.boxes[:, 4]), np.sin(self.boxes[:, 4])
         along, across = off[..., 0] * cos + off[..., 1] * sin, off[..., 1] * cos - off[..., 0] * sin
-        away = np.stack([along / (seen.along + SLACK_ALONG_M), across / (seen.across + SLACK_ACROSS_M)])
-        return np.where(self.claims.supporting, np.abs(away), np.nan)
+        return np.abs([along / (seen.along + SLACK_ALONG_M), across / (seen.across + SLACK_ACROSS_M)])
 
     def away(self, suspects: Collection[str] = (), *, across: bool = False) -> FloatArray:
         """How far (n,) each box is from where witnesses see it, in either direction or ``across`` itself, the lower

@@ -8,10 +8,10 @@ from typing import Any
 
 import numpy as np
 
-from robosac.boxes import FloatArray, IntArray
+from robosac.boxes import BoolArray, FloatArray, IntArray
 from robosac.defenses.group_testing import blocks, sets
 from robosac.defenses.group_testing.blocks import Block
-from robosac.defenses.group_testing.distribution import BoolArray, Distribution
+from robosac.defenses.group_testing.distribution import Distribution
 from robosac.defenses.group_testing.model import CELLS, CLEAN
 
 EXACT = 6

@@ -3,15 +3,16 @@
 from __future__ import annotations
 
 from collections.abc import Sequence
+from itertools import compress
 
 import numpy as np
 
 from robosac.answers import Standing, Support
 from robosac.boxes import FloatArray
-from robosac.defenses.group_testing.claims import DENIES, LEANS, SUPPORTS
+from robosac.defenses.group_testing.claims import DENIES, LEANS
 from robosac.defenses.group_testing.differences import AWAY_EFFECT, gone, gone_alone
 from robosac.defenses.group_testing.objects import Shown
-from robosac.defenses.protocol import EGO, JudgedBox
+from robosac.defenses.protocol import JudgedBox
 
 SAME_M = 2.5
 """A box of another fusion, centred so near, stands for the same vehicle."""
@@ -67,13 +68,13 @@ def judge(answer: Shown, decoded: Sequence[Shown]) -> Judged:
 
 def _judged(shown: Shown, index: int, status: Standing | None) -> JudgedBox:
     claims = shown.claims
-    said = list(zip(claims.witnesses, claims.likelihood[:, index].tolist(), strict=True))
-    witnesses = tuple(name for name, value in said if value >= SUPPORTS)
-    leaning = EGO not in witnesses and claims.rest[index] <= LEANS
-    least = max(LEANS, min(value for _, value in said)) if leaning else DENIES
-    deniers = tuple(name for name, value in said if value <= least)
+    supporting, said = claims.by_box[0][index], claims.by_box[1][index]
+    witnesses = tuple(compress(claims.witnesses, supporting))
+    leaning = not supporting[0] and claims.rest[index] <= LEANS
+    least = max(LEANS, min(said)) if leaning else DENIES
+    deniers = tuple(compress(claims.witnesses, map(least.__ge__, said)))
     if status is None:
-        if EGO in witnesses or (len(witnesses) >= 2 and not deniers):
+        if supporting[0] or (len(witnesses) >= 2 and not deniers):
             status = Standing.CONFIRMED
         else:
             status = Standing.DISPUTED if deniers else Standing.SINGLE_WITNESS

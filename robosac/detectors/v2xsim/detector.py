@@ -16,7 +16,7 @@ from typing import Any, ClassVar, Self
 import numpy as np
 import torch
 
-from robosac.boxes import FloatArray
+from robosac.boxes import BoolArray, FloatArray
 from robosac.detectors.base import (
     DetectorInfo,
     Message,
@@ -30,7 +30,7 @@ from robosac.detectors.map_fusion import FEATURES, Decode, Finder, Heads, MapFus
 from robosac.detectors.v2xsim.anchors import SCORE_THRESHOLD, detections, geometry
 from robosac.detectors.v2xsim.fast import FastDecoder
 from robosac.detectors.v2xsim.network import CHANNELS, MAP, V2XSimNetwork, select_published
-from robosac.detectors.v2xsim.voxels import AREA_M, PACKED_SHAPE, BoolArray, occupancy, pack, unpack
+from robosac.detectors.v2xsim.voxels import AREA_M, PACKED_SHAPE, occupancy, pack, unpack
 from robosac.detectors.weights_file import WeightsError, read_weights, save_weights
 
 FUSIONS: Mapping[str, Callable[..., torch.Tensor]] = {"mean": torch.mean, "max": torch.amax, "sum": torch.sum}

@@ -11,7 +11,7 @@ from typing import Any
 
 import numpy as np
 
-from robosac.boxes import FloatArray
+from robosac.boxes import BoolArray, FloatArray
 from robosac.detectors.v2xsim.network import GRID, LAYERS
 
 AREA_M = 32.0
@@ -24,7 +24,6 @@ DEPTH_M = 5.0
 _CELL_M = np.array([CELL_M, CELL_M, LAYER_M])
 PACKED_SHAPE = (GRID, GRID * LAYERS // 8)
 
-BoolArray = np.ndarray[tuple[Any, ...], np.dtype[np.bool_]]
 ByteArray = np.ndarray[tuple[Any, ...], np.dtype[np.uint8]]
 
 
