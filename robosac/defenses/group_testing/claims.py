@@ -17,6 +17,8 @@ from robosac.testimony import Testimony
 
 SUPPORTS = 3.0
 """An agent supports a place from this L on."""
+NEARLY_SUPPORTS = 2.5
+"""From this L on, an agent is the second to support a box, if all but the first support it together."""
 DENIES = -3.0
 """An agent denies a place from this L on downwards."""
 EGO_KNOWS = -5.5
@@ -89,6 +91,13 @@ class Claims:
         rest: FloatArray = self.likelihood.sum(axis=0) - supports[-2:].sum(axis=0)
         return rest
 
+    @cached_property
+    def beside(self) -> FloatArray:
+        """The sum of L of each box (n,) without the teammate who supports it most."""
+        most = np.maximum(self.likelihood[1:].max(axis=0, initial=0.0), 0.0)
+        beside: FloatArray = self.likelihood.sum(axis=0) - most
+        return beside
+
     def in_conflict(self, unheard: Collection[str]) -> BoolArray:
         """Over which boxes each witness says the contrary of all others that are heard (witnesses, n): its L is at
         least 4.5 one way, and the sum of theirs 10 the other.
@@ -108,9 +117,7 @@ class Claims:
         the ego itself supports is not contradicted.
         """
         heard = self if suspects is None else self.without(suspects)
-        rest = heard.likelihood.sum(axis=0)
-        if suspects is None:
-            rest = rest - np.maximum(self.likelihood[1:].max(axis=0, initial=0.0), 0.0)
+        rest = self.beside if suspects is None else heard.likelihood.sum(axis=0)
         denied = (rest <= -weighty) & two_witnesses(heard.denying) & ~self.supporting[0]
         known: BoolArray = denied | (self.likelihood[0] <= EGO_KNOWS)
         return known

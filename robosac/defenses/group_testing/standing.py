@@ -9,7 +9,7 @@ import numpy as np
 
 from robosac.answers import Standing, Support
 from robosac.boxes import FloatArray
-from robosac.defenses.group_testing.claims import DENIES, LEANS
+from robosac.defenses.group_testing.claims import DENIES, LEANS, NEARLY_SUPPORTS, SUPPORTS
 from robosac.defenses.group_testing.differences import AWAY_EFFECT, gone, gone_alone
 from robosac.defenses.group_testing.objects import Shown
 from robosac.defenses.protocol import JudgedBox
@@ -27,8 +27,10 @@ def judge(answer: Shown, decoded: Sequence[Shown]) -> Judged:
     2. A box that is out of place is taken from the part of the answer that has it nearest to its place.
     3. A vehicle that a part of the answer shows, and the answer has lost although it stands by testimony, is taken from
        there. Of the answer without one teammate the word of one witness is enough, if nobody else denies it.
-    4. Any other box is ``confirmed`` by the ego. Else it is ``disputed`` if somebody denies it, or all others together
-       lean against it (`Claims.rest`); ``confirmed`` by two teammates; or ``single_witness``.
+    4. Any other box is ``confirmed`` by the ego, if all but the teammate who supports it most support it together
+       (`Claims.beside`), and ``disputed`` if they do not. Where the ego does not support it, it is ``disputed`` if
+       somebody denies it, or all others together lean against it (`Claims.rest`); ``confirmed`` by two teammates, of
+       whom the second may nearly support it if they all do together; or ``single_witness``.
 
     Parameters
     ----------
@@ -70,11 +72,13 @@ def _judged(shown: Shown, index: int, status: Standing | None) -> JudgedBox:
     claims = shown.claims
     supporting, said = claims.by_box[0][index], claims.by_box[1][index]
     witnesses = tuple(compress(claims.witnesses, supporting))
-    leaning = not supporting[0] and claims.rest[index] <= LEANS
+    ego, backed = supporting[0], claims.beside[index] >= SUPPORTS
+    leaning = not backed if ego else claims.rest[index] <= LEANS
     least = max(LEANS, min(said)) if leaning else DENIES
     deniers = tuple(compress(claims.witnesses, map(least.__ge__, said)))
     if status is None:
-        if supporting[0] or (len(witnesses) >= 2 and not deniers):
+        several = len(witnesses) >= 2 or (witnesses and backed and sorted(said)[-2] >= NEARLY_SUPPORTS)
+        if backed if ego else several and not deniers:
             status = Standing.CONFIRMED
         else:
             status = Standing.DISPUTED if deniers else Standing.SINGLE_WITNESS
