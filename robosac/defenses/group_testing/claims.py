@@ -82,6 +82,12 @@ class Claims:
         """Who (witnesses, n) denies which box."""
         return self.likelihood <= DENIES
 
+    @property
+    def denied_by_more_than_two(self) -> BoolArray:
+        """Which boxes (n,) the ego leans against, or three teammates deny."""
+        denied: BoolArray = (self.likelihood[0] <= LEANS) | (self.denying[1:].sum(axis=0) >= 3)
+        return denied
+
     @cached_property
     def rest(self) -> FloatArray:
         """What the others say of each box (n,): the sum of L without the teammate who supports it, or without the two

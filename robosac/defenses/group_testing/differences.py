@@ -38,12 +38,14 @@ CRISP_SCORE = 0.5
 def effects(joined: Shown, without: Shown, suspects: Sequence[str]) -> list[Lie]:
     """What is wrong in a fusion, and is not in the same fusion without the suspects.
 
-    - ``ghost``: a contradicted box whose odds without them are less by a factor of e;
+    - ``ghost``: a contradicted box whose odds without them are less by a factor of e. Two teammates may deny together
+      what is there, so the ego or a third one has to go with them;
     - ``gone``: a box without them where the others support a vehicle, and nothing is shown with them;
     - ``moved``: a box that is out of place, and without them less so. If it is so along itself only, it may be late. So
       it may if many boxes together are `misplaced`, each a little.
     """
     ghosts = joined.claims.contradicted(suspects, BLAMED_SUM) & (joined.boxes[:, 5] >= CRISP_SCORE)
+    ghosts &= joined.claims.without(suspects).denied_by_more_than_two
     grown, own = joined.boxes[ghosts], joined.own(suspects)[:, ghosts].max(axis=0)
     drop = joined.odds_at(grown[:, :2]) - without.odds_at(grown[:, :2])
     found = [Lie("ghost", grown[i, :2], bool(own[i] <= OWN_DENIES)) for i in np.flatnonzero(drop >= EFFECT)]
