@@ -29,6 +29,8 @@ CONFLICT_OWN, CONFLICT_SUM = 4.5, 10.0
 """L of one, and the sum of all others' the other way, from which on they are in conflict."""
 AROUND_M = 0.6
 """L of a box is the greatest within so far along and across of its centre: a place a little off is no denial."""
+NOT_TOGETHER = 3
+"""So many teammates do not lie together, or no more would be left to tell."""
 LEANS = -1.0
 """All others lean against a box if the sum of L without those who vouch for it is so low."""
 _STEPS = np.array([[0.0, 0.0], [1.0, 0.0], [-1.0, 0.0], [0.0, 1.0], [0.0, -1.0]])
@@ -82,10 +84,13 @@ class Claims:
         """Who (witnesses, n) denies which box."""
         return self.likelihood <= DENIES
 
-    @property
-    def denied_by_more_than_two(self) -> BoolArray:
-        """Which boxes (n,) the ego leans against, or three teammates deny."""
-        denied: BoolArray = (self.likelihood[0] <= LEANS) | (self.denying[1:].sum(axis=0) >= 3)
+    def denied_for_certain(self, others: int) -> BoolArray:
+        """Which boxes (n,) the ego denies; or three teammates, or two whom the ego leans to; of fewer ``others`` than
+        three, all of them. Two teammates may lie together.
+        """
+        count = self.denying[1:].sum(axis=0)
+        several = (count >= 2) & ((count >= min(NOT_TOGETHER, others)) | (self.likelihood[0] <= LEANS))
+        denied: BoolArray = self.denying[0] | several
         return denied
 
     @cached_property
@@ -128,7 +133,8 @@ class Claims:
         """
         heard = self if suspects is None else self.without(suspects)
         rest = self.beside if suspects is None else heard.likelihood.sum(axis=0)
-        denied = (rest <= -weighty) & two_witnesses(heard.denying) & ~self.supporting[0]
+        others = len(heard.witnesses) - (2 if suspects is None else 1)
+        denied = (rest <= -weighty) & heard.denied_for_certain(others) & ~self.supporting[0]
         known: BoolArray = denied | (self.likelihood[0] <= EGO_KNOWS)
         return known
 

@@ -4,11 +4,13 @@ from __future__ import annotations
 
 from collections import Counter
 from collections.abc import Sequence
+from dataclasses import replace
 
 import numpy as np
 
 from robosac.defenses.group_testing.differences import SAME_LIE_M, blame
 from robosac.defenses.group_testing.findings import UNHEARD, Findings
+from robosac.defenses.group_testing.lies import Word
 from robosac.defenses.group_testing.model import CELLS, CLEAN, LIE
 from robosac.defenses.group_testing.objects import Lie, Shown
 from robosac.defenses.protocol import Hypothesis
@@ -32,7 +34,7 @@ def conclude(found: Findings, answer: Hypothesis) -> None:
     blamed: dict[str, list[Lie]] = {name: [] for name in found.team}
     comparisons = _comparisons(found)
     heard = sum(name not in found.unheard for name in found.team)
-    fewest = max(1, min(FEWEST_BESIDE, heard - 1))
+    fewest, frame = max(1, min(FEWEST_BESIDE, heard - 1)), found.known.memory.frame
     for joined, shown in found.shown.items():
         done = {
             suspect: found.effects(joined, without, (suspect,))
@@ -41,10 +43,11 @@ def conclude(found: Findings, answer: Hypothesis) -> None:
         }
         enough = len(joined) > fewest
         if enough:
-            found.lies.audited |= dict.fromkeys(done, found.known.memory.frame)
+            found.lies.audited |= dict.fromkeys(done, frame)
         for suspect, lies in blame(done, shown).items():
             counting = [lie for lie in lies if enough or lie.counts_as == "ghost"]
             counting = [lie for lie in counting if found.calm or not lie.veiled]
+            counting = _borne_out(found, suspect, counting, heard - 1)
             found.note(joined, tuple(name for name in joined if name != suspect), counting)
             blamed[suspect] += counting
     for name, lie in _together(found, answer):
@@ -57,12 +60,22 @@ def conclude(found: Findings, answer: Hypothesis) -> None:
         for kind in {lie.counts_as for lie in blamed[name]}:
             of_kind = [lie for lie in blamed[name] if lie.counts_as == kind]
             places = [found.placed(lie.place) for lie in of_kind]
-            counts[kind] = found.lies.counting(name, kind, places, found.known.memory.frame)
+            counts[kind] = found.lies.counting(name, kind, places, frame)
             if any(lie.said for lie in of_kind):
                 counts[kind] = 1
         weight = found.lies.add(name, counts)
         if weight:
             _accuse(found, name, weight, blamed[name], conflicts[name])
+
+
+def _borne_out(found: Findings, suspect: str, lies: Sequence[Lie], others: int) -> list[Lie]:
+    """The lies that count by the word of those who say so. What is doubtful may be late."""
+    counting = []
+    for lie in lies:
+        word = found.lies.hear(suspect, lie.by, others)
+        if word is not Word.NOTHING:
+            counting.append(lie if word is Word.GOOD else replace(lie, along=True))
+    return counting
 
 
 def _together(found: Findings, answer: Hypothesis) -> list[tuple[str, Lie]]:

@@ -38,14 +38,12 @@ CRISP_SCORE = 0.5
 def effects(joined: Shown, without: Shown, suspects: Sequence[str]) -> list[Lie]:
     """What is wrong in a fusion, and is not in the same fusion without the suspects.
 
-    - ``ghost``: a contradicted box whose odds without them are less by a factor of e. Two teammates may deny together
-      what is there, so the ego or a third one has to go with them;
+    - ``ghost``: a contradicted box whose odds without them are less by a factor of e;
     - ``gone``: a box without them where the others support a vehicle, and nothing is shown with them;
     - ``moved``: a box that is out of place, and without them less so. If it is so along itself only, it may be late. So
       it may if many boxes together are `misplaced`, each a little.
     """
     ghosts = joined.claims.contradicted(suspects, BLAMED_SUM) & (joined.boxes[:, 5] >= CRISP_SCORE)
-    ghosts &= joined.claims.without(suspects).denied_by_more_than_two
     grown, own = joined.boxes[ghosts], joined.own(suspects)[:, ghosts].max(axis=0)
     drop = joined.odds_at(grown[:, :2]) - without.odds_at(grown[:, :2])
     found = [Lie("ghost", grown[i, :2], bool(own[i] <= OWN_DENIES)) for i in np.flatnonzero(drop >= EFFECT)]
@@ -56,10 +54,11 @@ def effects(joined: Shown, without: Shown, suspects: Sequence[str]) -> list[Lie]
     found += [Lie("gone", lost[i, :2], bool(own[i] >= SUPPORTS), said=bool(own[i] <= DENIES)) for i in taken]
     found += [Lie("gone", without.boxes[i, :2], alone=True) for i in gone_alone(joined, without, suspects)]
     away, aside, other = joined.away(suspects), joined.away(suspects, across=True), without.away(suspects)
-    for index in np.flatnonzero((away >= AWAY) & (joined.boxes[:, 5] >= PLACED_SCORE) & ~ghosts):
+    for index in np.flatnonzero((away >= AWAY) & (joined.boxes[:, 5] >= PLACED_SCORE) & ~ghosts).tolist():
         same = _at(without, joined.boxes[index])
         if same is not None and 0.0 < other[same] <= away[index] - AWAY_EFFECT:
-            found.append(Lie("moved", joined.boxes[index, :2], along=bool(aside[index] < AWAY)))
+            by, along = joined.accusers(index, suspects), bool(aside[index] < AWAY)
+            found.append(Lie("moved", joined.boxes[index, :2], along=along, by=by))
     if all(lie.kind != "moved" for lie in found) and misplaced(joined, without, suspects) >= ADRIFT:
         places, grown = _grown(joined, without, suspects)
         found.append(Lie("moved", places[grown.argmax()], along=True))

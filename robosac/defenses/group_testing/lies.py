@@ -5,9 +5,12 @@ from __future__ import annotations
 import math
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, field
+from enum import Enum
 from typing import Any
 
 from robosac.boxes import FloatArray
+from robosac.defenses.group_testing.claims import NOT_TOGETHER
+from robosac.defenses.protocol import EGO
 
 
 @dataclass(frozen=True)
@@ -56,6 +59,15 @@ PLACE_FRAMES = 50
 """See `Rule.times`."""
 
 
+class Word(Enum):
+    """What it is worth that some say of a teammate that it lies."""
+
+    GOOD = "good"
+    DOUBTFUL = "doubtful"
+    """Nobody is named for it."""
+    NOTHING = "nothing"
+
+
 @dataclass
 class Lies:
     """Mutable while a frame is judged."""
@@ -72,10 +84,31 @@ class Lies:
     """By teammate: the frame of the session in which an answer was last decoded without it, to see what it does."""
     audited: dict[str, int] = field(default_factory=dict)
     """The same for a fusion of enough others to tell."""
+    accusers: dict[str, dict[str, int]] = field(default_factory=dict)
+    """By teammate: who said that it moves vehicles, and how often."""
 
     def recently_left_out(self, teammate: str, frame: int) -> bool:
         """Whether it was left out in this frame or one just before."""
         return frame - self.left_out.get(teammate, -RECENT_FRAMES) < RECENT_FRAMES
+
+    def hear(self, teammate: str, by: Sequence[str], others: int) -> Word:
+        """What the word of some against a teammate is worth; it is remembered that they said so.
+
+        Two may lie together. So it is good if the ego is among them, or if they are three, or if anybody is among them
+        but the two who have said such things most often. Else it is doubtful where one of them says so for the first
+        time, and worth nothing where not. Of fewer ``others`` than three nobody would be left, so it is good; and so is
+        what is by nobody.
+        """
+        if not by:
+            return Word.GOOD
+        said = self.accusers.setdefault(teammate, {})
+        before = sorted(said, key=lambda name: (-said[name], name))
+        for name in by:
+            said[name] = said.get(name, 0) + 1
+        often = before[:2] if len(before) >= 2 else by[:2]
+        if EGO in by or others < NOT_TOGETHER or not set(by) <= set(often):
+            return Word.GOOD
+        return Word.NOTHING if set(by) <= set(before) else Word.DOUBTFUL
 
     def add(self, teammate: str, counts: Mapping[str, int]) -> float:
         """Take in the lies of a frame by kind; what new levels add to the teammate's suspicion."""
@@ -150,6 +183,7 @@ class Lies:
         self.places.pop(teammate, None)
         self.left_out.pop(teammate, None)
         self.audited.pop(teammate, None)
+        self.accusers.pop(teammate, None)
 
     def to_state(self) -> dict[str, Any]:
         """JSON values that `from_state` reads."""
@@ -162,6 +196,7 @@ class Lies:
             },
             "left_out": self.left_out,
             "audited": self.audited,
+            "accusers": self.accusers,
         }
 
     @classmethod
@@ -178,7 +213,11 @@ class Lies:
                 for name, of in state.get("places", {}).items()  # not in the states of older versions
             },
             {str(name): int(frame) for name, frame in state["left_out"].items()},
-            {str(name): int(frame) for name, frame in state.get("audited", {}).items()},  # nor is this
+            {str(name): int(frame) for name, frame in state.get("audited", {}).items()},  # nor are these
+            {
+                str(name): {str(other): int(count) for other, count in by.items()}
+                for name, by in state.get("accusers", {}).items()
+            },
         )
 
 

@@ -64,6 +64,9 @@ class Lie:
     said: bool = False
     """Whether the message of whoever is behind it says so, too: that a vehicle that it removes is not there."""
 
+    by: Hypothesis = ()
+    """Who says that a vehicle is moved."""
+
     @property
     def counts_as(self) -> str:
         """What it is counted as, see `lies.RULES`."""
@@ -157,6 +160,12 @@ class Shown:
         """
         middle, seeing = self._median_away(suspects, self._away[1:] if across else self._away)
         return np.where(seeing >= 2, middle, 0.0)
+
+    def accusers(self, index: int, suspects: Collection[str]) -> Hypothesis:
+        """Who but the suspects sees a vehicle elsewhere than a box is."""
+        away = self._away[:, :, index].max(axis=0).tolist()  # not a number where nothing is seen
+        said = zip(self.claims.witnesses, away, strict=True)
+        return tuple(name for name, far in said if far > IN_PLACE and name not in suspects)
 
     def in_place(self, joining: Collection[str]) -> BoolArray:
         """Which boxes (n,) stand where those who are not among the joining see a vehicle, by their lower median."""

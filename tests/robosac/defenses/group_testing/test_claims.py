@@ -28,7 +28,9 @@ def claim(ego, *teammates):
         ((-5.0, YES, YES), False),  # if it is clear
         ((0.0, NO, YES), False),  # one against one
         ((0.0, NO, NO, YES), True),
-        ((0.0, NO, NO, YES, YES), True),  # who supports it most may have made it up
+        ((-1.5, NO, NO, YES, YES), True),  # who supports it most may have made it up
+        ((0.0, NO, NO, NO, YES, YES), True),
+        ((0.0, NO, NO, YES, YES), False),  # two may lie together
         ((0.0, NO, NO, YES, YES, YES), False),
         ((YES, NO, NO, NO, 0.0), False),  # the ego sees it
         ((0.0, 0.0, 0.0), False),
@@ -109,3 +111,25 @@ def test_the_ego_or_two_teammates_are_two_witnesses():
 )
 def test_what_the_rest_say_is_without_those_who_vouch(said, rest):
     assert claim(*said).rest.tolist() == [pytest.approx(rest, abs=0.1)]
+
+
+@pytest.mark.parametrize(
+    ("said", "conflicting"),
+    [
+        ((0.0, NO, NO, NO, YES), ["d"]),
+        ((NO, NO, 0.0, 0.0, YES), ["d"]),
+        ((0.0, NO, NO, 0.0, YES), []),  # two may lie together
+        ((0.0, YES, YES, 0.0, NO), []),
+        ((YES, YES, 0.0, 0.0, NO), ["d"]),
+        ((0.0, NO, NO, NO, 4.0), []),  # not so sure of it
+    ],
+)
+def test_who_is_in_conflict_with_all_others(said, conflicting):
+    claims = claim(*said)
+    found = dict(zip(claims.witnesses, claims.in_conflict(()).any(axis=1).tolist(), strict=True))
+    assert [name for name, against in found.items() if against] == conflicting
+
+
+def test_what_nobody_hears_is_no_conflict():
+    claims = claim(0.0, NO, NO, NO, YES)
+    assert not claims.in_conflict(["a"]).any()

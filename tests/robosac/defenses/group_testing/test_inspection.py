@@ -88,13 +88,13 @@ def erased(subset):
 
 
 HONEST = World({}, nothing)
-GHOST = World({"car-2": NO, "car-3": NO, LIAR: YES}, with_liar(CAR, CAR[:0]))
+GHOST = World({EGO: -2.0, "car-2": NO, "car-3": NO, LIAR: YES}, with_liar(CAR, CAR[:0]))
 ERASED = World({"car-2": YES, "car-3": YES, "rsu": YES, LIAR: NO}, erased)
 NEAR, ASIDE = CAR + [0, 0.1, 0, 0, 0, 0], CAR + [0, 1.6, 0, 0, 0, 0]
 MOVED = World({"car-2": YES, "car-3": YES, "rsu": YES}, with_liar(ASIDE, NEAR))
 DRIVING_MOVED = World({"car-2": YES, "car-3": YES, "rsu": YES}, with_liar(ASIDE, NEAR), speed=1.0)
-VEILED = World({"car-2": NO, "car-3": NO, LIAR: NO}, with_liar(CAR, CAR[:0]))
-DRIVING_VEILED = World({"car-2": NO, "car-3": NO, LIAR: NO}, with_liar(CAR, CAR[:0]), speed=1.0)
+VEILED = World({EGO: -2.0, "car-2": NO, "car-3": NO, LIAR: NO}, with_liar(CAR, CAR[:0]))
+DRIVING_VEILED = World({EGO: -2.0, "car-2": NO, "car-3": NO, LIAR: NO}, with_liar(CAR, CAR[:0]), speed=1.0)
 UNSAID = World({"car-2": YES, "car-3": YES, "rsu": YES}, erased)
 
 
@@ -186,7 +186,7 @@ def test_with_the_liar_in_the_answer_a_ghost_is_contradicted():
     assert LIAR in decision.accepted
     ((ghost, _),) = there(decision, tested, decision.contradicted)
     assert ghost.support.status is Standing.CONTRADICTED
-    assert (ghost.support.witnesses, set(ghost.support.deniers)) == ((LIAR,), {"car-2", "car-3"})
+    assert (ghost.support.witnesses, set(ghost.support.deniers)) == ((LIAR,), {EGO, "car-2", "car-3"})
     assert there(decision, tested, decision.objects) == []
 
 
@@ -225,8 +225,13 @@ def test_with_the_liar_in_the_answer_a_box_is_repaired(world, inspections):
 @pytest.mark.parametrize(
     ("said", "status"),
     [
-        ({EGO: YES, "car-2": NO}, Standing.CONFIRMED),
+        ({EGO: YES, "car-2": NO}, Standing.DISPUTED),
+        ({EGO: 3.5, "car-2": -1.5, "rsu": YES}, Standing.DISPUTED),
+        ({EGO: 3.5, "rsu": YES}, Standing.CONFIRMED),
         ({"car-2": YES, "rsu": YES}, Standing.CONFIRMED),
+        ({"car-2": YES, "rsu": 2.7, "car-3": 0.5}, Standing.CONFIRMED),
+        ({"car-2": YES, "rsu": 2.7}, Standing.SINGLE_WITNESS),
+        ({"car-2": YES, "rsu": 2.0, "car-3": 2.0}, Standing.SINGLE_WITNESS),
         ({"car-2": YES}, Standing.SINGLE_WITNESS),
         ({}, Standing.SINGLE_WITNESS),
         ({"car-2": YES, "rsu": NO}, Standing.DISPUTED),
@@ -236,7 +241,9 @@ def test_with_the_liar_in_the_answer_a_box_is_repaired(world, inspections):
         ({EGO: -2.0, "car-2": YES}, Standing.DISPUTED),
         ({EGO: -0.5, "car-2": YES, "car-3": YES}, Standing.CONFIRMED),
         ({EGO: YES, "car-2": -2.0}, Standing.CONFIRMED),
-        ({"car-2": NO, "rsu": NO}, Standing.CONTRADICTED),
+        ({"car-2": NO, "rsu": NO}, Standing.DISPUTED),
+        ({EGO: -2.0, "car-2": NO, "rsu": NO}, Standing.CONTRADICTED),
+        ({"car-2": NO, "car-3": NO, "rsu": NO}, Standing.CONTRADICTED),
     ],
 )
 def test_a_box_stands_on_what_is_said_of_it(said, status):
@@ -244,8 +251,9 @@ def test_a_box_stands_on_what_is_said_of_it(said, status):
     boxes = decision.contradicted if status is Standing.CONTRADICTED else decision.objects
     ((judged, _),) = there(decision, tested, boxes)
     assert judged.support.status is status
-    assert set(judged.support.witnesses) == {name for name, value in said.items() if value > 0}
-    least = max(-1.0, min(said.values(), default=0.0)) if status is Standing.DISPUTED else NO
+    assert set(judged.support.witnesses) == {name for name, value in said.items() if value >= 3.0}
+    against = status in (Standing.DISPUTED, Standing.CONTRADICTED)
+    least = max(-1.0, min(said.values())) if against else NO
     assert set(judged.support.deniers) == {name for name, value in said.items() if value <= least}
     everywhere = [other.support for other in decision.objects if other is not judged]
     assert {each.status for each in everywhere} == {Standing.CONFIRMED}
@@ -269,6 +277,19 @@ def test_one_who_denies_what_another_sees_is_believed_no_more_than_it():
         assert decision.contradicted == ()
         if "car-2" in decision.accepted:
             assert there(decision, tested, decision.objects)
+
+
+@pytest.mark.parametrize("victims", [("rsu",), ("rsu", "car-5")])
+def test_two_that_deny_together_what_others_see_frame_nobody(victims):
+    """Two words against one or two: nobody is suspected, and the box stays, as one that is disputed."""
+    world = World({"car-2": NO, "car-3": NO, **dict.fromkeys(victims, YES)}, seen_by(*victims))
+    for decision, tested in world.play(12):
+        assert decision.named == ()
+        assert decision.contradicted == ()
+        assert set(victims) <= set(decision.accepted)
+        ((judged, _),) = there(decision, tested, decision.objects)
+        assert judged.support.status is Standing.DISPUTED
+    assert max(decision.suspicion[name] for name in victims) < 0.1
 
 
 def test_nobody_is_suspected_where_nothing_is_wrong():

@@ -13,7 +13,9 @@ from robosac.defenses.group_testing.lies import (
     QUIET_M,
     RULES,
     Lies,
+    Word,
 )
+from robosac.defenses.protocol import EGO
 
 HERE = np.array([100.0, -40.0])
 
@@ -187,3 +189,31 @@ def test_what_is_remembered_survives_json():
     assert again.add("a", {"ghost": 1}) == lies.add("a", {"ghost": 1})
     again.forget("a")
     assert set(again.levels) == {"b"}
+
+
+def test_two_who_say_the_same_again_and_again_are_not_believed():
+    lies = Lies()
+    assert lies.hear("a", ("b", "c"), 4) is Word.DOUBTFUL
+    assert [lies.hear("a", ("c", "b"), 4) for _ in range(3)] == [Word.NOTHING] * 3
+    assert lies.hear("a", ("b", "d"), 4) is Word.GOOD  # another one says so, too
+    assert lies.hear("a", ("b", "c"), 4) is Word.NOTHING
+    assert lies.hear("b", ("c", "d"), 4) is Word.DOUBTFUL  # of somebody else
+
+
+@pytest.mark.parametrize(
+    ("by", "others"), [((EGO, "b"), 4), (("b", "c", "d"), 4), (("b", "c"), 2), ((), 4)], ids=["ego", "3", "all", "none"]
+)
+def test_whose_word_is_good_at_once(by, others):
+    lies = Lies()
+    assert [lies.hear("a", by, others) for _ in range(3)] == [Word.GOOD] * 3
+
+
+def test_who_accused_whom_is_kept_until_that_one_leaves():
+    lies = Lies()
+    lies.hear("a", ("b", "c"), 4)
+    kept = Lies.from_state(json.loads(json.dumps(lies.to_state(), sort_keys=True)))
+    assert kept.hear("a", ("b", "c"), 4) is Word.NOTHING
+    kept.forget("a")
+    assert kept.hear("a", ("b", "c"), 4) is Word.DOUBTFUL
+    older = {key: value for key, value in lies.to_state().items() if key != "accusers"}
+    assert Lies.from_state(older).accusers == {}

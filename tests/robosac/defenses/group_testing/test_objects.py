@@ -43,7 +43,7 @@ def found(heard, joined, without, suspect="d"):
     return [lie.kind for lie in lies]
 
 
-DENIED = {"b": NO, "c": NO, "d": YES}
+DENIED = {"ego": -2.0, "b": NO, "c": NO, "d": YES}
 SEEN = {"b": YES, "c": YES}
 
 
