@@ -77,15 +77,15 @@ class Standing(StrEnum):
     """How a box stands among those who could see the place."""
 
     CONFIRMED = "confirmed"
-    """The ego sees it, or at least two teammates do and nobody denies it."""
+    """The ego sees it and is not outweighed, or two teammates do and nobody denies it."""
     SINGLE_WITNESS = "single_witness"
     """Nobody denies it, and fewer than two teammates are sure of it, as where nobody else can see: no accusation."""
     DISPUTED = "disputed"
-    """Somebody who could have seen it did not, but not enough of them to leave it out."""
+    """Somebody who could have seen it did not, but not so many of them that it is left out."""
     REPAIRED = "repaired"
     """It is taken from a fusion without a teammate whose joining removes or moves it."""
     CONTRADICTED = "contradicted"
-    """The ego, or at least two teammates, could have seen it and did not."""
+    """The ego, three teammates, or two and the ego inclined to agree, could have seen it and did not."""
 
 
 def _array_of(*shape: int) -> Any:
