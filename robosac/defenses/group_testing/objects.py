@@ -31,6 +31,8 @@ CERTAIN = 4.0
 """From this L on, two teammates or the ego know that a vehicle stands in a place."""
 REACH_M = 2.2
 """A box is at a place if it is centred so near."""
+OWN_M = 3.0
+"""What is centred so near the ego's sensor is the ego."""
 RIM_M = 1.2
 """A place so near a box belongs to it."""
 AWAY = 2.5
@@ -102,7 +104,8 @@ class Hearing:
     @cached_property
     def standing(self) -> FloatArray:
         """Centres (k, 2) of vehicles that the ego, or two teammates, know of, and all together without the one who
-        denies them most. The surest come first; of one vehicle there may be many.
+        denies them most. The surest come first; of one vehicle there may be many. The ego itself, which others see, is
+        none of them: no fusion shows it.
         """
         rows, columns = np.nonzero(two_witnesses(self.heard.over_ego >= CERTAIN))
         over = np.minimum(np.maximum(self.heard.over_ego[:, rows, columns], -WEIGHTY), WEIGHTY)
@@ -113,7 +116,8 @@ class Hearing:
         supporting = over[:, order] >= CERTAIN
         seen = np.nansum(self.heard.sighting(places, supporting).centre, axis=0)
         centres: FloatArray = seen / np.maximum(supporting.sum(axis=0), 1)[:, None]
-        standing: FloatArray = centres[np.hypot(*(centres - places).T) <= REACH_M]
+        others = np.hypot(*centres.T) > OWN_M
+        standing: FloatArray = centres[others & (np.hypot(*(centres - places).T) <= REACH_M)]
         return standing
 
 

@@ -158,6 +158,13 @@ def test_a_vehicle_stands_where_the_ego_or_two_know_it(said, holes):
     assert len(Shown(TEAM, REST, hearing(**said)).holes) == holes
 
 
+def test_the_ego_is_no_vehicle_that_is_missing():
+    """Others see it, and no fusion shows it."""
+    seen = dict.fromkeys("abcd", YES)
+    assert [lie.kind for lie in Shown(TEAM, REST, hearing(**seen)).lies] == ["gone"]
+    assert Shown(TEAM, REST, hearing(place=np.array([0.4, -0.3]), **seen)).lies == []
+
+
 def test_all_that_may_be_wrong_is_told_of_a_fusion():
     ghost = Shown(TEAM, np.vstack([REST, car()]), hearing(**DENIED)).lies
     assert [(lie.kind, lie.place.tolist()) for lie in ghost] == [("ghost", PLACE.tolist())]
