@@ -33,6 +33,8 @@ REACH_M = 2.2
 """A box is at a place if it is centred so near."""
 OWN_M = 3.0
 """What is centred so near the ego's sensor is the ego."""
+EDGE_M = 1.0
+"""What is centred so near the edge of the ego's map may be beyond it."""
 RIM_M = 1.2
 """A place so near a box belongs to it."""
 AWAY = 2.5
@@ -104,8 +106,10 @@ class Hearing:
     @cached_property
     def standing(self) -> FloatArray:
         """Centres (k, 2) of vehicles that the ego, or two teammates, know of, and all together without the one who
-        denies them most. The surest come first; of one vehicle there may be many. The ego itself, which others see, is
-        none of them: no fusion shows it.
+        denies them most. The surest come first; of one vehicle there may be many.
+
+        What no fusion shows is none of them: the ego itself, which others see, and what is centred at the edge of its
+        map or beyond.
         """
         rows, columns = np.nonzero(two_witnesses(self.heard.over_ego >= CERTAIN))
         over = np.minimum(np.maximum(self.heard.over_ego[:, rows, columns], -WEIGHTY), WEIGHTY)
@@ -116,8 +120,9 @@ class Hearing:
         supporting = over[:, order] >= CERTAIN
         seen = np.nansum(self.heard.sighting(places, supporting).centre, axis=0)
         centres: FloatArray = seen / np.maximum(supporting.sum(axis=0), 1)[:, None]
-        others = np.hypot(*centres.T) > OWN_M
-        standing: FloatArray = centres[others & (np.hypot(*(centres - places).T) <= REACH_M)]
+        far, outermost = np.hypot(*centres.T), np.abs(centres).max(axis=1, initial=0.0)
+        shown = (far > OWN_M) & (outermost <= self.heard.half_extent_m - EDGE_M)
+        standing: FloatArray = centres[shown & (np.hypot(*(centres - places).T) <= REACH_M)]
         return standing
 
 

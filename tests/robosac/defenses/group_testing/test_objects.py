@@ -158,11 +158,13 @@ def test_a_vehicle_stands_where_the_ego_or_two_know_it(said, holes):
     assert len(Shown(TEAM, REST, hearing(**said)).holes) == holes
 
 
-def test_the_ego_is_no_vehicle_that_is_missing():
-    """Others see it, and no fusion shows it."""
+@pytest.mark.parametrize(
+    ("place", "missing"), [(PLACE, 1), ((0.4, -0.3), 0), ((3.4, -0.3), 1), ((31.4, 4.3), 0), ((4.3, -31.4), 0)]
+)
+def test_what_no_fusion_shows_is_not_missing(place, missing):
+    """The ego itself, which others see, and what is at the edge of its map."""
     seen = dict.fromkeys("abcd", YES)
-    assert [lie.kind for lie in Shown(TEAM, REST, hearing(**seen)).lies] == ["gone"]
-    assert Shown(TEAM, REST, hearing(place=np.array([0.4, -0.3]), **seen)).lies == []
+    assert [lie.kind for lie in Shown(TEAM, REST, hearing(place=np.array(place), **seen)).lies] == missing * ["gone"]
 
 
 def test_all_that_may_be_wrong_is_told_of_a_fusion():
