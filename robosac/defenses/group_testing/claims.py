@@ -127,9 +127,9 @@ class Claims:
     def contradicted(self, suspects: Collection[str] | None = None, weighty: float = WEIGHTY) -> BoolArray:
         """Which boxes (n,) are contradicted, whoever supports them.
 
-        Those with an L of -5.5 or less by the ego are. So are those that the ego denies, or two teammates, if the sum
-        of L without the suspects is at most ``-weighty``; by default without the teammate who supports a box most. What
-        the ego itself supports is not contradicted.
+        Those with an L of -5.5 or less by the ego are. So are those that are denied for certain
+        (`denied_for_certain`), if the sum of L without the suspects is at most ``-weighty``; by default without the
+        teammate who supports a box most. What the ego itself supports is not contradicted.
         """
         heard = self if suspects is None else self.without(suspects)
         rest = self.beside if suspects is None else heard.likelihood.sum(axis=0)

@@ -69,7 +69,7 @@ def conclude(found: Findings, answer: Hypothesis) -> None:
 
 
 def _borne_out(found: Findings, suspect: str, lies: Sequence[Lie], others: int) -> list[Lie]:
-    """The lies that count by the word of those who say so. What is doubtful may be late."""
+    """The lies that count by the word of those who say so; what is doubtful counts as late, which names nobody."""
     counting = []
     for lie in lies:
         word = found.lies.hear(suspect, lie.by, others)

@@ -77,11 +77,10 @@ def _judged(shown: Shown, index: int, status: Standing | None) -> JudgedBox:
     least = max(LEANS, min(said)) if leaning else DENIES
     deniers = tuple(compress(claims.witnesses, map(least.__ge__, said)))
     if status is None:
-        several = len(witnesses) >= 2 or (witnesses and backed and sorted(said)[-2] >= NEARLY_SUPPORTS)
-        if backed if ego else several and not deniers:
-            status = Standing.CONFIRMED
-        else:
-            status = Standing.DISPUTED if deniers else Standing.SINGLE_WITNESS
+        several = len(witnesses) >= 2 or (witnesses and backed and sorted(said)[-2:][0] >= NEARLY_SUPPORTS)
+        known = backed if ego else several and not deniers
+        unknown = Standing.DISPUTED if deniers else Standing.SINGLE_WITNESS
+        status = Standing.CONFIRMED if known else unknown
     return JudgedBox(shown.teammates, index, Support(status=status, witnesses=witnesses, deniers=deniers))
 
 

@@ -15,7 +15,9 @@ from robosac.defenses.group_testing.findings import Findings
 from robosac.defenses.group_testing.knowledge import Knowledge
 from robosac.defenses.group_testing.lies import RULES, Lies
 from robosac.defenses.group_testing.memory import Memory
+from robosac.defenses.group_testing.objects import Hearing, Shown
 from robosac.defenses.group_testing.posterior import Posterior
+from robosac.defenses.group_testing.standing import judge
 from robosac.defenses.group_testing.steadiness import Steadiness
 from tests.robosac.defenses.group_testing.conversing import TEAM, make_model, run_frame
 from tests.robosac.testifying import saying
@@ -258,6 +260,14 @@ def test_a_box_stands_on_what_is_said_of_it(said, status):
     everywhere = [other.support for other in decision.objects if other is not judged]
     assert {each.status for each in everywhere} == {Standing.CONFIRMED}
     assert all(set(each.witnesses) == {EGO, *TEAM} for each in everywhere)
+
+
+def test_where_only_the_ego_is_heard_its_word_is_enough():
+    testimony = World({EGO: YES, "car-2": NO}, lambda _: CAR).testimony
+    shown = Shown(("car-2",), np.vstack([SEEN, CAR]), Hearing(testimony, TEAM))
+    objects, contradicted = judge(shown, [shown])
+    assert {box.support.status for box in objects} == {Standing.CONFIRMED}
+    assert contradicted == ()
 
 
 def test_a_false_box_that_nobody_brings_is_blamed_on_nobody():
