@@ -9,7 +9,7 @@ import math
 import threading
 import time
 from collections.abc import Callable, Iterable, Mapping, Sequence
-from concurrent.futures import Future, ThreadPoolExecutor
+from concurrent.futures import CancelledError, Future, ThreadPoolExecutor
 from copy import copy
 from dataclasses import dataclass
 from functools import partial
@@ -53,6 +53,7 @@ class _Job:
     def __init__(self, work: Work, steps: Steps[FusionResult], others_s: float) -> None:
         self.work = work
         self.done: Future[Decided] = Future()
+        self.outcome: Decided | BaseException = CancelledError()
         self._steps = steps
         self._submitted = time.perf_counter()
         self._had_s = work.had_s
@@ -60,17 +61,17 @@ class _Job:
         """What all had when it was submitted."""
 
     def step(self) -> bool:
-        """Do the next step; whether there are more."""
+        """Do the next step; whether there are more. If not, what came of it waits to be told."""
         began = time.perf_counter()
         try:
             next(self._steps)
         except StopIteration as stop:
             now = time.perf_counter()
             worked_s = self.work.had_s - self._had_s + now - began
-            self.end(Decided(stop.value, worked_s, now - self._submitted - worked_s))
+            self.outcome = Decided(stop.value, worked_s, now - self._submitted - worked_s)
             return False
         except BaseException as error:
-            self.fail(error)
+            self.outcome = error
             return False
         return True
 
@@ -79,15 +80,17 @@ class _Job:
         late_s = now + LEAST * self.work.expected_s - self.work.due
         return self.work.had_s == 0 and 0 < late_s <= others_s - self._others_s
 
-    def end(self, decided: Decided) -> None:
-        """It is decided."""
-        if self.done.set_running_or_notify_cancel():
-            self.done.set_result(decided)
+    def tell(self) -> None:
+        """Tell whoever waits what came of it.
 
-    def fail(self, error: BaseException) -> None:
-        """It cannot be decided."""
-        if self.done.set_running_or_notify_cancel():
-            self.done.set_exception(error)
+        That one may ask for the same work anew at once, so the job must be nobody's any more.
+        """
+        if not self.done.set_running_or_notify_cancel():
+            return
+        if isinstance(self.outcome, Decided):
+            self.done.set_result(self.outcome)
+        else:
+            self.done.set_exception(self.outcome)
 
 
 class Begun:
@@ -252,6 +255,8 @@ class Engine:
                     self._turns.charge(job.work, time.perf_counter() - began)
                     if not goes_on:
                         self._remove(job)
+                if not goes_on:
+                    job.tell()
         except BaseException:
             self._working = False
             raise
@@ -262,7 +267,8 @@ class Engine:
             now = time.perf_counter()
             for job in [job for job in self._jobs.values() if job.is_hopeless(now, self._turns.charged_s)]:
                 self._remove(job)
-                job.fail(Refused(Kind.OVERLOADED, "other frames took the time that this one had", retry_after_s=1))
+                job.outcome = Refused(Kind.OVERLOADED, "other frames took the time that this one had", retry_after_s=1)
+                job.tell()
             self._working = len(self._turns) > 0
             return self._jobs[self._turns.next(now)] if self._working else None
 

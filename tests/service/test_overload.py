@@ -6,6 +6,7 @@ from contextlib import ExitStack
 import pytest
 
 from robosac import wire
+from service import engine as engine_module
 from service.deciding.admission import MARGIN_S, SESSION_FRAMES, Admission
 from service.engine import Engine
 from service.errors import Kind, Refused
@@ -246,3 +247,37 @@ async def test_a_frame_that_others_held_up_until_it_cannot_be_in_time_is_refused
         assert (await engine.decide(Slow(2, 0.02), 0, None, {}, 0, None, work=nobodys_fault)).result == "decided"
     finally:
         engine.stop()
+
+
+async def test_work_may_be_asked_for_anew_as_soon_as_it_is_decided(monkeypatch):
+    """As where the session changed meanwhile: the engine is done with it then, however slowly it goes on."""
+    step = engine_module._Job.step
+
+    def slow(job):
+        goes_on = step(job)
+        if not goes_on:
+            time.sleep(0.05)
+        return goes_on
+
+    monkeypatch.setattr(engine_module._Job, "step", slow)
+    engine, work = Engine(1), Work("key", "s", math.inf, 0.0)
+    try:
+        for _ in range(3):
+            again = engine.decide(Slow(2, 0.0), 0, None, {}, 0, None, work=work)
+            assert (await asyncio.wait_for(again, 5)).result == "decided"
+            assert work.over
+        failing = engine.decide(Failing(), 0, None, {}, 0, None, work=work)
+        with pytest.raises(ZeroDivisionError):
+            await asyncio.wait_for(failing, 5)
+        again = engine.decide(Slow(2, 0.0), 0, None, {}, 0, None, work=work)
+        assert (await asyncio.wait_for(again, 5)).result == "decided"
+    finally:
+        engine.stop()
+
+
+class Failing:
+    """A session whose frames cannot be decided."""
+
+    def decide_in_steps(self, *_, **__):
+        yield
+        raise ZeroDivisionError
