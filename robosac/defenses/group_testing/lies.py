@@ -184,6 +184,8 @@ class Lies:
         self.left_out.pop(teammate, None)
         self.audited.pop(teammate, None)
         self.accusers.pop(teammate, None)
+        for said in self.accusers.values():
+            said.pop(teammate, None)
 
     def to_state(self) -> dict[str, Any]:
         """JSON values that `from_state` reads."""

@@ -302,6 +302,14 @@ def test_two_that_deny_together_what_others_see_frame_nobody(victims):
     assert max(decision.suspicion[name] for name in victims) < 0.1
 
 
+def test_two_that_say_again_and_again_that_another_moves_a_vehicle_do_not_get_it_named():
+    """A third one that says so does."""
+    driving = dict.fromkeys(("car-2", "car-3"), YES)
+    two, three = (World(said, with_liar(ASIDE, NEAR), speed=1.0) for said in (driving, {**driving, "rsu": YES}))
+    assert not any(decision.named for decision, _ in two.play(20))
+    assert any(LIAR in decision.named for decision, _ in three.play(20))
+
+
 def test_nobody_is_suspected_where_nothing_is_wrong():
     met = World(dict.fromkeys((EGO, *TEAM), YES), lambda _: CAR).play(15)
     last, tested = met[-1]

@@ -215,5 +215,7 @@ def test_who_accused_whom_is_kept_until_that_one_leaves():
     assert kept.hear("a", ("b", "c"), 4) is Word.NOTHING
     kept.forget("a")
     assert kept.hear("a", ("b", "c"), 4) is Word.DOUBTFUL
+    kept.forget("c")
+    assert kept.accusers == {"a": {"b": 1}}
     older = {key: value for key, value in lies.to_state().items() if key != "accusers"}
     assert Lies.from_state(older).accusers == {}
