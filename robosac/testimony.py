@@ -124,16 +124,34 @@ class Testimony:
         """
         shape = len(self.agents), len(points)
         who, where = np.nonzero(np.ones(shape, dtype=bool) if asked is None else asked)
+        seen, off_by = self._nearest(who, points[where], slice(X, LAYERS))
+        centre, off = np.full((*shape, 2), np.nan), np.full((2, *shape), np.nan, dtype=self.maps.dtype)
+        centre[who, where] = seen.T
+        off[:, who, where] = np.exp(off_by)
+        return Sighting(centre, *off)
+
+    def centres(self, points: FloatArray, asked: BoolArray) -> FloatArray:
+        """The mean (n, 2) of where those asked (agents, n) see the vehicles at places (n, 2), ego frame; somebody is
+        asked of each.
+        """
+        who, where = np.nonzero(asked)
+        (x, y), _ = self._nearest(who, points[where], slice(X, ALONG))
+        total = [np.bincount(where, weights=of, minlength=len(points)) for of in (x, y)]
+        mean: FloatArray = np.stack(total, axis=1) / asked.sum(axis=0)[:, None]
+        return mean
+
+    def _nearest(self, who: IntArray, points: FloatArray, layers: slice) -> tuple[FloatArray, FloatArray]:
+        """What the agents (n,), by their numbers, have in the places of their maps nearest to each its point (n, 2): of
+        the layers, of which the first two are `X` and `Y`, the centre (2, n), ego frame, and the others (k, n) as they
+        are.
+        """
         size = np.array(self.maps.shape[:-3:-1])[:, None]
         cell = 2 * self.half_extent_m / size
-        place = (_moved(self.from_ego[who], points[where].T) + self.half_extent_m) / cell
+        place = (_moved(self.from_ego, who, points.T) + self.half_extent_m) / cell
         nearest = np.minimum(np.maximum(place.astype(np.int64), 0), size - 1)
-        found = self.maps[who, :, nearest[1], nearest[0]].T
-        seen = (nearest + 0.5) * cell - self.half_extent_m + found[X : Y + 1]
-        centre, off = np.full((*shape, 2), np.nan), np.full((2, *shape), np.nan, dtype=self.maps.dtype)
-        centre[who, where] = _moved(self._to_ego[who], seen).T
-        off[:, who, where] = np.exp(found[ALONG : ACROSS + 1])
-        return Sighting(centre, *off)
+        found = self.maps[who, layers, nearest[1], nearest[0]].T
+        seen = (nearest + 0.5) * cell - self.half_extent_m + found[:2]
+        return _moved(self._to_ego, who, seen), found[2:]
 
     def of(self, agents: Collection[str]) -> Testimony:
         """That of some of them alone."""
@@ -150,9 +168,9 @@ class Testimony:
         )
 
 
-def _moved(planes: FloatArray, points: FloatArray) -> FloatArray:
-    """Points (2, n), each moved as its plane of (n, 3, 3) is."""
-    turn = planes[:, :2].T
+def _moved(planes: FloatArray, which: IntArray, points: FloatArray) -> FloatArray:
+    """Points (2, n), each moved as its plane is: which (n,) of some (m, 3, 3)."""
+    turn = planes[:, :2].T.take(which, axis=2)
     moved: FloatArray = turn[0] * points[0] + turn[1] * points[1] + turn[2]
     return moved
 

@@ -28,6 +28,8 @@ DEFAULT_POSE_ERROR_M = 0.2
 """To expect more error than there is costs some sharpness; to expect less names honest teammates."""
 COMPARABLE_PERIOD_MS = 250.0
 """Longest period of frames of which one is like the next, as calibrated at 200 ms."""
+HIJACKED_OF = 10
+"""In larger teams as many teammates are hijacked from frame to frame as in a team of so many."""
 
 
 class GroupTestingSettings(DefenseSettings):
@@ -40,7 +42,13 @@ class GroupTestingSettings(DefenseSettings):
     attacker_prior: float = Field(
         0.25, gt=0, lt=1, description="Probability of each teammate to attack if anybody does."
     )
-    hijack: float = Field(0.003, ge=0, le=0.5, description="Per frame, that a benign teammate becomes an attacker.")
+    hijack: float = Field(
+        0.003,
+        ge=0,
+        le=0.5,
+        description="Per frame, that a benign teammate becomes an attacker; of a team of more than "
+        f"{HIJACKED_OF}, so much less that as many do as of {HIJACKED_OF}.",
+    )
     recovery: float = Field(0.001, ge=0, le=0.5, description="Per frame, that an attacker becomes benign.")
     kind_change: float = Field(0.02, ge=0, le=0.5, description="Per frame, that the kind of attack changes.")
     budgets: ClassVar[tuple[str, ...]] = ("first_budget", "budget")
@@ -103,8 +111,8 @@ class GroupTestingSettings(DefenseSettings):
 class GroupTesting:
     """Bayesian group testing over the team, with memory; the number of attackers is not assumed.
 
-    1. The posterior over (who attacks, whose view is complementary, kind of attack) goes one frame on: hijacks,
-       recoveries.
+    1. The posterior over (who attacks, whose view is complementary, kind of attack) goes one frame on: hijacks, as many
+       in a large team as in one of `HIJACKED_OF`, or somebody would always be in doubt there; recoveries.
     2. The next subset is the one with the greatest ``max(0, U(m) - best U so far) + .06 bits(m) - .004``: what it gains
        as an answer, and what it is expected to tell. Nothing above 0, the frame's budget, or the deadline ends the
        search.
@@ -189,7 +197,8 @@ class GroupTesting:
         self._welcome(posterior, memory, team)
         first = memory.frame == 0
         if not first:
-            posterior.step(Hazards(settings.hijack, settings.recovery, settings.kind_change))
+            hijack = settings.hijack * HIJACKED_OF / max(HIJACKED_OF, len(posterior.members))
+            posterior.step(Hazards(hijack, settings.recovery, settings.kind_change))
             memory.strangeness.step()
         posterior.regroup(unresolved(posterior.marginals()))
         known = Knowledge(self.model, posterior, memory)

@@ -151,7 +151,7 @@ def come_and_gone(
     """
     came = _nowhere(now[now[:, 3] >= NEW_SCORE], before)
     gone = _nowhere(before[before[:, 3] >= WITNESS_SCORE], now)
-    if real is None:
+    if real is None or not len(came) + len(gone):
         return came, gone
     counts = ~real(np.concatenate([came, gone]))
     return came[counts[: len(came)]], gone[counts[len(came) :]]

@@ -118,8 +118,7 @@ class Hearing:
         order = enough[np.argsort(-total[enough], kind="stable")]
         places = self.heard.ego_places()[rows[order], columns[order]]
         supporting = over[:, order] >= CERTAIN
-        seen = np.nansum(self.heard.sighting(places, supporting).centre, axis=0)
-        centres: FloatArray = seen / np.maximum(supporting.sum(axis=0), 1)[:, None]
+        centres = self.heard.centres(places, supporting)
         far, outermost = np.hypot(*centres.T), np.abs(centres).max(axis=1, initial=0.0)
         shown = (far > OWN_M) & (outermost <= self.heard.half_extent_m - EDGE_M)
         standing: FloatArray = centres[shown & (np.hypot(*(centres - places).T) <= REACH_M)]

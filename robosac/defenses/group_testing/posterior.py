@@ -145,7 +145,8 @@ class Posterior(Distribution):
         team = int(self._sizes.sum())
         nobody, after = self._tables[:, :1], self._tables[:, 1:]
         after = sets.through(after, kernel, self._sizes)
-        self._mix(after, sets.awakened(nobody, team, hazards.hijack, self._attacker_prior, self._sizes))
+        awakened = sets.awakened(nobody, team, hazards.hijack, self._attacker_prior, self._sizes)
+        self._mix(after, awakened, (1 - hazards.hijack) ** team)
         change = hazards.change if self._kinds > 1 else 0.0
         attacked, under_attack = self._weights[1:], self._tables[:, 1:]
         flow = (1 - change) * attacked[:, None] * under_attack
@@ -182,7 +183,7 @@ class Posterior(Distribution):
         padded = np.zeros((len(team), 1, self._tables.shape[2]))
         for one, table in zip(padded, awakened, strict=True):
             one[:, : table.shape[1]] = table
-        self._mix(self._tables[:, 1:], padded)
+        self._mix(self._tables[:, 1:], padded, 1 - alone)
 
     def remove(self, name: str) -> None:
         """Let a teammate leave: what is known of the others stays."""
@@ -224,16 +225,20 @@ class Posterior(Distribution):
             team.append(Block(block["members"], table))
         return cls(len(weights) - 1, attack_prior, attacker_prior, known=(weights, team))
 
-    def _mix(self, after: FloatArray, awakened: FloatArray) -> None:
+    def _mix(self, after: FloatArray, awakened: FloatArray, still: float) -> None:
         """Let attacked teams go on as in ``after`` (B, K, 3 ** n), and a benign team as in ``awakened`` (B, 1, 3 ** n),
-        in which attackers may have awoken or not.
+        in which attackers may have awoken, or nobody with the probability ``still``.
+
+        Whether anybody has is one question to all blocks, so it goes into the weights: by the tables of many blocks,
+        each for itself, somebody would be far likelier.
         """
-        new = self._weights[0] / self._kinds
+        nobody = self._tables[:, :1]
+        new = self._weights[0] * (1 - still) / self._kinds
         old = self._weights[1:]
-        total = np.maximum(old + new, _TINY)[:, None]
-        mixed = (old[:, None] * after + new * awakened) / total
-        tables = np.concatenate([self._tables[:, :1], mixed], axis=1)
-        self._replace(np.concatenate([[0.0], old + new]), tables)
+        share = (new / np.maximum(old + new, _TINY))[:, None]
+        attacked = np.maximum(awakened - still * nobody, 0.0) / max(1 - still, _TINY)
+        tables = np.concatenate([nobody, after + share * (attacked - after)], axis=1)
+        self._replace(np.concatenate([[self._weights[0] * still], old + new]), tables)
         self._settle()
 
     def _settle(self) -> None:

@@ -162,6 +162,13 @@ def test_learning_across_blocks_keeps_the_marginals_exact(rng):
         assert posterior.nobody == pytest.approx(brute.nobody, abs=1e-4)
 
 
+@pytest.mark.parametrize("size", [4, 12, 50])
+def test_an_attack_begins_as_often_whatever_the_blocks(size):
+    posterior = Posterior(KINDS, 1e-9, 0.25, [f"v{i:02d}" for i in range(size)])
+    posterior.step(HAZARDS)
+    assert 1 - posterior.nobody == pytest.approx(1 - (1 - HAZARDS.hijack) ** size, rel=0.12)
+
+
 def test_state_survives_json(rng):
     posterior = Posterior(KINDS, 0.5, 0.25, TEAM)
     for a, d, log_likelihood in random_tests(rng, TEAM, 4):

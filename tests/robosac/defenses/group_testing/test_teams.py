@@ -5,6 +5,7 @@ import pytest
 from robosac.answers import Source, Verdict
 from robosac.defenses import GroupTesting, Outcome
 from robosac.defenses.group_testing import OPEN, GroupTestingSettings
+from robosac.defenses.group_testing.defense import HIJACKED_OF
 from robosac.defenses.group_testing.memory import FORGETTING_FRAMES
 from tests.robosac.defenses.group_testing.conversing import SEEN, TEAM, make_model, outcome, run_frame
 from tests.robosac.defenses.group_testing.sessions import DEFENSE, named, run, with_settings
@@ -126,6 +127,22 @@ def test_a_larger_team_tests_first_and_answers_with_what_is_clean(rng):
     small, _ = run(DEFENSE, ["car-3"], 1, rng)
     _, tested = run(DEFENSE, ["car-3"], 1, rng, small.state, most=1)
     assert set(tested[0][0].teammates) <= set(small.state["trusted"])
+
+
+def test_as_many_are_hijacked_in_a_large_team_as_in_one_of_ten(rng):
+    """Nothing is tested: what is suspected comes from hijacks alone."""
+
+    def attacked(size):
+        team = tuple(f"v{i:02d}" for i in range(size))
+        state = DEFENSE.initial_state(team)
+        weights = [1.0, *[0.0] * (len(state["posterior"]["weights"]) - 1)]
+        benign = {"posterior": {**state["posterior"], "weights": weights}, "memory": {**state["memory"], "frame": 1}}
+        decision, _ = run(DEFENSE, [], 1, rng, {**state, **benign}, team=team, most=0)
+        return 1.0 - decision.state["posterior"]["weights"][0]
+
+    three, six, ten, fifty = (attacked(size) for size in (3, 6, HIJACKED_OF, 50))
+    assert six == pytest.approx(2 * three, rel=0.02)
+    assert (ten, fifty) == pytest.approx((10 / 6 * six, ten), rel=0.2)  # blocks are an approximation
 
 
 @pytest.mark.parametrize(
