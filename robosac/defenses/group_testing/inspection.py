@@ -6,6 +6,7 @@ from collections.abc import Collection, Iterator, Sequence
 
 import numpy as np
 
+from robosac.defenses.group_testing.candidates import UNRESOLVED
 from robosac.defenses.group_testing.conclusions import conclude
 from robosac.defenses.group_testing.findings import Findings
 from robosac.defenses.group_testing.objects import Lie, Shown
@@ -86,14 +87,17 @@ class Inspection:
     def _again(self, answer: Hypothesis) -> list[Hypothesis]:
         """What is to be decoded to ask those again that are neither in the answer nor named: of those only in doubt,
         beside the answer, in one frame as many together as are more likely all honest than not, in the next the least
-        suspected; each of the two most suspected ones, or that lied lately, alone and beside the answer.
+        suspected, in a large team of those who are not as good as cleared; each of the two most suspected ones, or that
+        lied lately, alone and beside the answer.
         """
         posterior, suspicion = self._found.known.posterior, self._found.known.suspicion()
         left = [name for name in self._found.team if name not in answer and name not in self._found.named]
         left.sort(key=lambda name: round(suspicion[name], 9))
         suspects = [name for name in left if suspicion[name] > SUSPECT or self._found.lies.worst(name)]
         doubtful = [name for name in left if name not in suspects]
-        asked = [self._with(answer, doubtful[:1])] if doubtful else []
+        large = len(self._found.team) > EXACT
+        alone = [name for name in doubtful if not large or suspicion[name] >= UNRESOLVED[0]][:1]
+        asked = [self._with(answer, alone)] if alone else []
         # every other frame, or a liar among them would spoil every test
         turn = self._found.hearing is None or self._found.known.memory.frame % 2 == 0
         if len(doubtful) > 1 and turn:

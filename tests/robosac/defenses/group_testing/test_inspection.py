@@ -12,9 +12,11 @@ from robosac.defenses.group_testing import GroupTesting, GroupTestingSettings
 from robosac.defenses.group_testing.conclusions import conclude
 from robosac.defenses.group_testing.evidence import Evidence
 from robosac.defenses.group_testing.findings import Findings
+from robosac.defenses.group_testing.inspection import Inspection
 from robosac.defenses.group_testing.knowledge import Knowledge
 from robosac.defenses.group_testing.lies import RULES, Lies
 from robosac.defenses.group_testing.memory import Memory
+from robosac.defenses.group_testing.model import CELLS, CLEAN
 from robosac.defenses.group_testing.objects import Hearing, Shown
 from robosac.defenses.group_testing.posterior import Posterior
 from robosac.defenses.group_testing.standing import judge
@@ -308,6 +310,24 @@ def test_two_that_say_again_and_again_that_another_moves_a_vehicle_do_not_get_it
     two, three = (World(said, with_liar(ASIDE, NEAR), speed=1.0) for said in (driving, {**driving, "rsu": YES}))
     assert not any(decision.named for decision, _ in two.play(20))
     assert any(LIAR in decision.named for decision, _ in three.play(20))
+
+
+@pytest.mark.parametrize(("size", "one_by_one"), [(6, True), (8, False)])
+def test_those_cleared_of_a_large_team_are_asked_again_together_only(size, one_by_one):
+    """Every other frame all that are left out are asked together, in between one of those in doubt."""
+    team = tuple(f"v{i}" for i in range(size))
+    posterior, answer = Posterior(len(MODEL.kinds), 1e-3, 0.25, team), team[:4]
+
+    def asked(frame):
+        found = Findings(Knowledge(MODEL, posterior, Memory(frame=frame)), Lies(), team, ())
+        found.hearing = Hearing(HONEST.testimony, ())
+        return Inspection(found, keep_contradicted=False).next_test(answer)
+
+    assert asked(2) == team
+    assert asked(3) == (team[:5] if one_by_one else None)
+    accusing = np.repeat([0.0, 4.7], [CLEAN, CELLS * len(MODEL.kinds)])
+    posterior.update(*(np.array([name in of for name in posterior.members]) for of in ((), team[-1:])), accusing)
+    assert asked(3) == (team[:5] if one_by_one else (*answer, team[-1]))
 
 
 def test_nobody_is_suspected_where_nothing_is_wrong():

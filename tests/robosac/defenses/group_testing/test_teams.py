@@ -97,6 +97,14 @@ def test_fifty_teammates(rng):
     assert len(json.dumps(state)) < 100_000
 
 
+@pytest.mark.parametrize("size", [20, 50])
+def test_a_large_honest_team_is_answered_whole_and_takes_few_tests(rng, size):
+    team = tuple(f"v{i:02d}" for i in range(size))
+    decision, tested = run(DEFENSE, [], 12, rng, team=team)
+    assert decision.accepted == team
+    assert sum(map(len, tested[1:])) < 1.6 * len(tested[1:])
+
+
 TWENTY = tuple(f"v{i:02d}" for i in range(20))
 
 
