@@ -13,9 +13,11 @@ from robosac.boxes import FloatArray, IntArray, from_world, pose_matrix
 from robosac.scenes.base import Split, View
 from robosac.scenes.lidar import Lidar
 from robosac.scenes.splits import TEST_SEEDS, TRAINING_SEEDS, VALIDATION_SEEDS
-from robosac.scenes.world import CAR_SENSOR_HEIGHT_M, RSU_HEIGHT_M, Traffic, build_traffic
+from robosac.scenes.world import CAR_SENSOR_HEIGHT_M, RSU_HEIGHT_M, Traffic, draw_traffic
 
 FRAME_PERIOD_S = 0.2
+DRAWS = 1000
+"""Times that traffic is drawn, at most, until enough cars are near each other to carry the sensors."""
 TRUTH_MIN_HITS = 6
 TRUTH_RANGE_M = 31.0
 
@@ -87,15 +89,20 @@ class GeneratedScene(ABC):
         Raises
         ------
         ValueError
-            If no car carries a sensor.
+            If no car shall carry a sensor, or more than there ever are near each other.
         """
         if self.car_agents < 1:
             raise ValueError(f"car_agents must be at least 1, got {self.car_agents}")
-        return self.draw(np.random.default_rng([self.seed, 0]))
+        rng = np.random.default_rng([self.seed, 0])
+        drawn = (self.draw(rng) for _ in range(DRAWS))
+        found = next((traffic for traffic in drawn if traffic is not None), None)
+        if found is None:
+            raise ValueError(f"car_agents must be fewer: in {DRAWS} draws there were never {self.car_agents} cars near")
+        return found
 
     @abstractmethod
-    def draw(self, rng: np.random.Generator) -> Traffic:
-        """Draw the traffic, with as many cars that carry a sensor as there shall be."""
+    def draw(self, rng: np.random.Generator) -> Traffic | None:
+        """Draw the traffic, with as many cars that carry a sensor as there shall be; None if there are too few."""
 
     @property
     def number(self) -> int:
@@ -155,9 +162,9 @@ class IntersectionScene(GeneratedScene):
     ['car-1', 'car-2', 'car-3', 'car-4', 'car-5', 'rsu']
     """
 
-    def draw(self, rng: np.random.Generator) -> Traffic:
-        """The traffic of `build_traffic`."""
-        return build_traffic(rng, self.car_agents)
+    def draw(self, rng: np.random.Generator) -> Traffic | None:
+        """The traffic of `draw_traffic`."""
+        return draw_traffic(rng, self.car_agents)
 
 
 class Synthetic:

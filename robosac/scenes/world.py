@@ -92,7 +92,7 @@ class Traffic:
         return np.column_stack([x, y, self.size[:, :2], self.road_yaw + self.yaw_offset])
 
 
-def build_traffic(rng: np.random.Generator, car_agents: int, flow: Flow = PLAIN_FLOW) -> Traffic:
+def draw_traffic(rng: np.random.Generator, car_agents: int, flow: Flow = PLAIN_FLOW) -> Traffic | None:
     """Draw the traffic of one scene.
 
     Parameters
@@ -102,14 +102,12 @@ def build_traffic(rng: np.random.Generator, car_agents: int, flow: Flow = PLAIN_
         Cars that carry a sensor, at least 1. At most two of them drive on the flowing axis, and those are within 12 m
         of the centre in the middle of a 5 s sequence; the others stand in the queue or at the kerb, within 30 m.
     flow : Flow
+
+    Returns
+    -------
+    Traffic or None
+        None if there are not enough such cars.
     """
-    while True:
-        traffic = _draw(rng, car_agents, flow)
-        if traffic is not None:
-            return traffic
-
-
-def _draw(rng: np.random.Generator, car_agents: int, flow: Flow) -> Traffic | None:
     world_yaw = rng.uniform(-np.pi, np.pi)
     rows: list[tuple[float, float, float, float, bool]] = []  # along, lateral, road_yaw, speed, may be a truck
     for direction in (0.0, np.pi):

@@ -44,14 +44,12 @@ class CarPark(GeneratedScene):
     speed_mps: Speeds | None = None
     """By default that of the density."""
 
-    def draw(self, rng: np.random.Generator) -> Traffic:
-        """Cars are drawn until there are enough for all sensors near the middle."""
-        while True:
-            traffic = self._drawn(rng)
-            anybody = np.ones(len(traffic.size), dtype=bool)
-            chosen = choose_agents(rng, traffic, anybody, self.car_agents, MOVING_RANGE_M, STANDING_RANGE_M)
-            if chosen is not None:
-                return replace(traffic, agent_vehicles=chosen)
+    def draw(self, rng: np.random.Generator) -> Traffic | None:
+        """Cars, if there are enough for all sensors near the middle."""
+        traffic = self._drawn(rng)
+        anybody = np.ones(len(traffic.size), dtype=bool)
+        chosen = choose_agents(rng, traffic, anybody, self.car_agents, MOVING_RANGE_M, STANDING_RANGE_M)
+        return None if chosen is None else replace(traffic, agent_vehicles=chosen)
 
     def _drawn(self, rng: np.random.Generator) -> Traffic:
         world_yaw = rng.uniform(-np.pi, np.pi)

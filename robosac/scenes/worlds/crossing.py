@@ -8,7 +8,7 @@ from dataclasses import dataclass, replace
 import numpy as np
 
 from robosac.scenes.intersection import GeneratedScene
-from robosac.scenes.world import PLAIN_FLOW, Flow, Speeds, Traffic, build_traffic
+from robosac.scenes.world import PLAIN_FLOW, Flow, Speeds, Traffic, draw_traffic
 from robosac.scenes.worlds.density import Density
 
 FLOWS: Mapping[Density, Flow] = {
@@ -28,9 +28,9 @@ class Crossing(GeneratedScene):
     speed_mps: Speeds | None = None
     """Of the flowing axis; by default that of the density."""
 
-    def draw(self, rng: np.random.Generator) -> Traffic:
-        """The traffic of `build_traffic` with another flow."""
+    def draw(self, rng: np.random.Generator) -> Traffic | None:
+        """The traffic of `draw_traffic` with another flow."""
         flow = FLOWS[self.density]
         if self.speed_mps is not None:
             flow = replace(flow, speed_mps=self.speed_mps)
-        return build_traffic(rng, self.car_agents, flow)
+        return draw_traffic(rng, self.car_agents, flow)

@@ -69,16 +69,16 @@ class Highway(GeneratedScene):
     speed_mps: Speeds | None = None
     """By default that of the density."""
 
-    def draw(self, rng: np.random.Generator) -> Traffic:
-        """Lanes are drawn until there are enough cars near each other that drive in one direction."""
-        while True:
-            traffic = self._drawn(rng)
-            mid = np.hypot(*traffic.vehicles_at(MID_SCENE_S)[:, :2].T)
-            cars = traffic.size[:, 2] < 2.0  # lorries are higher
-            near = np.flatnonzero(cars & (traffic.ahead > 0) & (mid < AGENT_RANGE_M))
-            if len(near) >= self.car_agents:
-                chosen = near[np.argsort(mid[near])][: self.car_agents]
-                return replace(traffic, agent_vehicles=rng.permutation(chosen))
+    def draw(self, rng: np.random.Generator) -> Traffic | None:
+        """Lanes, if there are enough cars near each other that drive in one direction."""
+        traffic = self._drawn(rng)
+        mid = np.hypot(*traffic.vehicles_at(MID_SCENE_S)[:, :2].T)
+        cars = traffic.size[:, 2] < 2.0  # lorries are higher
+        near = np.flatnonzero(cars & (traffic.ahead > 0) & (mid < AGENT_RANGE_M))
+        if len(near) < self.car_agents:
+            return None
+        chosen = near[np.argsort(mid[near])][: self.car_agents]
+        return replace(traffic, agent_vehicles=rng.permutation(chosen))
 
     def _drawn(self, rng: np.random.Generator) -> HighwayTraffic:
         world_yaw = rng.uniform(-np.pi, np.pi)

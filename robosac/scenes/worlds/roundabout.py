@@ -109,15 +109,13 @@ class Roundabout(GeneratedScene):
     speed_mps: Speeds | None = None
     """By default that of the density."""
 
-    def draw(self, rng: np.random.Generator) -> Traffic:
-        """Vehicles are drawn until there are enough cars near the circle."""
-        while True:
-            traffic = self._drawn(rng)
-            cars = traffic.size[:, 2] < 2.0  # lorries are higher
-            near, parked = traffic.radius + MOVING_RANGE_M, traffic.radius + PARKED_FROM_M + 1.5 * PARKED_PITCH_M
-            chosen = choose_agents(rng, traffic, cars, self.car_agents, near, parked, MOVING_AGENTS)
-            if chosen is not None:
-                return replace(traffic, agent_vehicles=chosen)
+    def draw(self, rng: np.random.Generator) -> Traffic | None:
+        """Vehicles, if there are enough cars near the circle."""
+        traffic = self._drawn(rng)
+        cars = traffic.size[:, 2] < 2.0  # lorries are higher
+        near, parked = traffic.radius + MOVING_RANGE_M, traffic.radius + PARKED_FROM_M + 1.5 * PARKED_PITCH_M
+        chosen = choose_agents(rng, traffic, cars, self.car_agents, near, parked, MOVING_AGENTS)
+        return None if chosen is None else replace(traffic, agent_vehicles=chosen)
 
     def _drawn(self, rng: np.random.Generator) -> RoundaboutTraffic:
         world_yaw, radius = rng.uniform(-np.pi, np.pi), rng.uniform(*RADIUS_M)

@@ -182,6 +182,8 @@ def test_nonsense_is_refused():
     for layout in LAYOUTS:
         with pytest.raises(ValueError, match="at least 1"):
             layout(0, car_agents=0).frame(0)
+        with pytest.raises(ValueError, match="never 70 cars"):
+            layout(0, car_agents=70).frame(0)
 
 
 @pytest.mark.parametrize("name", ["highway", "roundabout", "car-park"])
