@@ -1,0 +1,207 @@
+"""Who is blamed for a false object, and named, and who is not."""
+
+from dataclasses import replace
+
+import numpy as np
+import pytest
+
+from robosac.answers import Verdict
+from robosac.defenses import EGO, Outcome
+from robosac.defenses.group_testing.conclusions import conclude
+from robosac.defenses.group_testing.evidence import Evidence
+from robosac.defenses.group_testing.findings import Findings
+from robosac.defenses.group_testing.knowledge import Knowledge
+from robosac.defenses.group_testing.lies import RULES, Lies
+from robosac.defenses.group_testing.memory import Memory
+from robosac.defenses.group_testing.posterior import Posterior
+from robosac.defenses.group_testing.steadiness import Steadiness
+from tests.robosac.defenses.group_testing.conversing import TEAM
+from tests.robosac.defenses.group_testing.one_place import (
+    ASIDE,
+    CAR,
+    DRIVING_MOVED,
+    DRIVING_VEILED,
+    ERASED,
+    GHOST,
+    LIAR,
+    MODEL,
+    MOVED,
+    NEAR,
+    NO,
+    PLACE,
+    SEEN,
+    UNSAID,
+    VEILED,
+    YES,
+    World,
+    nothing,
+    seen_by,
+    there,
+    with_liar,
+)
+from tests.robosac.testifying import saying
+
+
+@pytest.mark.parametrize(("world", "kind"), [(GHOST, "ghost"), (ERASED, "gone"), (DRIVING_MOVED, "moved")])
+def test_who_lies_about_an_object_is_named_and_nobody_else(world, kind):
+    met = world.play(10)
+    assert {name for decision, _ in met for name in decision.named} == {LIAR}
+    last, _ = met[-1]
+    assert set(last.accepted) == set(TEAM) - {LIAR}
+    assert max(p for name, p in last.suspicion.items() if name != LIAR) < 0.5
+    items = [item for item in last.state["memory"]["evidence"][LIAR] if item["test"] == "objects"]
+    assert all(item["log_likelihood_ratio"] > 0 for item in items)
+    assert all(item["kinds"] or item["conflicts"] for item in items)
+    audited = [item for item in items if item["kinds"]]
+    assert audited
+    for item in audited:
+        assert set(item["kinds"]) == {kind}
+        assert item["places"][0] == pytest.approx(PLACE + [world.speed * item["frame"], 0.0], abs=2.0)
+
+
+@pytest.mark.parametrize("kind", ["moved", "veiled", "gone"])
+def test_who_is_wrong_about_one_thing_only_is_left_out_and_not_named(kind):
+    met = {"moved": MOVED, "veiled": VEILED, "gone": UNSAID}[kind].play(60)
+    assert not any(decision.named for decision, _ in met)
+    assert any(
+        kind in item["kinds"] for item in met[-1][0].state["memory"]["evidence"][LIAR] if item["test"] == "objects"
+    )
+    assert any(LIAR not in decision.accepted for decision, _ in met)
+
+
+def test_without_testimony_a_lie_names_nobody():
+    """A single object is below what whole fusions show."""
+    world = World({}, GHOST.shows)
+    world.testimony = None
+    met = world.play(10)
+    assert {name for decision, _ in met for name in decision.named} == set()
+    assert all(decision.objects is None and decision.contradicted == () for decision, _ in met)
+
+
+def test_a_false_box_that_nobody_brings_is_blamed_on_nobody():
+    """The detector itself shows it, with and without each of them; after a while nobody is asked any more."""
+    met = World({EGO: NO, "car-2": NO, "rsu": NO}, lambda subset: CAR).play(12)
+    assert all(decision.named == () for decision, _ in met)
+    assert max(met[-1][0].suspicion.values()) < 0.5
+    assert set(met[-1][0].accepted) == set(TEAM)
+    assert min(len(tested) for _, tested in met[1:]) < len(met[0][1])
+
+
+def test_two_that_say_again_and_again_that_another_moves_a_vehicle_do_not_get_it_named():
+    """A third one that says so does."""
+    driving = dict.fromkeys(("car-2", "car-3"), YES)
+    two, three = (World(said, with_liar(ASIDE, NEAR), speed=1.0) for said in (driving, {**driving, "rsu": YES}))
+    assert not any(decision.named for decision, _ in two.play(20))
+    assert any(LIAR in decision.named for decision, _ in three.play(20))
+
+
+def test_who_moves_all_boxes_a_little_is_left_out():
+    """Each box is nearly in its place, and overlaps what it was."""
+    world = World({}, nothing)
+    world.judge = shifted(world.judge, 0.4)
+    met = world.play(8)
+    last, _ = met[-1]
+    assert LIAR not in last.accepted
+    assert all(p < 0.5 for name, p in last.suspicion.items() if name != LIAR)
+    assert {name for decision, _ in met for name in decision.named} == set()
+
+
+def shifted(judge, aside):
+    """The same outcomes, with boxes moved across themselves where the liar is fused."""
+
+    def moved(subset, *more):
+        outcome = judge(subset, *more)
+        off = np.array([0, aside, 0, 0, 0, 0]) if LIAR in subset else 0.0
+        return replace(outcome, boxes=outcome.boxes + off)
+
+    return moved
+
+
+def knowledge():
+    return Knowledge(MODEL, Posterior(len(MODEL.kinds), 0.5, 0.25, TEAM), Memory())
+
+
+def concluded(world, answer, *subsets):
+    """What is found out by these fusions."""
+    found = Findings(knowledge(), Lies(), tuple(TEAM), ())
+    for subset in (answer, *subsets):
+        found.learn(world.judge(subset, None, 0))
+    conclude(found, answer)
+    return found
+
+
+def test_a_hole_is_left_alone_only_after_those_who_see_a_vehicle_there_were_asked():
+    unseen = World({"car-2": YES, "car-3": YES}, nothing)
+    assert concluded(unseen, ("rsu", "car-5")).lies.quiet == []
+    assert concluded(unseen, ("car-2", "car-3", "rsu")).lies.quiet == []
+    assert len(concluded(unseen, ("car-2", "car-3", "rsu"), ("car-2", "car-3")).lies.quiet) == 1
+
+
+def test_beside_few_others_nobody_is_to_blame_for_what_is_gone():
+    few, more = ("car-2", "car-3"), ("car-2", "car-3", "rsu")
+    assert "gone" not in concluded(ERASED, (*few, LIAR), few).lies.levels.get(LIAR, {})
+    assert "gone" in concluded(ERASED, (*more, LIAR), more).lies.levels[LIAR]
+
+
+@pytest.mark.parametrize(("seen_by_others", "unsteady"), [(True, False), (False, True)])
+def test_who_flickers_where_others_see_vehicles_is_not_unsteady(seen_by_others, unsteady):
+    knowing = {EGO, *TEAM} if seen_by_others else {LIAR}
+    testimony = saying(
+        {name: [(x, y, YES) for x, y in SEEN[:, :2]] if name in knowing else [] for name in (EGO, *TEAM)}
+    )
+    found = Findings(knowledge(), Lies(), tuple(TEAM), ())
+    for frame, boxes in enumerate((SEEN, SEEN[:0])):
+        told = {"testimony": testimony, "alone": SEEN}
+        outcome = Outcome((LIAR,), 0.93, Verdict.CONSENSUS, boxes, SEEN, np.eye(4), frame, **told)
+        evidence = Evidence(found.known)
+        evidence.learn(outcome, found.learn(outcome))
+        evidence.compare_singles()
+        found.known.memory.shown, found.known.memory.shown_in = evidence.shown, frame
+    assert (LIAR in found.known.memory.steadiness.levels) == unsteady
+
+
+def test_a_ghost_is_blamed_beside_few_others_too():
+    assert "ghost" in concluded(GHOST, ("car-2", "car-3", LIAR), ("car-2", "car-3")).lies.levels[LIAR]
+
+
+def test_who_denies_its_own_ghosts_is_named_too():
+    met = DRIVING_VEILED.play(12)
+    assert {name for decision, _ in met for name in decision.named} == {LIAR}
+    items = [item for item in met[-1][0].state["memory"]["evidence"][LIAR] if item["test"] == "objects"]
+    assert {kind for item in items for kind in item["kinds"]} == {"veiled"}
+
+
+@pytest.mark.parametrize("denied", [{"": NO}, {"car-2": NO, "car-3": NO, "": -4.0}])
+def test_two_that_vouch_for_each_others_ghost_are_both_named(denied):
+    """Leaving out one of them changes nothing: the other one shows it as well."""
+    liars = {LIAR, "rsu"}
+    world = World({**denied, **dict.fromkeys(liars, YES)}, seen_by(*liars))
+    met = world.play(10)
+    assert {name for decision, _ in met for name in decision.named} == liars
+    for decision, tested in met:
+        assert there(decision, tested, decision.objects) == []
+    assert set(met[-1][0].accepted) == set(TEAM) - liars
+
+
+def test_who_moves_a_vehicle_along_itself_may_be_late_and_is_not_named():
+    behind = CAR - [2.0, 0, 0, 0, 0, 0]
+    met = World({"car-2": YES, "car-3": YES, "rsu": YES}, with_liar(behind, NEAR)).play(12)
+    assert {name for decision, _ in met for name in decision.named} == set()
+    last, _ = met[-1]
+    assert LIAR not in last.accepted
+    assert last.suspicion[LIAR] > 0.5
+
+
+@pytest.mark.parametrize(("calm", "times"), [(1.0, RULES["conflict"].times), (0.1, 1)])
+def test_a_conflict_over_one_place_counts_once_beside_an_ego_that_flickers(calm, times, monkeypatch):
+    monkeypatch.setattr(Steadiness, "calm", calm)
+    alone_with_it = World({"car-2": YES, "car-3": YES, "rsu": YES, LIAR: NO}, lambda _: CAR)
+    found = Findings(knowledge(), Lies(), tuple(TEAM), ())
+    counted = []
+    for frame in range(5):
+        found.known.memory.frame = frame
+        found.learn(alone_with_it.judge(tuple(TEAM), None, frame))
+        before = found.lies.levels.get(LIAR, {}).get("conflict", (0.0, 0.0))[0]
+        conclude(found, tuple(TEAM))
+        counted.append(found.lies.levels.get(LIAR, {}).get("conflict", (0.0, 0.0))[0] > before)
+    assert counted == [True] * times + [False] * (5 - times)

@@ -1,0 +1,146 @@
+"""How the box of a place over which they differ stands, and what is answered there."""
+
+import numpy as np
+import pytest
+
+from robosac.answers import Standing
+from robosac.defenses import EGO
+from robosac.defenses.group_testing import GroupTesting, GroupTestingSettings
+from robosac.defenses.group_testing.objects import Hearing, Shown
+from robosac.defenses.group_testing.standing import judge
+from tests.robosac.defenses.group_testing.conversing import TEAM
+from tests.robosac.defenses.group_testing.one_place import (
+    CAR,
+    ERASED,
+    GHOST,
+    LIAR,
+    MODEL,
+    MOVED,
+    NEAR,
+    NO,
+    SEEN,
+    YES,
+    World,
+    seen_by,
+    there,
+)
+
+
+def test_a_ghost_is_in_no_answer():
+    for decision, tested in GHOST.play(6, quiet=6):
+        assert there(decision, tested, decision.objects) == []
+        assert len(decision.objects) == len(SEEN)
+
+
+def test_with_the_liar_in_the_answer_a_ghost_is_contradicted():
+    decision, tested = GHOST.play(1, GroupTesting(MODEL, GroupTestingSettings(inspections=0)), quiet=6)[0]
+    assert LIAR in decision.accepted
+    ((ghost, _),) = there(decision, tested, decision.contradicted)
+    assert ghost.support.status is Standing.CONTRADICTED
+    assert (ghost.support.witnesses, set(ghost.support.deniers)) == ((LIAR,), {EGO, "car-2", "car-3"})
+    assert there(decision, tested, decision.objects) == []
+
+
+TRUE = {ERASED: CAR[0], MOVED: NEAR[0]}
+
+
+@pytest.mark.parametrize("world", TRUE)
+def test_what_a_liar_removes_or_moves_is_answered_where_it_is(world):
+    for decision, tested in world.play(5, quiet=6):
+        ((_, row),) = there(decision, tested, decision.objects)
+        np.testing.assert_array_equal(row, TRUE[world])
+        assert len(decision.objects) == len(SEEN) + 1
+        assert decision.contradicted == ()
+
+
+@pytest.mark.parametrize(("world", "inspections"), [(ERASED, 1), (MOVED, 4)])
+def test_with_the_liar_in_the_answer_a_box_is_repaired(world, inspections):
+    """Taken from a fusion without it, although there was no time to find out who it is."""
+    decision, tested = world.play(1, GroupTesting(MODEL, GroupTestingSettings(inspections=inspections)), quiet=6)[0]
+    assert LIAR in decision.accepted
+    ((judged, row),) = there(decision, tested, decision.objects)
+    assert judged.support.status is Standing.REPAIRED
+    assert LIAR not in judged.subset
+    np.testing.assert_array_equal(row, TRUE[world])
+
+
+@pytest.mark.parametrize(
+    ("said", "status"),
+    [
+        ({EGO: YES, "car-2": NO}, Standing.DISPUTED),
+        ({EGO: 3.5, "car-2": -1.5, "rsu": YES}, Standing.DISPUTED),
+        ({EGO: 3.5, "rsu": YES}, Standing.CONFIRMED),
+        ({"car-2": YES, "rsu": YES}, Standing.CONFIRMED),
+        ({"car-2": YES, "rsu": 2.7, "car-3": 0.5}, Standing.CONFIRMED),
+        ({"car-2": YES, "rsu": 2.7}, Standing.SINGLE_WITNESS),
+        ({"car-2": YES, "rsu": 2.0, "car-3": 2.0}, Standing.SINGLE_WITNESS),
+        ({"car-2": YES}, Standing.SINGLE_WITNESS),
+        ({}, Standing.SINGLE_WITNESS),
+        ({"car-2": YES, "rsu": NO}, Standing.DISPUTED),
+        ({"car-2": YES, "car-3": YES, "rsu": NO}, Standing.DISPUTED),
+        ({EGO: -2.0, "car-2": YES, "car-3": YES}, Standing.DISPUTED),
+        ({EGO: -0.5, "rsu": -0.6, "car-2": YES, "car-3": YES}, Standing.DISPUTED),
+        ({EGO: -2.0, "car-2": YES}, Standing.DISPUTED),
+        ({EGO: -0.5, "car-2": YES, "car-3": YES}, Standing.CONFIRMED),
+        ({EGO: YES, "car-2": -2.0}, Standing.CONFIRMED),
+        ({"car-2": NO, "rsu": NO}, Standing.DISPUTED),
+        ({EGO: -2.0, "car-2": NO, "rsu": NO}, Standing.CONTRADICTED),
+        ({"car-2": NO, "car-3": NO, "rsu": NO}, Standing.CONTRADICTED),
+    ],
+)
+def test_a_box_stands_on_what_is_said_of_it(said, status):
+    decision, tested = World(said, lambda _: CAR).play(1)[0]
+    boxes = decision.contradicted if status is Standing.CONTRADICTED else decision.objects
+    ((judged, _),) = there(decision, tested, boxes)
+    assert judged.support.status is status
+    assert set(judged.support.witnesses) == {name for name, value in said.items() if value >= 3.0}
+    against = status in (Standing.DISPUTED, Standing.CONTRADICTED)
+    least = max(-1.0, min(said.values())) if against else NO
+    assert set(judged.support.deniers) == {name for name, value in said.items() if value <= least}
+    everywhere = [other.support for other in decision.objects if other is not judged]
+    assert {each.status for each in everywhere} == {Standing.CONFIRMED}
+    assert all(set(each.witnesses) == {EGO, *TEAM} for each in everywhere)
+
+
+def test_where_only_the_ego_is_heard_its_word_is_enough():
+    testimony = World({EGO: YES, "car-2": NO}, lambda _: CAR).testimony
+    shown = Shown(("car-2",), np.vstack([SEEN, CAR]), Hearing(testimony, TEAM))
+    objects, contradicted = judge(shown, [shown])
+    assert {box.support.status for box in objects} == {Standing.CONFIRMED}
+    assert contradicted == ()
+
+
+def test_one_who_denies_what_another_sees_is_believed_no_more_than_it():
+    """One word against one: nobody is named, and the box stays."""
+    world = World({"car-2": YES, "rsu": NO}, seen_by("car-2"))
+    for decision, tested in world.play(10):
+        assert decision.named == ()
+        assert decision.contradicted == ()
+        if "car-2" in decision.accepted:
+            assert there(decision, tested, decision.objects)
+
+
+@pytest.mark.parametrize("victims", [("rsu",), ("rsu", "car-5")])
+def test_two_that_deny_together_what_others_see_frame_nobody(victims):
+    """Two words against one or two: nobody is suspected, and the box stays, as one that is disputed."""
+    world = World({"car-2": NO, "car-3": NO, **dict.fromkeys(victims, YES)}, seen_by(*victims))
+    for decision, tested in world.play(12):
+        assert decision.named == ()
+        assert decision.contradicted == ()
+        assert set(victims) <= set(decision.accepted)
+        ((judged, _),) = there(decision, tested, decision.objects)
+        assert judged.support.status is Standing.DISPUTED
+    assert max(decision.suspicion[name] for name in victims) < 0.1
+
+
+ALONE = World({"car-2": YES, LIAR: NO}, lambda subset: CAR[:0] if LIAR in subset else seen_by("car-2")(subset))
+
+
+def test_what_one_sees_and_one_takes_away_is_shown_and_nobody_is_named():
+    """One word against one: whoever takes it away is left out, but may be right."""
+    met = ALONE.play(10)
+    assert {name for decision, _ in met for name in decision.named} == set()
+    assert all(there(decision, tested, decision.objects) for decision, tested in met[2:])
+    last, _ = met[-1]
+    assert LIAR not in last.accepted
+    assert "car-2" in last.accepted
