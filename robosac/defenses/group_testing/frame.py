@@ -80,6 +80,8 @@ class JudgedFrame:
             most = choice.INFORMATION_VALUE * choice.most_information(known, options)
             likely = gained + most >= gained.max() - 2 * _TIE
             options, gained = options[likely], gained[likely]
+            if len(options) == 1 and gained[0] > choice.TEST_COST:  # whatever it tells
+                return known.names(options[0], self._team)
         bits = choice.expected_information(known, options, decoded, ego_sees=ego_sees)
         value = gained + choice.INFORMATION_VALUE * bits - choice.TEST_COST
         if may_wait:
