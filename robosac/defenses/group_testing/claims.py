@@ -25,6 +25,10 @@ EGO_KNOWS = -5.5
 """Where the ego's own L is so low, whoever supports a vehicle is wrong: nobody else has a part in what the ego saw."""
 WEIGHTY = 6.0
 """Testimony of several agents decides from this sum of L on, in either direction."""
+BLAMED_SUM, BLAMED_BESIDE = 8.0, 4.0
+"""Somebody is to blame for a box that the others contradict with the first sum of L, and with the second one without
+the teammate who denies it most.
+"""
 CONFLICT_OWN, CONFLICT_SUM = 4.5, 10.0
 """L of one, and the sum of all others' the other way, from which on they are in conflict."""
 AROUND_M = 0.6
@@ -124,17 +128,31 @@ class Claims:
         against: BoolArray = denied | claimed
         return against
 
-    def contradicted(self, suspects: Collection[str] | None = None, weighty: float = WEIGHTY) -> BoolArray:
+    def contradicted(self) -> BoolArray:
         """Which boxes (n,) are contradicted, whoever supports them.
 
         Those with an L of -5.5 or less by the ego are. So are those that are denied for certain
-        (`denied_for_certain`), if the sum of L without the suspects is at most ``-weighty``; by default without the
-        teammate who supports a box most. What the ego itself supports is not contradicted.
+        (`denied_for_certain`), if the sum of L without the teammate who supports a box most is at most -6. What the ego
+        itself supports is not contradicted.
         """
-        heard = self if suspects is None else self.without(suspects)
-        rest = self.beside if suspects is None else heard.likelihood.sum(axis=0)
-        others = len(heard.witnesses) - (2 if suspects is None else 1)
-        denied = (rest <= -weighty) & heard.denied_for_certain(others) & ~self.supporting[0]
+        return self._contradicted(self.beside <= -WEIGHTY, len(self.witnesses) - 2)
+
+    def contradicted_by_others(self, suspects: Collection[str]) -> BoolArray:
+        """Which boxes (n,) are so contradicted by all but the suspects that somebody is to blame for them.
+
+        The sum of their L is at most -8, and at most -4 without the teammate who denies a box most: whoever lies may
+        deny what another one alone sees, and the ego may lean to it.
+        """
+        others = self.without(suspects)
+        total = others.likelihood.sum(axis=0)
+        most = others.likelihood[1:].min(axis=0, initial=0.0)
+        return others._contradicted(
+            (total <= -BLAMED_SUM) & (total - most <= -BLAMED_BESIDE), len(others.witnesses) - 1
+        )
+
+    def _contradicted(self, enough: BoolArray, others: int) -> BoolArray:
+        """Which boxes (n,) are contradicted where it is ``enough`` (n,), by so many ``others`` besides the ego."""
+        denied = enough & self.denied_for_certain(others) & ~self.supporting[0]
         known: BoolArray = denied | (self.likelihood[0] <= EGO_KNOWS)
         return known
 

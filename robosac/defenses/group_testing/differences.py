@@ -17,8 +17,6 @@ OWN_DENIES = -4.0
 """Whose own message denies a place so far is not to blame for a box there."""
 GONE_EFFECT = 1.5
 """A box is gone by somebody's fault if it had such a score, and has so much less now: faint ones come and go."""
-BLAMED_SUM = 8.0
-"""Somebody is to blame for a crisp box that the others contradict with this sum of L: more than the word of one."""
 FEWEST_ALONE = 3
 """Of fusions of fewer teammates one witness alone does not tell that something is gone."""
 EFFECT = 1.0
@@ -43,7 +41,7 @@ def effects(joined: Shown, without: Shown, suspects: Sequence[str]) -> list[Lie]
     - ``moved``: a box that is out of place, and without them less so. If it is so along itself only, it may be late. So
       it may if many boxes together are `misplaced`, each a little.
     """
-    ghosts = joined.claims.contradicted(suspects, BLAMED_SUM) & (joined.boxes[:, 5] >= CRISP_SCORE)
+    ghosts = joined.claims.contradicted_by_others(suspects) & (joined.boxes[:, 5] >= CRISP_SCORE)
     grown, own = joined.boxes[ghosts], joined.own(suspects)[:, ghosts].max(axis=0)
     drop = joined.odds_at(grown[:, :2]) - without.odds_at(grown[:, :2])
     found = [Lie("ghost", grown[i, :2], bool(own[i] <= OWN_DENIES)) for i in np.flatnonzero(drop >= EFFECT)]

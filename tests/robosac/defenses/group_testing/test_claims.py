@@ -46,12 +46,28 @@ def test_a_box_is_contradicted_by_the_ego_or_by_two(said, contradicted):
 def test_a_suspects_own_word_is_left_out_whatever_it_is():
     liar_denies = claim(0.0, NO, NO, 0.0)
     assert liar_denies.contradicted().tolist() == [True]
-    assert liar_denies.contradicted(["a"]).tolist() == [False]  # only "b" is left to deny it
-    assert liar_denies.contradicted(["c"]).tolist() == [True]
+    assert liar_denies.contradicted_by_others(["a"]).tolist() == [False]  # only "b" is left to deny it
+    assert liar_denies.contradicted_by_others(["c"]).tolist() == [True]
     vouches = claim(0.0, NO, NO, YES, YES, YES)
     assert vouches.contradicted().tolist() == [False]
-    assert vouches.contradicted(["c"]).tolist() == [False]  # "d" and "e" have still vouched for it
+    assert vouches.contradicted_by_others(["c"]).tolist() == [False]  # "d" and "e" have still vouched for it
     assert vouches.without(["c", "d"]).contradicted().tolist() == [True]
+
+
+@pytest.mark.parametrize(
+    ("said", "to_blame"),
+    [
+        ((-3.2, -6.0, YES), False),  # one who denies it and the ego, a little: the one may lie
+        ((-3.2, -6.0, 0.0, 0.0, YES), False),
+        ((-4.5, -6.0, YES), True),
+        ((-3.2, -6.0, -1.0, YES), True),
+        ((-2.0, -5.0, -5.0, YES), True),
+        ((-6.0, YES), True),  # the ego knows
+        ((-3.5, -3.5, YES), False),  # too little in all
+    ],
+)
+def test_nobody_is_to_blame_for_a_box_by_the_word_of_one(said, to_blame):
+    assert claim(*said).contradicted_by_others(["abcde"[len(said) - 2]]).tolist() == [to_blame]
 
 
 def test_without_some_their_word_counts_for_nothing():
