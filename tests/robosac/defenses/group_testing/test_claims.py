@@ -62,6 +62,7 @@ def test_a_suspects_own_word_is_left_out_whatever_it_is():
         ((-4.5, -6.0, YES), True),
         ((-3.2, -6.0, -1.0, YES), True),
         ((-2.0, -5.0, -5.0, YES), True),
+        ((-5.2, -3.5, YES), True),  # the ego does not lie
         ((-6.0, YES), True),  # the ego knows
         ((-3.5, -3.5, YES), False),  # too little in all
     ],

@@ -171,6 +171,13 @@ def test_settings_out_of_range(settings):
         GroupTestingSettings(**settings)
 
 
+def test_a_single_teammate_is_tested_only_while_that_is_worth_a_pass(rng):
+    _, honest = run(with_settings(inspections=0), [], 8, rng, team=("car-2",))
+    assert [len(outcomes) for outcomes in honest] == [1] * 8
+    _, attacked = run(with_settings(inspections=0), ["car-2"], 8, rng, team=("car-2",))
+    assert [len(outcomes) for outcomes in attacked[3:]] == [0] * 5
+
+
 def test_outcomes_without_boxes_tell_nothing(rng):
     def bare(subset, attackers, frame):
         full = outcome(subset, attackers, frame)
