@@ -85,7 +85,9 @@ class Standing(StrEnum):
     REPAIRED = "repaired"
     """It is taken from a fusion without a teammate whose joining removes or moves it."""
     CONTRADICTED = "contradicted"
-    """The ego, three teammates, or two and the ego inclined to agree, could have seen it and did not."""
+    """The ego, three teammates, or two and the ego inclined to agree, could have seen it and did not; or nobody saw it
+    of which the fusion is sure.
+    """
 
 
 def _array_of(*shape: int) -> Any:

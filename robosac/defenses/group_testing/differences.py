@@ -36,15 +36,18 @@ CRISP_SCORE = 0.5
 def effects(joined: Shown, without: Shown, suspects: Sequence[str]) -> list[Lie]:
     """What is wrong in a fusion, and is not in the same fusion without the suspects.
 
-    - ``ghost``: a contradicted box whose odds without them are less by a factor of e;
+    - ``ghost``: a contradicted box whose odds without them are less by a factor of e; veiled, if their own messages
+      deny it, or nobody supports it;
     - ``gone``: a box without them where the others support a vehicle, and nothing is shown with them;
     - ``moved``: a box that is out of place, and without them less so. If it is so along itself only, it may be late. So
       it may if many boxes together are `misplaced`, each a little.
     """
-    ghosts = joined.claims.contradicted_by_others(suspects) & (joined.boxes[:, 5] >= CRISP_SCORE)
+    contradicted = joined.claims.contradicted_by_others(suspects)
+    ghosts = (contradicted | joined.on_nobodys_word) & (joined.boxes[:, 5] >= CRISP_SCORE)
     grown, own = joined.boxes[ghosts], joined.own(suspects)[:, ghosts].max(axis=0)
     drop = joined.odds_at(grown[:, :2]) - without.odds_at(grown[:, :2])
-    found = [Lie("ghost", grown[i, :2], bool(own[i] <= OWN_DENIES)) for i in np.flatnonzero(drop >= EFFECT)]
+    veiled = (own <= OWN_DENIES) | ~contradicted[ghosts]
+    found = [Lie("ghost", grown[i, :2], bool(veiled[i])) for i in np.flatnonzero(drop >= EFFECT)]
     which = gone(joined, without, suspects)
     lost, own = without.boxes[which], without.own(suspects)[:, which].min(axis=0)
     drop = without.odds_at(lost[:, :2]) - joined.odds_at(lost[:, :2])

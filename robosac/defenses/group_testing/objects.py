@@ -23,6 +23,8 @@ SHOWN_SCORE = 0.3
 """Boxes from this score on claim something."""
 PLACED_SCORE = 0.4
 """Boxes from this score on have to be in their place."""
+SURE_SCORE = 0.9
+"""A fusion is sure of a box of this score or more. Of such a vehicle somebody has seen something."""
 THERE_SCORE = 0.15
 """Where a box has this score or more, something is shown."""
 STANDING_SUM = 10.0
@@ -204,9 +206,24 @@ class Shown:
         return bool(said <= DENIES if lie.kind == "gone" else said >= SUPPORTS)
 
     @cached_property
+    def on_nobodys_word(self) -> BoolArray:
+        """Boxes (n,) that the fusion is sure of, though nobody supports them, heard or not; none while some messages
+        are unread.
+        """
+        if self._hearing.everybody.unread:
+            return np.zeros(len(self.boxes), dtype=bool)
+        nobodys: BoolArray = (self.boxes[:, 5] >= SURE_SCORE) & ~self.everybody.supporting.any(axis=0)
+        return nobodys
+
+    @cached_property
+    def contradicted(self) -> BoolArray:
+        """Boxes (n,) that are contradicted by those who are heard, or on nobody's word."""
+        return self.claims.contradicted() | self.on_nobodys_word
+
+    @cached_property
     def ghosts(self) -> BoolArray:
         """Boxes (n,) that are shown and contradicted."""
-        return self.claims.contradicted() & (self.boxes[:, 5] >= SHOWN_SCORE)
+        return self.contradicted & (self.boxes[:, 5] >= SHOWN_SCORE)
 
     @cached_property
     def displaced(self) -> BoolArray:

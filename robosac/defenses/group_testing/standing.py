@@ -45,7 +45,7 @@ def judge(answer: Shown, decoded: Sequence[Shown]) -> Judged:
     def keep(shown: Shown, index: int, status: Standing | None = None) -> None:
         kept.setdefault((shown.teammates, index), _judged(shown, index, status))
 
-    away, contradicted, displaced = answer.away(), answer.claims.contradicted(), answer.displaced
+    away, contradicted, displaced = answer.away(), answer.contradicted, answer.displaced
     repaired: list[FloatArray] = []
     for index, box in enumerate(answer.boxes):
         better = _in_place(box, float(away[index]), parts) if displaced[index] else None

@@ -15,7 +15,7 @@ DEFENSE = GroupTesting(MODEL)
 SEEN = np.array([[x, y, 4.5, 1.9, 0.0, 0.9] for x in (-22.4, -7.4, 7.6, 22.6) for y in (-12.3, 12.7)])
 """What everybody sees."""
 PLACE = np.array([10.4, 2.3])
-CAR = np.array([[*PLACE, 4.5, 1.9, 0.0, 0.9]])
+CAR = np.array([[*PLACE, 4.5, 1.9, 0.0, 0.85]])
 YES, NO = 5.5, -7.0
 LIAR = "car-4"
 
@@ -85,6 +85,8 @@ MOVED = World({"car-2": YES, "car-3": YES, "rsu": YES}, with_liar(ASIDE, NEAR))
 DRIVING_MOVED = World({"car-2": YES, "car-3": YES, "rsu": YES}, with_liar(ASIDE, NEAR), speed=1.0)
 VEILED = World({EGO: -2.0, "car-2": NO, "car-3": NO, LIAR: NO}, with_liar(CAR, CAR[:0]))
 DRIVING_VEILED = World({EGO: -2.0, "car-2": NO, "car-3": NO, LIAR: NO}, with_liar(CAR, CAR[:0]), speed=1.0)
+SURE = CAR + [0, 0, 0, 0, 0, 0.1]
+DRIVING_UNFOUNDED = World({LIAR: -0.5}, with_liar(SURE, CAR[:0]), speed=1.0)
 UNSAID = World({"car-2": YES, "car-3": YES, "rsu": YES}, erased)
 
 

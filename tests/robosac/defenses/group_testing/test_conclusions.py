@@ -20,6 +20,7 @@ from tests.robosac.defenses.group_testing.one_place import (
     ASIDE,
     CAR,
     DRIVING_MOVED,
+    DRIVING_UNFOUNDED,
     DRIVING_VEILED,
     ERASED,
     GHOST,
@@ -164,8 +165,9 @@ def test_a_ghost_is_blamed_beside_few_others_too():
     assert "ghost" in concluded(GHOST, ("car-2", "car-3", LIAR), ("car-2", "car-3")).lies.levels[LIAR]
 
 
-def test_who_denies_its_own_ghosts_is_named_too():
-    met = DRIVING_VEILED.play(12)
+@pytest.mark.parametrize("world", [DRIVING_VEILED, DRIVING_UNFOUNDED])
+def test_who_denies_its_own_ghosts_or_says_nothing_of_them_is_named_too(world):
+    met = world.play(12)
     assert {name for decision, _ in met for name in decision.named} == {LIAR}
     items = [item for item in met[-1][0].state["memory"]["evidence"][LIAR] if item["test"] == "objects"]
     assert {kind for item in items for kind in item["kinds"]} == {"veiled"}

@@ -1,5 +1,7 @@
 """What a fusion does to single objects, and on whom it is blamed."""
 
+from dataclasses import replace
+
 import numpy as np
 import pytest
 
@@ -13,7 +15,7 @@ YES, NO = 5.5, -7.0
 TEAM = ("a", "b", "c", "d")
 
 
-def car(place=PLACE, score=0.9, off=(0.0, 0.0), yaw=0.0):
+def car(place=PLACE, score=0.85, off=(0.0, 0.0), yaw=0.0):
     """A box whose centre is off its place along and across itself, metres."""
     cos, sin = np.cos(yaw), np.sin(yaw)
     x, y = place + [off[0] * cos - off[1] * sin, off[0] * sin + off[1] * cos]
@@ -71,6 +73,34 @@ def test_a_ghost_is_blamed_on_whoever_brings_it():
 )
 def test_a_box_that_nobody_can_deny_is_blamed_on_nobody(said, kinds):
     assert found(hearing(**said), car(), NOTHING) == kinds
+
+
+@pytest.mark.parametrize(
+    ("said", "score", "nobodys"),
+    [
+        ({}, 0.95, True),
+        ({"ego": 1.0, "a": 2.8, "b": NO}, 0.95, True),
+        ({"d": NO}, 0.95, True),  # whoever brings it lets its own message deny it
+        ({}, 0.85, False),
+        ({"c": 3.5}, 0.95, False),
+        ({"d": 3.5}, 0.95, False),
+        ({"ego": 3.5}, 0.95, False),
+    ],
+)
+def test_a_sure_box_is_on_somebodys_word_or_contradicted(said, score, nobodys):
+    for unheard in ((), ("c", "d")):  # who is not heard has seen something, too
+        heard = hearing(unheard, **said)
+        shown = Shown(TEAM, np.vstack([REST, car(score=score)]), heard)
+        assert shown.contradicted.tolist() == [False, nobodys]
+        lies = effects(shown, Shown(("a", "b", "c"), REST, heard), ["d"])
+        assert [lie.counts_as for lie in lies] == ["veiled"] * nobodys
+
+
+def test_while_some_messages_are_unread_no_box_is_on_nobodys_word():
+    testimony = hearing().everybody
+    for unread, nobodys in (((), True), (("b",), False)):
+        shown = Shown(TEAM, car(score=0.95), Hearing(replace(testimony, unread=unread), ()))
+        assert shown.contradicted.tolist() == [nobodys]
 
 
 def test_a_vehicle_gone_is_blamed_on_whoever_takes_it_away():

@@ -3,7 +3,7 @@
 import numpy as np
 import pytest
 
-from robosac.answers import Standing
+from robosac.answers import Standing, Support
 from robosac.defenses import EGO
 from robosac.defenses.group_testing import GroupTesting, GroupTestingSettings
 from robosac.defenses.group_testing.objects import Hearing, Shown
@@ -19,6 +19,7 @@ from tests.robosac.defenses.group_testing.one_place import (
     NEAR,
     NO,
     SEEN,
+    SURE,
     YES,
     World,
     seen_by,
@@ -100,6 +101,15 @@ def test_a_box_stands_on_what_is_said_of_it(said, status):
     everywhere = [other.support for other in decision.objects if other is not judged]
     assert {each.status for each in everywhere} == {Standing.CONFIRMED}
     assert all(set(each.witnesses) == {EGO, *TEAM} for each in everywhere)
+
+
+def test_a_sure_box_that_nobody_speaks_of_is_left_out_and_accuses_nobody_yet():
+    defense = GroupTesting(MODEL, GroupTestingSettings(inspections=0))
+    decision, tested = World({LIAR: -0.5}, lambda _: SURE).play(1, defense)[0]
+    ((judged, _),) = there(decision, tested, decision.contradicted)
+    assert judged.support == Support(status=Standing.CONTRADICTED, witnesses=(), deniers=())
+    assert there(decision, tested, decision.objects) == []
+    assert decision.named == ()
 
 
 def test_where_only_the_ego_is_heard_its_word_is_enough():
