@@ -99,6 +99,8 @@ class JudgedFrame:
     def decide(self, named_before: frozenset[str], naming_bound: float, inspection: Inspection) -> Decision:
         """The answer, whom to trust, and whom to name; the frame is over."""
         memory, outcomes = self._known.memory, self._evidence.outcomes
+        if not outcomes:  # how steady the ego is, by all frames so far
+            memory.steadiness.begin(None)
         suspicion = self._known.suspicion()
         accepted, _, source = self._best_answer()
         if not outcomes or (not accepted and len(self._team) > EXACT):

@@ -176,6 +176,8 @@ def awakened(
     sizes : (B,) int ndarray, optional
         As of `through`.
     """
+    if not team:
+        return table
     benign, nobody = (1 - hijack) ** team, (1 - attacker_prior) ** team
     alone = through(table, transition(hijack, 0.0), sizes)
     drawn = through(table, transition(attacker_prior, 0.0), sizes)

@@ -6,6 +6,7 @@ from robosac.answers import Source, Verdict
 from robosac.defenses import GroupTesting, Outcome
 from robosac.defenses.group_testing import OPEN, GroupTestingSettings
 from robosac.defenses.group_testing.defense import HIJACKED_OF
+from robosac.defenses.group_testing.lies import RULES
 from robosac.defenses.group_testing.memory import FORGETTING_FRAMES
 from tests.robosac.defenses.group_testing.conversing import SEEN, TEAM, make_model, outcome, run_frame
 from tests.robosac.defenses.group_testing.sessions import DEFENSE, named, run, with_settings
@@ -187,3 +188,28 @@ def test_outcomes_without_boxes_tell_nothing(rng):
     decision, tested = run_frame(DEFENSE, DEFENSE.initial_state(TEAM), TEAM, ["car-3"], rng, judge=bare)
     assert tested
     assert decision.suspicion == pytest.approx(before, abs=1e-6)
+
+
+@pytest.mark.parametrize("compare_frames", [True, False])
+def test_a_team_of_nobody_is_one_too(compare_frames, rng):
+    """The last teammate may leave, and others come."""
+    defense = with_settings(compare_frames=compare_frames)
+    state = defense.initial_state(["car-2"])
+    for team in (["car-2"], [], [], ["car-2", "car-3"], ["car-2", "car-3"]):
+        state = defense.change_team(state, team)
+        decision, _ = run_frame(defense, state, team, [], rng)
+        state = json.loads(json.dumps(decision.state, allow_nan=False))
+    assert decision.accepted == ("car-2", "car-3")
+    assert decision.suspicion == pytest.approx(dict.fromkeys(team, 0.05), abs=0.05)
+
+
+def test_a_frame_without_a_test_does_not_forget_that_the_ego_flickers(rng):
+    """Where it does, it takes twice the lies to be named."""
+    known, _ = run(DEFENSE, [], 3, rng)
+    state = json.loads(json.dumps(known.state))
+    state["memory"]["steadiness"] |= {"boxes": 400.0, "changes": 200.0}
+    state["memory"]["lies"]["levels"] = {"car-3": {"ghost": [RULES["ghost"].names, RULES["ghost"].names]}}
+    state["posterior"] = run(DEFENSE, ["car-3"], 3, rng)[0].state["posterior"]
+    assert run(DEFENSE, [], 1, rng, state, most=0)[0].named == ()
+    state["memory"]["steadiness"] |= {"changes": 4.0}
+    assert run(DEFENSE, [], 1, rng, state, most=0)[0].named == ("car-3",)
