@@ -8,14 +8,18 @@ from itertools import compress
 import numpy as np
 
 from robosac.answers import Standing, Support
-from robosac.boxes import FloatArray
+from robosac.boxes import BoolArray, FloatArray, pairwise_iou
 from robosac.defenses.group_testing.claims import DENIES, LEANS, NEARLY_SUPPORTS, SUPPORTS
 from robosac.defenses.group_testing.differences import AWAY_EFFECT, gone, gone_alone
-from robosac.defenses.group_testing.objects import Shown
+from robosac.defenses.group_testing.objects import THERE_SCORE, Shown
 from robosac.defenses.protocol import JudgedBox
 
 SAME_M = 2.5
 """A box of another fusion, centred so near, stands for the same vehicle."""
+SAME_IOU = 0.3
+"""Boxes that overlap so much stand for the same vehicle."""
+Repair = tuple[Shown, int]
+"""A box of another fusion."""
 Judged = tuple[tuple[JudgedBox, ...], tuple[JudgedBox, ...]]
 """Boxes of an answer, and those that are contradicted."""
 
@@ -26,7 +30,8 @@ def judge(answer: Shown, decoded: Sequence[Shown]) -> Judged:
     1. A contradicted box is left out.
     2. A box that is out of place is taken from the part of the answer that has it nearest to its place.
     3. A vehicle that a part of the answer shows, and the answer has lost although it stands by testimony, is taken from
-       there. Of the answer without one teammate the word of one witness is enough, if nobody else denies it.
+       there. Of the answer without one teammate the word of one witness is enough, if nobody else denies it. No vehicle
+       is there twice by it.
     4. Any other box is ``confirmed`` by the ego, if all but the teammate who supports it most support it together
        (`Claims.beside`), and ``disputed`` if they do not. Where the ego does not support it, it is ``disputed`` if
        somebody denies it, or all others together lean against it (`Claims.rest`); ``confirmed`` by two teammates, of
@@ -39,33 +44,41 @@ def judge(answer: Shown, decoded: Sequence[Shown]) -> Judged:
         All that was decoded in the frame.
     """
     parts = [shown for shown in decoded if shown.teammates and set(shown.teammates) < set(answer.teammates)]
-    kept: dict[tuple[tuple[str, ...], int], JudgedBox] = {}
-    left_out: list[JudgedBox] = []
-
-    def keep(shown: Shown, index: int, status: Standing | None = None) -> None:
-        kept.setdefault((shown.teammates, index), _judged(shown, index, status))
-
     away, contradicted, displaced = answer.away(), answer.contradicted, answer.displaced
-    repaired: list[FloatArray] = []
-    for index, box in enumerate(answer.boxes):
-        better = _in_place(box, float(away[index]), parts) if displaced[index] else None
-        if contradicted[index]:
-            left_out.append(_judged(answer, index, Standing.CONTRADICTED))
-        elif better is not None:
-            part, at = better
-            keep(part, at, Standing.REPAIRED)
-            repaired.append(part.boxes[at, :2])
-        else:
-            keep(answer, index)
+    kept, repairs = ~contradicted, list[Repair]()
+    for index in np.flatnonzero(displaced).tolist():
+        better = _in_place(answer.boxes[index], float(away[index]), parts)
+        if better is not None:
+            kept[index] = False
+            repairs.append(better)
     for part in parts:
         left = [name for name in answer.teammates if name not in part.teammates]
         alone: list[int] = gone_alone(answer, part, left).tolist() if len(left) == 1 else []
         for at in (*gone(answer, part).tolist(), *alone):
             place = part.boxes[at, :2]
-            if all(np.hypot(*(place - other)) > SAME_M for other in repaired):
-                keep(part, at, Standing.REPAIRED)
-                repaired.append(place)
-    return tuple(kept.values()), tuple(left_out)
+            if all(np.hypot(*(place - other.boxes[i, :2])) > SAME_M for other, i in repairs):
+                repairs.append((part, at))
+    repairs, kept = _each_once(repairs, answer, kept)
+    objects = [_judged(answer, index, None) for index in np.flatnonzero(kept).tolist()]
+    objects += [_judged(part, at, Standing.REPAIRED) for part, at in repairs]
+    left_out = [_judged(answer, index, Standing.CONTRADICTED) for index in np.flatnonzero(contradicted).tolist()]
+    return tuple(objects), tuple(left_out)
+
+
+def _each_once(repairs: Sequence[Repair], answer: Shown, kept: BoolArray) -> tuple[list[Repair], BoolArray]:
+    """The repairs, and the boxes (n,) of the answer that stay, so that no vehicle is there twice: what the answer has
+    in its place needs no repair, and a faint box gives way to one.
+    """
+    faint, chosen = answer.boxes[:, 5] < THERE_SCORE, list[Repair]()
+    placed = kept & ~answer.displaced & ~faint
+    for part, at in repairs:
+        box = part.boxes[at : at + 1]
+        same = pairwise_iou(box, answer.boxes)[0] >= SAME_IOU
+        again = any(pairwise_iou(box, other.boxes[i : i + 1])[0, 0] >= SAME_IOU for other, i in chosen)
+        if not again and not (same & placed).any():
+            chosen.append((part, at))
+            kept = kept & ~(same & faint)
+    return chosen, kept
 
 
 def _judged(shown: Shown, index: int, status: Standing | None) -> JudgedBox:
@@ -84,7 +97,7 @@ def _judged(shown: Shown, index: int, status: Standing | None) -> JudgedBox:
     return JudgedBox(shown.teammates, index, Support(status=status, witnesses=witnesses, deniers=deniers))
 
 
-def _in_place(box: FloatArray, away: float, parts: Sequence[Shown]) -> tuple[Shown, int] | None:
+def _in_place(box: FloatArray, away: float, parts: Sequence[Shown]) -> Repair | None:
     """The box of a part that stands for this one and is least out of place."""
     best: tuple[float, Shown, int] | None = None
     for part in parts:

@@ -10,6 +10,7 @@ from robosac.defenses.group_testing.objects import Hearing, Shown
 from robosac.defenses.group_testing.standing import judge
 from tests.robosac.defenses.group_testing.conversing import TEAM
 from tests.robosac.defenses.group_testing.one_place import (
+    ASIDE,
     CAR,
     ERASED,
     GHOST,
@@ -22,6 +23,7 @@ from tests.robosac.defenses.group_testing.one_place import (
     SURE,
     YES,
     World,
+    nothing,
     seen_by,
     there,
 )
@@ -110,6 +112,23 @@ def test_a_sure_box_that_nobody_speaks_of_is_left_out_and_accuses_nobody_yet():
     assert judged.support == Support(status=Standing.CONTRADICTED, witnesses=(), deniers=())
     assert there(decision, tested, decision.objects) == []
     assert decision.named == ()
+
+
+@pytest.mark.parametrize("score", [0.12, 0.5])
+def test_a_vehicle_that_is_repaired_is_there_once(score):
+    """A faint box gives way to what is taken from a fusion of a part; one in its place needs none."""
+    testimony = World({"car-2": YES, "car-3": YES, "rsu": YES}, nothing).testimony
+    part = Shown(("car-2", "car-3", "rsu"), np.vstack([SEEN, NEAR]), Hearing(testimony, ()))
+    own = NEAR + [0.2, 0, 0, 0, 0, score - NEAR[0, 5]]
+    boxes = np.vstack([SEEN, own] if score < 0.15 else [SEEN, ASIDE, own])
+    answer = Shown(("car-2", "car-3", LIAR, "rsu"), boxes, Hearing(testimony, ()))
+    objects, contradicted = judge(answer, [answer, part])
+    assert contradicted == ()
+    assert len(objects) == len(SEEN) + 1
+    (place,) = [judged for judged in objects if judged.index >= len(SEEN)]
+    repaired = score < 0.15
+    assert (place.subset, place.index) == ((part.teammates, 8) if repaired else (answer.teammates, 9))
+    assert (place.support.status is Standing.REPAIRED) == repaired
 
 
 def test_where_only_the_ego_is_heard_its_word_is_enough():
