@@ -23,6 +23,9 @@ VALUES = 2048
 """Of each tensor that are looked at; of a smaller one all."""
 SKETCH = 128
 """Numbers in a sketch: correlations are estimated to within about .08."""
+RIM = 8
+"""The rim of a map is this part of its side."""
+FEW = 7
 _STEPS = 127
 _BITS = {"float16": 16, "float32": 32, "float64": 64}
 
@@ -35,8 +38,8 @@ class Fingerprint:
 
     digest: str
     """16 hexadecimal digits; the same bytes have the same."""
-    constant: bool
-    """Whether all values of each tensor are the same, as those of a blind sensor may be."""
+    blank: bool
+    """Whether all tensors are the same everywhere, see `_blank`, as those of a blind sensor are."""
     sizes: Mapping[str, tuple[float, float]]
     """By tensor: largest absolute value, and root mean square of the values that are looked at."""
     sketch: FloatArray
@@ -57,15 +60,14 @@ def fingerprints(messages: Mapping[str, Mapping[str, Tensor]]) -> dict[str, Fing
     """
     if not messages:
         return {}
-    digests, constant = [0] * len(messages), np.ones(len(messages), dtype=bool)
+    digests, blank = [0] * len(messages), np.ones(len(messages), dtype=bool)
     sizes: list[dict[str, tuple[float, float]]] = [{} for _ in messages]
     total = np.zeros((len(messages), SKETCH))
     for name in sorted(next(iter(messages.values()))):
         flats = [np.ascontiguousarray(tensors[name]).reshape(-1) for tensors in messages.values()]
         places, signs = _drawn(name, len(flats[0]))
         values = np.stack([flat.take(places) for flat in flats]).astype(np.float64)
-        same = (values == values[:, :1]).all(axis=1)  # spares most of them a look at all values
-        constant &= [bool(s and (flat == flat[:1]).all()) for s, flat in zip(same, flats, strict=True)]
+        blank &= [_blank(tensors[name]) for tensors in messages.values()]
         with np.errstate(over="ignore", invalid="ignore"):  # what is no number comes out as none
             rms = np.sqrt(np.einsum("ij,ij->i", values, values) / max(values.shape[1], 1))
             total += _summed(values, signs)
@@ -73,9 +75,9 @@ def fingerprints(messages: Mapping[str, Mapping[str, Tensor]]) -> dict[str, Fing
             words = _words(flat)
             digests[i] += int(np.dot(words, _weights(name, len(words))))
             sizes[i][name] = (_largest(flat), float(rms[i]))
-    sketches = _coarse(total)
+    sketches = _coarse(np.where(blank[:, None], 0.0, total))
     return {
-        vehicle: Fingerprint(f"{digests[i] % 2**64:016x}", bool(constant[i]), sizes[i], sketches[i])
+        vehicle: Fingerprint(f"{digests[i] % 2**64:016x}", bool(blank[i]), sizes[i], sketches[i])
         for i, vehicle in enumerate(messages)
     }
 
@@ -95,6 +97,19 @@ def unpacked(text: str) -> FloatArray:
     steps = np.frombuffer(base64.b64decode(text, validate=True), dtype=np.int8)
     sketch: FloatArray = _of_norm_1(steps[None].astype(np.float64))[0]
     return sketch
+
+
+def _blank(tensor: Tensor) -> bool:
+    """Whether a map (..., H, W) has the same in all places, but for an eighth at each rim, where a network sees that
+    map ends; or another array in all its values. Such a message says nothing that could be repeated or copied.
+    """
+    if tensor.ndim < 3:
+        return bool((tensor == tensor.reshape(-1)[:1]).all())
+    rows, columns = (side // RIM for side in tensor.shape[-2:])
+    inside = tensor[..., rows : tensor.shape[-2] - rows, columns : tensor.shape[-1] - columns]
+    middle = inside[..., :1, :1]
+    few = inside[..., ::FEW, ::FEW]  # spares most maps a look at all places
+    return bool((few == middle).all() and (inside == middle).all())
 
 
 def _words(flat: Tensor) -> np.ndarray[Any, np.dtype[np.uint64]]:

@@ -138,7 +138,7 @@ class Screening:
             if sent.digest == seen.print.digest and seen.moved_from(sent.place) > MOVED_M:
                 return _repetition(seen, sent.first, sent.place, 1.0)
         anchor = seen.past.anchor
-        if seen.print.constant:
+        if seen.print.blank:
             return None
         if anchor is not None and self.bounds and seen.moved_from(anchor.place) > MOVED_M:
             correlation = likeness(anchor.sketch, seen.print.sketch)
@@ -174,7 +174,7 @@ class _Seen:
                 sent.append(Sent(digest, each.first, self.frame, each.place))
             elif self.frame - each.last < KEPT_FRAMES:
                 sent.append(each)
-        if not again and not self.print.constant:
+        if not again and not self.print.blank:
             sent.append(Sent(digest, self.frame, self.frame, self.place))
         return Past(tuple(sent), self._anchor(screening), self.past.refused + refused).as_json()
 
@@ -191,7 +191,7 @@ class _Seen:
 def _copied(name: str, seen: Mapping[str, _Seen]) -> Rejection | None:
     """What another vehicle sent first. Who of two sent it first in one frame nobody knows, but for the ego."""
     one = seen[name]
-    if one.print.constant:
+    if one.print.blank:
         return None
     since = one.first_sent
     for other, theirs in seen.items():

@@ -59,15 +59,25 @@ def test_the_digest_is_of_all_tensors_by_their_names(rng):
     assert both.digest == one(y=b, x=a).digest
 
 
-def test_a_map_of_one_value_is_constant(rng):
+def test_a_map_that_is_the_same_everywhere_is_blank(rng):
     flat = np.full((64, 32, 32), 0.5, np.float16)
-    assert one(flat).constant
-    assert one(np.zeros_like(flat)).constant
-    almost = flat.copy()
-    almost[7, 7, 7] = 0.75
-    assert not one(almost).constant
-    assert not one(x=flat, y=a_map(rng)).constant
-    assert not one(flat).sketch.any()
+    flat += rng.normal(size=(64, 1, 1)).astype(np.float16)
+    rimmed = flat.copy()
+    rimmed[:, :4], rimmed[..., -4:] = rng.normal(size=(64, 4, 32)), rng.normal(size=(64, 32, 4))
+    for blank in (flat, rimmed, np.zeros_like(flat), np.full((5, 3), 2.0), np.zeros((0, 4, 4))):
+        assert one(blank).blank
+        assert not one(blank).sketch.any()
+    for row, column in ((7, 7), (4, 4), (27, 27), (4, 20)):
+        almost = rimmed.copy()
+        almost[7, row, column] += 0.75
+        assert not one(almost).blank
+    assert not one(np.array([[1.0, 1.0, 2.0]])).blank
+    assert not one(x=flat, y=a_map(rng)).blank
+
+
+def test_the_message_of_an_empty_scan_is_blank(detector):
+    tensors = detector.encode(np.zeros((0, 3)), np.eye(4)).tensors
+    assert fingerprints({"a": tensors})["a"].blank
 
 
 def test_likeness_is_the_correlation_of_the_maps(rng):
