@@ -113,20 +113,19 @@ class Claims:
         beside: FloatArray = self.likelihood.sum(axis=0) - most
         return beside
 
-    def in_conflict(self, unheard: Collection[str]) -> BoolArray:
-        """Over which boxes each witness says the contrary of all others that are heard (witnesses, n): its L is at
-        least 4.5 one way, and the sum of theirs 10 the other. Two that lie together come to more than that, so it has
-        to be 3 without the two teammates who oppose it most.
+    def in_conflict(self, unheard: Collection[str]) -> tuple[BoolArray, BoolArray]:
+        """Which boxes each witness supports (witnesses, n), and which it denies, against all others that are heard: its
+        L is at least 4.5 one way, and the sum of theirs 10 the other. Two that lie together come to more than that, so
+        it has to be 3 without the two teammates who oppose it most.
         """
         heard = np.array([name not in unheard for name in self.witnesses])[:, None]
         said = np.where(heard, self.likelihood, 0.0)
         others = said.sum(axis=0) - said
         ranked = np.sort(said[1:], axis=0)
         high, low = np.maximum(ranked[-2:], 0.0).sum(axis=0), np.minimum(ranked[:2], 0.0).sum(axis=0)
-        denied = (self.likelihood >= CONFLICT_OWN) & (others <= -CONFLICT_SUM) & (others - low <= DENIES)
-        claimed = (self.likelihood <= -CONFLICT_OWN) & (others >= CONFLICT_SUM) & (others - high >= SUPPORTS)
-        against: BoolArray = denied | claimed
-        return against
+        supported = (self.likelihood >= CONFLICT_OWN) & (others <= -CONFLICT_SUM) & (others - low <= DENIES)
+        denied = (self.likelihood <= -CONFLICT_OWN) & (others >= CONFLICT_SUM) & (others - high >= SUPPORTS)
+        return supported, denied
 
     def contradicted(self) -> BoolArray:
         """Which boxes (n,) are contradicted, whoever supports them.

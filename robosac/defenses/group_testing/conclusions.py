@@ -17,6 +17,8 @@ from robosac.defenses.protocol import Hypothesis
 
 CLEARING = 1.5
 """What a frame in which nothing is wrong takes off the logarithm of the odds that one of those fused lies."""
+FEWEST_SEEN = 3
+"""Whoever sees so many vehicles against the word of all others is not blind: one or two differ by where they end."""
 CONFLICT_SCORE = 0.5
 """Conflicts are counted over boxes of this score."""
 FEWEST_BESIDE = 3
@@ -33,21 +35,22 @@ def conclude(found: Findings, answer: Hypothesis) -> None:
         return
     blamed: dict[str, list[Lie]] = {name: [] for name in found.team}
     comparisons = _comparisons(found)
-    heard = sum(name not in found.unheard for name in found.team)
-    fewest, frame = max(1, min(FEWEST_BESIDE, heard - 1)), found.known.memory.frame
+    heard = [name for name in found.team if name not in found.unheard]
+    frame = found.known.memory.frame
     for joined, shown in found.shown.items():
         done = {
             suspect: found.effects(joined, without, (suspect,))
             for (fused, without), suspect in comparisons.items()
             if fused == joined
         }
-        enough = len(joined) > fewest
-        if enough:
-            found.lies.audited |= dict.fromkeys(done, frame)
         for suspect, lies in blame(done, shown).items():
+            others = len(heard) - (suspect in heard)
+            enough = len(joined) > max(1, min(FEWEST_BESIDE, others))
+            if enough:
+                found.lies.audited[suspect] = frame
             counting = [lie for lie in lies if enough or lie.counts_as == "ghost"]
             counting = [lie for lie in counting if found.calm or not lie.veiled]
-            counting = _borne_out(found, suspect, counting, heard - 1)
+            counting = _borne_out(found, suspect, counting, others)
             found.note(joined, tuple(name for name in joined if name != suspect), counting)
             blamed[suspect] += counting
     for name, lie in _together(found, answer):
@@ -56,7 +59,7 @@ def conclude(found: Findings, answer: Hypothesis) -> None:
     _leave_alone(found, answer)
     _clear(found)
     for name in found.team:
-        counts = {"conflict": conflicts[name]}
+        counts = dict([conflicts[name]] if name in conflicts else [])
         for kind in {lie.counts_as for lie in blamed[name]}:
             of_kind = [lie for lie in blamed[name] if lie.counts_as == kind]
             places = [found.placed(lie.place) for lie in of_kind]
@@ -65,7 +68,7 @@ def conclude(found: Findings, answer: Hypothesis) -> None:
                 counts[kind] = 1
         weight = found.lies.add(name, counts)
         if weight:
-            _accuse(found, name, weight, blamed[name], conflicts[name])
+            _accuse(found, name, weight, blamed[name], conflicts.get(name, ("", 0))[1])
 
 
 def _borne_out(found: Findings, suspect: str, lies: Sequence[Lie], others: int) -> list[Lie]:
@@ -94,20 +97,27 @@ def _together(found: Findings, answer: Hypothesis) -> list[tuple[str, Lie]]:
     return blamed
 
 
-def _conflicts(found: Findings, answer: Hypothesis) -> dict[str, int]:
+def _conflicts(found: Findings, answer: Hypothesis) -> dict[str, tuple[str, int]]:
     """Boxes of the answer over which each teammate alone says the contrary of all others. Where the ego itself is
     unsteady, only those count over which it did not before: there honest mistakes are to be expected, and stay.
+
+    Given by teammate, with the kind they count as. Whoever only denies what all others see, and sees nothing against
+    their word, may be blind there, as a scanner is behind a wall of its own: ``unseen``.
     """
-    if answer not in found.shown:
-        return dict.fromkeys(found.team, 0)
+    if answer not in found.shown or found.hearing is None:
+        return {}
     claims = found.shown[answer].everybody
     claims = claims.of_boxes(claims.boxes[:, 5] >= CONFLICT_SCORE)
-    against = dict(zip(claims.witnesses, claims.in_conflict(found.unheard), strict=True))
+    conflicts = {who: at for who, *at in zip(claims.witnesses, *claims.in_conflict(found.unheard), strict=True)}
     frame, once = found.known.memory.frame, None if found.calm else 1
     counts = {}
     for name in found.team:
-        places = [found.placed(box[:2]) for box in claims.boxes[against[name]]]
-        counts[name] = found.lies.counting(name, "conflict", places, frame, once)
+        supported, denied = conflicts[name]
+        places = [found.placed(box[:2]) for box in claims.boxes[supported | denied]]
+        count = found.lies.counting(name, "conflict", places, frame, once)
+        if count:
+            seeing = supported.any() or found.hearing.alone(name, found.unheard) >= FEWEST_SEEN
+            counts[name] = ("conflict" if seeing else "unseen"), count
     return counts
 
 

@@ -15,7 +15,7 @@ from functools import cached_property
 import numpy as np
 
 from robosac.boxes import BoolArray, FloatArray, IntArray
-from robosac.defenses.group_testing.claims import DENIES, SUPPORTS, WEIGHTY, Claims, two_witnesses
+from robosac.defenses.group_testing.claims import CONFLICT_OWN, DENIES, SUPPORTS, WEIGHTY, Claims, two_witnesses
 from robosac.defenses.protocol import Hypothesis
 from robosac.testimony import Testimony
 
@@ -33,6 +33,8 @@ CERTAIN = 4.0
 """From this L on, two teammates or the ego know that a vehicle stands in a place."""
 REACH_M = 2.2
 """A box is at a place if it is centred so near."""
+APART_M = 3.0
+"""Vehicles are so far apart."""
 OWN_M = 3.0
 """What is centred so near the ego's sensor is the ego."""
 EDGE_M = 1.0
@@ -104,6 +106,19 @@ class Hearing:
         if asked not in self._said:
             self._said[asked] = self.everybody.likelihood(place[None])[:, 0]
         return self._said[asked]
+
+    def alone(self, agent: str, unheard: Collection[str]) -> int:
+        """In how many places, `APART_M` apart, an agent sees a vehicle against the word of all who are heard."""
+        over, places = self.everybody.over_ego, self.everybody.ego_places()
+        index = self.everybody.agents.index(agent)
+        rows, columns = np.nonzero(over[index] >= CONFLICT_OWN)
+        said = np.minimum(np.maximum(over[:, rows, columns], -WEIGHTY), WEIGHTY)
+        supported, _ = Claims(places[rows, columns], self.everybody.agents, said).in_conflict(unheard)
+        surest = np.argsort(-over[index, rows, columns], kind="stable")
+        left, count = places[rows, columns][surest[supported[index, surest]]], 0
+        while len(left):
+            left, count = left[np.hypot(*(left - left[0]).T) > APART_M], count + 1
+        return count
 
     @cached_property
     def standing(self) -> FloatArray:

@@ -122,9 +122,9 @@ def knowledge():
     return Knowledge(MODEL, Posterior(len(MODEL.kinds), 0.5, 0.25, TEAM), Memory())
 
 
-def concluded(world, answer, *subsets):
+def concluded(world, answer, *subsets, named=()):
     """What is found out by these fusions."""
-    found = Findings(knowledge(), Lies(), tuple(TEAM), ())
+    found = Findings(knowledge(), Lies(), tuple(TEAM), named)
     for subset in (answer, *subsets):
         found.learn(world.judge(subset, None, 0))
     conclude(found, answer)
@@ -203,7 +203,37 @@ def test_a_conflict_over_one_place_counts_once_beside_an_ego_that_flickers(calm,
     for frame in range(5):
         found.known.memory.frame = frame
         found.learn(alone_with_it.judge(tuple(TEAM), None, frame))
-        before = found.lies.levels.get(LIAR, {}).get("conflict", (0.0, 0.0))[0]
+        before = found.lies.levels.get(LIAR, {}).get("unseen", (0.0, 0.0))[0]
         conclude(found, tuple(TEAM))
-        counted.append(found.lies.levels.get(LIAR, {}).get("conflict", (0.0, 0.0))[0] > before)
+        counted.append(found.lies.levels.get(LIAR, {}).get("unseen", (0.0, 0.0))[0] > before)
     assert counted == [True] * times + [False] * (5 - times)
+
+
+def seeing(elsewhere):
+    """What all say where one denies two vehicles that all others see, and sees so many where they see that none is."""
+    denied = [(*PLACE, NO), *((x, y, NO) for x, y in SEEN[:1, :2])]
+    own = denied + [(-20.0 + 8.0 * i, 2.0, YES) for i in range(elsewhere)]
+    others = [(x, y, -value) for x, y, value in own]
+    return saying({name: own if name == LIAR else others for name in (EGO, *TEAM)})
+
+
+@pytest.mark.parametrize(("elsewhere", "kind"), [(0, "unseen"), (2, "unseen"), (3, "conflict")])
+def test_who_only_denies_what_others_see_may_be_blind_and_is_not_named(elsewhere, kind):
+    found = Findings(knowledge(), Lies(), tuple(TEAM), ())
+    boxes = np.vstack([SEEN, CAR])
+    for frame in range(8):
+        found.known.memory.frame = frame
+        told = {"testimony": seeing(elsewhere), "alone": SEEN}
+        found.learn(Outcome(tuple(TEAM), 0.9, Verdict.CONSENSUS, boxes, SEEN, np.eye(4), frame, **told))
+        conclude(found, tuple(TEAM))
+    assert set(found.lies.levels[LIAR]) == {kind}
+    assert (found.lies.guilt(LIAR) > 0) == (kind == "conflict")
+    assert found.known.suspicion()[LIAR] > 0.5
+
+
+@pytest.mark.parametrize(("named", "kind"), [((LIAR, "car-5"), "late"), ((LIAR, "car-5", "rsu"), "moved")])
+def test_two_may_lie_together_as_long_as_three_others_than_the_suspect_are_heard(named, kind):
+    two = World({"car-2": YES, "car-3": YES}, with_liar(ASIDE, NEAR))
+    fused = tuple(name for name in TEAM if name == LIAR or name not in named)
+    without = tuple(name for name in fused if name != LIAR)
+    assert set(concluded(two, fused, without, named=named).lies.levels[LIAR]) == {kind}
