@@ -6,7 +6,7 @@ A witness network reads one agent's message alone and says for every place how m
 
 from __future__ import annotations
 
-from collections.abc import Collection, Sequence
+from collections.abc import Callable, Collection, Sequence
 from dataclasses import dataclass
 from functools import cached_property, lru_cache
 
@@ -54,6 +54,10 @@ class Testimony:
     """Maps cover +- this in both directions."""
     unread: tuple[str, ...] = ()
     """Agents whose messages there was no time to read: they say nothing."""
+    empty: Callable[[str, FloatArray], BoolArray] | None = None
+    """Of an agent, and places (n, 2) in its frame, where its message is the same all around: it shows nothing there,
+    whether there is nothing or it could not see. None where messages are not at hand.
+    """
 
     def ego_places(self) -> FloatArray:
         """Centres (H, W, 2) of the places of the ego's map, ego frame, metres."""
@@ -63,6 +67,12 @@ class Testimony:
         """Places (n, 2), ego frame, in each sender's frame: (agents, n, 2), metres."""
         turned: FloatArray = points @ self.from_ego[:, :2, :2].swapaxes(1, 2) + self.from_ego[:, None, :2, 2]
         return turned
+
+    def is_empty(self, agent: str, points: FloatArray) -> BoolArray:
+        """Whether an agent's message shows nothing around places (n, 2), ego frame; nowhere if that is not known."""
+        if self.empty is None:
+            return np.zeros(len(points), dtype=bool)
+        return self.empty(agent, self.places(points)[self.agents.index(agent)])
 
     def likelihood(self, points: FloatArray) -> FloatArray:
         """L at places (n, 2), ego frame: (agents, n), bilinear, within +- `MOST`, 0 outside a map."""
@@ -165,6 +175,7 @@ class Testimony:
             self.over_ego[kept],
             self.half_extent_m,
             tuple(name for name in self.unread if name in agents),
+            self.empty,
         )
 
 

@@ -16,7 +16,7 @@ import numpy as np
 import torch
 from torch import nn
 
-from robosac.boxes import FloatArray
+from robosac.boxes import BoolArray, FloatArray
 from robosac.detectors.base import DetectorInfo, Message
 from robosac.detectors.warp import warp
 from robosac.detectors.weights_file import WeightsError, read_weights, save_weights
@@ -36,6 +36,10 @@ HIGHEST_M = 10.0
 """A pose whose z is not the height above ground, but above the sea, counts as this high."""
 AT_ONCE = 8
 """Messages read together: between groups it is looked at whether there is time for another one."""
+AROUND_M = 2.0
+"""A message shows nothing of a place if it is the same in all cells so near, along x and y, or next to the place's."""
+RIM = 16
+"""The rim of a map is this part of its side."""
 GEOMETRY = 7
 """Where a cell is, as the network is told: x, y and r (32 m), x / r, y / r, ln r / 3, and the sensor's height (5 m)."""
 
@@ -121,6 +125,22 @@ class Layout:
         """What the network reads of maps (n, C, H, W) as they are sent: columns along +x, values about 1."""
         return (sent.flip(-1) if self.mirrored else sent) / self.scale
 
+    def empty(self, message: Message, places: FloatArray) -> BoolArray:
+        """Whether a message is the same within `AROUND_M` of places (n, 2), its sender's frame, the rim of its map left
+        out, where a network sees that it ends.
+        """
+        sent, cells = self.maps([message])[0].numpy(), np.array([self.width, self.height])
+        cell_m = 2 * self.half_extent_m / cells
+        reach = np.maximum(AROUND_M, cell_m)
+        ends = [(places + self.half_extent_m + side) / cell_m for side in (-reach, reach)]
+        first, last = np.clip([np.floor(ends[0]), np.ceil(ends[1])], cells // RIM, cells - cells // RIM).astype(
+            np.int64
+        )
+        around = [
+            sent[:, y:below, x:right] for (x, y), (right, below) in zip(first.tolist(), last.tolist(), strict=True)
+        ]
+        return np.array([bool((part == part[:, :1, :1]).all()) for part in around], dtype=bool)
+
     def geometry(self, heights: Sequence[float]) -> torch.Tensor:
         """Where the cells of maps are whose sensors are so high, metres, as far as poses tell: (n, GEOMETRY, H, W)."""
         x, y = (
@@ -199,7 +219,8 @@ class Witness:
             count += len(group)
         from_ego = planar(messages[ego].pose, [message.pose for message in messages.values()])
         said = as_testimony(tuple(names), maps, from_ego, self.layout.half_extent_m)
-        return replace(said, unread=tuple(names[i] for i in sorted(order[count:])))
+        unread = tuple(names[i] for i in sorted(order[count:]))
+        return replace(said, unread=unread, empty=lambda agent, places: self.layout.empty(messages[agent], places))
 
     def read_message(self, message: Message) -> Float16Array:
         """What a message says by itself: (LAYERS, H, W), as `Testimony` has it."""

@@ -59,7 +59,7 @@ def conclude(found: Findings, answer: Hypothesis) -> None:
     _leave_alone(found, answer)
     _clear(found)
     for name in found.team:
-        counts = dict([conflicts[name]] if name in conflicts else [])
+        counts = dict(conflicts.get(name, {}))
         for kind in {lie.counts_as for lie in blamed[name]}:
             of_kind = [lie for lie in blamed[name] if lie.counts_as == kind]
             places = [found.placed(lie.place) for lie in of_kind]
@@ -68,7 +68,7 @@ def conclude(found: Findings, answer: Hypothesis) -> None:
                 counts[kind] = 1
         weight = found.lies.add(name, counts)
         if weight:
-            _accuse(found, name, weight, blamed[name], conflicts.get(name, ("", 0))[1])
+            _accuse(found, name, weight, blamed[name], sum(conflicts.get(name, {}).values()))
 
 
 def _borne_out(found: Findings, suspect: str, lies: Sequence[Lie], others: int) -> list[Lie]:
@@ -97,12 +97,13 @@ def _together(found: Findings, answer: Hypothesis) -> list[tuple[str, Lie]]:
     return blamed
 
 
-def _conflicts(found: Findings, answer: Hypothesis) -> dict[str, tuple[str, int]]:
+def _conflicts(found: Findings, answer: Hypothesis) -> dict[str, dict[str, int]]:
     """Boxes of the answer over which each teammate alone says the contrary of all others. Where the ego itself is
     unsteady, only those count over which it did not before: there honest mistakes are to be expected, and stay.
 
-    Given by teammate, with the kind they count as. Whoever only denies what all others see, and sees nothing against
-    their word, may be blind there, as a scanner is behind a wall of its own: ``unseen``.
+    Given by teammate and by the kind they count as. Whoever denies what all others see where its own message shows
+    nothing, and sees nothing against their word elsewhere, may be blind there, as a scanner is behind a wall of its
+    own: ``unseen``.
     """
     if answer not in found.shown or found.hearing is None:
         return {}
@@ -110,14 +111,17 @@ def _conflicts(found: Findings, answer: Hypothesis) -> dict[str, tuple[str, int]
     claims = claims.of_boxes(claims.boxes[:, 5] >= CONFLICT_SCORE)
     conflicts = {who: at for who, *at in zip(claims.witnesses, *claims.in_conflict(found.unheard), strict=True)}
     frame, once = found.known.memory.frame, None if found.calm else 1
-    counts = {}
+    counts: dict[str, dict[str, int]] = {}
     for name in found.team:
         supported, denied = conflicts[name]
-        places = [found.placed(box[:2]) for box in claims.boxes[supported | denied]]
-        count = found.lies.counting(name, "conflict", places, frame, once)
-        if count:
-            seeing = supported.any() or found.hearing.alone(name, found.unheard) >= FEWEST_SEEN
-            counts[name] = ("conflict" if seeing else "unseen"), count
+        if not (supported | denied).any():
+            continue
+        unseen = denied & found.hearing.everybody.is_empty(name, claims.boxes[:, :2])
+        if unseen.any() and found.hearing.alone(name, found.unheard) >= FEWEST_SEEN:
+            unseen[:] = False
+        for kind, which in (("conflict", (supported | denied) & ~unseen), ("unseen", unseen)):
+            places = [found.placed(box[:2]) for box in claims.boxes[which]]
+            counts.setdefault(name, {})[kind] = found.lies.counting(name, kind, places, frame, once)
     return counts
 
 

@@ -44,7 +44,7 @@ RULES: Mapping[str, Rule] = {
     "alone": Rule(1.0, 1, 0.3, 2.0, ((0.7, 2.0), (1.4, 3.0), (2.1, 4.0)), malice=False),
     "veiled": Rule(1.25, 1, 0.5, 3.0, ((0.75, 2.5), (1.5, 2.5), (2.25, 4.0)), times=2),
     "conflict": Rule(1.0, 3, 0.5, 6.0, ((3.0, 2.0), (4.5, 4.0), (6.0, 4.0)), times=3),
-    "unseen": Rule(1.0, 3, 0.5, 6.0, ((3.0, 2.0), (4.5, 4.0), (6.0, 4.0)), malice=False),
+    "unseen": Rule(1.0, 3, 0.5, 6.0, ((3.0, 2.0), (4.5, 4.0), (6.0, 4.0)), malice=False, times=3),
 }
 QUIET_FRAMES = 9
 LONGEST_QUIET = 24

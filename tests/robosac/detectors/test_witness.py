@@ -157,6 +157,26 @@ def test_testimony_is_laid_over_the_egos_map(rng):
     assert (said.over_ego[1][~inside[1]] == 0).any()
 
 
+@pytest.mark.parametrize("mirrored", [False, True])
+def test_a_message_that_is_the_same_around_a_place_shows_nothing_there(mirrored, rng):
+    """It has cells of 4 m; what differs is one at x 8 to 12, y -20 to -16 of its sender's frame, and the rim."""
+    sent = messages(rng)
+    alone = np.repeat(rng.normal(size=(4, 1, 1)), 16, axis=1).repeat(16, axis=2).astype(np.float32)
+    alone[:, 3, 10] += 1.0
+    alone[:, 0], alone[..., -1] = 7.0, 7.0
+    sent["b"] = Message(POSES[2], {"map": np.ascontiguousarray(alone[..., ::-1]) if mirrored else alone})
+    testimony = witness(replace(INFO, mirrored=mirrored)).testify("", sent)
+    places = np.array(
+        [[10.0, -18.0], [6.5, -18.0], [10.0, -12.5], [3.5, -18.0], [10.0, -11.5], [29.0, -31.0], [90.0, 0.0]]
+    )
+    world_from_b = POSES[2] @ np.vstack([places.T, np.zeros(len(places)), np.ones(len(places))])
+    in_ego = (np.linalg.inv(POSES[0]) @ world_from_b)[:2].T
+    assert testimony.is_empty("b", in_ego).tolist() == [False, False, False, True, True, True, True]
+    assert testimony.of(["", "b"]).is_empty("b", in_ego[:1]).tolist() == [False]
+    assert testimony.is_empty("a", in_ego[:5]).tolist() == [False] * 5
+    assert replace(testimony, empty=None).is_empty("b", in_ego).tolist() == [False] * 7
+
+
 def test_a_witness_survives_a_file(rng, tmp_path):
     before, path = witness(scale=0.7), tmp_path / "x.witness.safetensors"
     before.network.half().float()  # as files hold it

@@ -203,28 +203,33 @@ def test_a_conflict_over_one_place_counts_once_beside_an_ego_that_flickers(calm,
     for frame in range(5):
         found.known.memory.frame = frame
         found.learn(alone_with_it.judge(tuple(TEAM), None, frame))
-        before = found.lies.levels.get(LIAR, {}).get("unseen", (0.0, 0.0))[0]
+        before = found.lies.levels.get(LIAR, {}).get("conflict", (0.0, 0.0))[0]
         conclude(found, tuple(TEAM))
-        counted.append(found.lies.levels.get(LIAR, {}).get("unseen", (0.0, 0.0))[0] > before)
+        counted.append(found.lies.levels.get(LIAR, {}).get("conflict", (0.0, 0.0))[0] > before)
     assert counted == [True] * times + [False] * (5 - times)
 
 
-def seeing(elsewhere):
+def seeing(elsewhere, empty):
     """What all say where one denies two vehicles that all others see, and sees so many where they see that none is."""
-    denied = [(*PLACE, NO), *((x, y, NO) for x, y in SEEN[:1, :2])]
+    denied = [(*PLACE, NO), (*SEEN[0, :2], NO)]
     own = denied + [(-20.0 + 8.0 * i, 2.0, YES) for i in range(elsewhere)]
     others = [(x, y, -value) for x, y, value in own]
-    return saying({name: own if name == LIAR else others for name in (EGO, *TEAM)})
+    testimony = saying({name: own if name == LIAR else others for name in (EGO, *TEAM)})
+    return replace(testimony, empty=lambda name, places: np.full(len(places), empty and name == LIAR))
 
 
-@pytest.mark.parametrize(("elsewhere", "kind"), [(0, "unseen"), (2, "unseen"), (3, "conflict")])
-def test_who_only_denies_what_others_see_may_be_blind_and_is_not_named(elsewhere, kind):
+@pytest.mark.parametrize(
+    ("elsewhere", "empty", "kind"),
+    [(0, True, "unseen"), (2, True, "unseen"), (3, True, "conflict"), (0, False, "conflict")],
+)
+def test_who_denies_what_others_see_where_it_shows_nothing_may_be_blind_and_is_not_named(elsewhere, empty, kind):
     found = Findings(knowledge(), Lies(), tuple(TEAM), ())
-    boxes = np.vstack([SEEN, CAR])
+    told = {"testimony": seeing(elsewhere, empty), "alone": SEEN}
     for frame in range(8):
         found.known.memory.frame = frame
-        told = {"testimony": seeing(elsewhere), "alone": SEEN}
-        found.learn(Outcome(tuple(TEAM), 0.9, Verdict.CONSENSUS, boxes, SEEN, np.eye(4), frame, **told))
+        found.learn(
+            Outcome(tuple(TEAM), 0.9, Verdict.CONSENSUS, np.vstack([SEEN, CAR]), SEEN, np.eye(4), frame, **told)
+        )
         conclude(found, tuple(TEAM))
     assert set(found.lies.levels[LIAR]) == {kind}
     assert (found.lies.guilt(LIAR) > 0) == (kind == "conflict")
