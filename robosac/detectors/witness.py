@@ -132,14 +132,10 @@ class Layout:
         sent, cells = self.maps([message])[0].numpy(), np.array([self.width, self.height])
         cell_m = 2 * self.half_extent_m / cells
         reach = np.maximum(AROUND_M, cell_m)
-        ends = [(places + self.half_extent_m + side) / cell_m for side in (-reach, reach)]
-        first, last = np.clip([np.floor(ends[0]), np.ceil(ends[1])], cells // RIM, cells - cells // RIM).astype(
-            np.int64
-        )
-        around = [
-            sent[:, y:below, x:right] for (x, y), (right, below) in zip(first.tolist(), last.tolist(), strict=True)
-        ]
-        return np.array([bool((part == part[:, :1, :1]).all()) for part in around], dtype=bool)
+        first, last = (places + self.half_extent_m - reach) / cell_m, (places + self.half_extent_m + reach) / cell_m
+        around = np.clip(np.hstack([np.floor(first), np.ceil(last)]), [*cells // RIM] * 2, [*cells - cells // RIM] * 2)
+        parts = [sent[:, y:below, x:right] for x, y, right, below in around.astype(int).tolist()]
+        return np.array([bool((part == part[:, :1, :1]).all()) for part in parts], dtype=bool)
 
     def geometry(self, heights: Sequence[float]) -> torch.Tensor:
         """Where the cells of maps are whose sensors are so high, metres, as far as poses tell: (n, GEOMETRY, H, W)."""
