@@ -6,6 +6,8 @@ from enum import StrEnum
 
 from robosac.answers import Reason
 
+RENEWED = "the token was renewed, or its vehicle has left"
+
 
 class Kind(StrEnum):
     """What was wrong: the last part of a problem's ``type``."""
@@ -94,6 +96,13 @@ class TokenRefused(Refused):
     def __init__(self, detail: str, vehicle_id: str | None = None, kind: Kind = Kind.UNAUTHENTICATED) -> None:
         super().__init__(kind, detail)
         self.vehicle_id = vehicle_id
+
+
+class TokenReplaced(Refused):
+    """A token that counted once, and does not any more."""
+
+    def __init__(self) -> None:
+        super().__init__(Kind.UNAUTHENTICATED, RENEWED)
 
 
 class SessionOver(Refused):

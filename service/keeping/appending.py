@@ -9,7 +9,7 @@ from typing import Any
 from sqlalchemy import Connection, insert
 
 from robosac.audit import Unsealed, digest
-from service.errors import SessionChanged, SessionOver
+from service.errors import SessionChanged, SessionOver, TokenReplaced
 from service.keeping.partitions import day
 from service.keeping.record import SessionRecord
 from service.keeping.rows import CHANGE, GET_BUT_STATE, GET_TO_CHANGE, columns, read_row
@@ -67,3 +67,16 @@ def check_revision(now: SessionRecord, worked_out_from: SessionRecord) -> None:
     """Raise SessionChanged if a session is not of the revision that a change was worked out from."""
     if now.revision != worked_out_from.revision:
         raise SessionChanged
+
+
+def renewal(vehicle_id: str, before: str, token_id: str) -> Change:
+    """The change to another token of a vehicle. It raises TokenReplaced unless the one ``before`` still counts: it may
+    have been renewed, or its vehicle dismissed, by another process that this one has not heard of.
+    """
+
+    def change(now: SessionRecord) -> Mapping[str, Any]:
+        if now.token_ids.get(vehicle_id) != before:
+            raise TokenReplaced
+        return {"token_ids": {**now.token_ids, vehicle_id: token_id}}
+
+    return change

@@ -10,9 +10,9 @@ from sqlalchemy import Connection, Delete, Select, Update, func, insert, select,
 
 from robosac.audit import FULL_EVERY, digest
 from robosac.audit.events import DetectorChanged, Event, FrameAnswered, SessionEnded, TeamChanged, TokenRenewed
-from service.errors import AuditFull, FrameDecided, SessionChanged
+from service.errors import AuditFull, FrameDecided, SessionChanged, TokenReplaced
 from service.keeping import migrations, once, partitions, purging
-from service.keeping.appending import Change, append, check_revision, line_row
+from service.keeping.appending import Change, append, check_revision, line_row, renewal
 from service.keeping.database import connect
 from service.keeping.limits import Limits
 from service.keeping.patience import Patience
@@ -190,9 +190,9 @@ class Store:
 
         return await self._append(record.session_id, event, change)
 
-    async def renew_token(self, session_id: str, token_id: str, event: TokenRenewed) -> None:
-        """Let another token of a vehicle count instead of the one before."""
-        await self._append(session_id, event, lambda now: {"token_ids": {**now.token_ids, event.vehicle_id: token_id}})
+    async def renew_token(self, session_id: str, before: str, token_id: str, event: TokenRenewed) -> None:
+        """Let another token of a vehicle count instead of ``before``; `TokenReplaced` if that one counts no more."""
+        await self._append(session_id, event, renewal(event.vehicle_id, before, token_id))
 
     async def hold(self, session_id: str, holder: str) -> None:
         """Note which process a session's ego asks now; that changes nothing that was decided."""
@@ -291,7 +291,7 @@ class Store:
 
         try:
             after = await self._database.write(work, ready.write)
-        except SessionChanged:
+        except (SessionChanged, TokenReplaced):
             self._seen.forget(session_id)
             await self.get(session_id)
             raise

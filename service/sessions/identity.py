@@ -18,7 +18,7 @@ from typing import Any
 
 import jwt
 
-from service.errors import Kind, Refused, TokenRefused
+from service.errors import RENEWED, Kind, Refused, TokenRefused
 from service.keeping.record import SessionRecord
 from service.keeping.store import Store
 from service.settings import Settings
@@ -32,7 +32,6 @@ LEEWAY_S = 10.0
 """How far the clocks of two gateways may be apart."""
 ISSUER = AUDIENCE = "robosac-gateway"
 ALGORITHM = "HS256"
-RENEWED = "the token was renewed, or its vehicle has left"
 CLAIMS = ("iss", "aud", "sub", "sid", "role", "jti", "iat", "exp")
 _BEARER_TOKEN = re.compile(r"[A-Za-z0-9._~+/-]+=*")  # RFC 6750, section 2.1
 

@@ -8,11 +8,11 @@ from dataclasses import dataclass
 from robosac.audit.events import TeamChanged, TokenRenewed
 from robosac.budget import DomainError
 from robosac.session import changed_team
-from service.errors import Kind, Refused
+from service.errors import Kind, Refused, TokenReplaced
 from service.keeping.record import SessionRecord
 from service.keeping.store import Store
 from service.schemas import ChangedTeam, RenewedToken
-from service.sessions.identity import RENEWED, Tokens
+from service.sessions.identity import Tokens
 from service.sessions.live import Caller
 from service.sessions.sessions import Sessions
 from service.settings import Settings
@@ -63,15 +63,16 @@ class Teams:
         vehicle = caller.vehicle_id
         async with caller.live.lock:  # else a team that changes meanwhile would bring the old token back
             record = await self.sessions.current(caller)
-            if record.token_ids.get(vehicle) != caller.record.token_ids[vehicle]:
-                raise Refused(Kind.UNAUTHENTICATED, RENEWED)
+            before = caller.record.token_ids[vehicle]
+            if record.token_ids.get(vehicle) != before:
+                raise TokenReplaced
             if caller.live.renewals[vehicle] >= MAX_RENEWALS:
                 detail = f"a vehicle may have {MAX_RENEWALS} tokens between two frames"
                 raise Refused(Kind.TOO_MANY_RENEWALS, detail)
             caller.live.renewals[vehicle] += 1
             token = self.tokens.issue(record.session_id, vehicle, is_ego=caller.is_ego)
             event = TokenRenewed(vehicle_id=vehicle, expires_at=token.expires_at)
-            await self.store.renew_token(record.session_id, token.token_id, event)
+            await self.store.renew_token(record.session_id, before, token.token_id, event)
             return RenewedToken(token=token.text, expires_at=token.expires_at)
 
     async def _change_team(

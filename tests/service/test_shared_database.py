@@ -179,6 +179,31 @@ async def test_teams_that_change_at_both_gateways_at_once(two):
     assert (await one.ego(session).state())["teammates"] == ["car-3", "car-4", "car-5"]
 
 
+async def test_a_token_is_renewed_at_one_gateway_only(two):
+    session = await two[0].open()
+    for _ in range(5):
+        calls = [served.teammate(session, "rsu").renew() for served in two]
+        outcomes = await asyncio.gather(*calls, return_exceptions=True)
+        assert [isinstance(outcome, AccessDenied) for outcome in outcomes].count(True) == 1
+        (renewed,) = [outcome for outcome in outcomes if not isinstance(outcome, AccessDenied)]
+        session.teammate_tokens["rsu"] = renewed.token
+    await two[1].teammate(session, "rsu").renew()
+
+
+async def test_who_is_dismissed_at_one_gateway_gets_no_fresh_token_at_the_other(two):
+    one, other = two
+    session = await one.open()
+    await other.ego(session).state()
+    async with other.gateway.sessions._live[session.session_id].lock:
+        renewing = asyncio.create_task(other.teammate(session, "rsu").renew())
+        await asyncio.sleep(0.2)  # it knows the session by now, and waits for the lock
+        await one.ego(session).dismiss("rsu")
+    with pytest.raises(AccessDenied):
+        await renewing
+    assert "rsu" not in (await one.gateway.store.get(session.session_id)).token_ids
+    assert (await one.ego(session).audit())[-1]["event"] == "team_changed"
+
+
 @pytest.fixture
 def own(tmp_path, monkeypatch):
     """The shipped detector under the name "own", with weights and calibration that a test may take away."""

@@ -9,7 +9,7 @@ import pytest
 import rfc8785
 from sqlalchemy import text
 
-from service.errors import AuditFull, FrameDecided, Refused, SessionChanged, SessionOver
+from service.errors import AuditFull, FrameDecided, Refused, SessionChanged, SessionOver, TokenReplaced
 from service.keeping.once import MOST_PROOFS
 from service.keeping.record import SessionRecord
 from service.keeping.store import PAGE, Store
@@ -123,7 +123,7 @@ async def test_a_change_worked_out_from_an_older_session_is_refused(store):
     sid = await added(store)
     await store.log(sid, note())
     assert (await store.get(sid)).revision == 0
-    await store.renew_token(sid, "t9", A_TOKEN)
+    await store.renew_token(sid, "t1", "t9", A_TOKEN)
     before, tokens = a_session(), {"ego": "t0", "a": "t1"}
     for change in (store.decide(before, a_decision(), "00" * 32), store.change_team(before, A_TEAM, tokens)):
         with pytest.raises(SessionChanged):
@@ -154,7 +154,9 @@ async def test_a_proof_is_new_once_for_its_vehicle_until_it_is_forgotten(store):
 
 async def test_one_token_is_renewed_and_the_others_stay(store):
     sid = await added(store)
-    await store.renew_token(sid, "new", A_TOKEN)
+    await store.renew_token(sid, "t1", "new", A_TOKEN)
+    with pytest.raises(TokenReplaced):
+        await store.renew_token(sid, "t1", "newer", A_TOKEN)
     assert (await store.get(sid)).token_ids == {"ego": "t0", "a": "new", "b": "t2"}
 
 
@@ -165,7 +167,7 @@ async def test_nothing_is_added_to_a_session_that_is_over(store):
         calls = (
             store.decide(record, a_decision(), "00" * 32),
             store.log(record.session_id, note()),
-            store.renew_token(record.session_id, "t", A_TOKEN),
+            store.renew_token(record.session_id, "t1", "t", A_TOKEN),
             store.change_team(record, A_TEAM, {}),
             store.end(record.session_id, THE_END),
         )
@@ -237,7 +239,7 @@ async def test_two_stores_on_one_database_never_fork_a_chain_or_decide_twice(sha
 async def test_a_store_learns_of_a_conflict_what_the_other_did(shared_url):
     async with opened(shared_url) as one, opened(shared_url) as two:
         sid = await added(one)
-        await two.renew_token(sid, "t9", A_TOKEN)
+        await two.renew_token(sid, "t1", "t9", A_TOKEN)
         assert one.seen(sid).revision == 0
         with pytest.raises(SessionChanged):
             await one.decide(a_session(), a_decision(), "00" * 32)
@@ -256,7 +258,7 @@ async def test_many_sessions_are_remembered_but_not_all():
 async def test_the_database_is_right_even_where_it_lost_what_was_written(store):
     """As a standby may have that is promoted."""
     sid = await added(store)
-    await store.renew_token(sid, "t9", A_TOKEN)
+    await store.renew_token(sid, "t1", "t9", A_TOKEN)
     undone = text("UPDATE sessions SET revision = 0, audit_seq = 1")
     await store._database.write(lambda connection: connection.execute(undone))
     assert (await store.get(sid)).revision == 0
