@@ -16,6 +16,8 @@ from service.sessions.gathering import Received
 from service.sessions.live import Caller
 
 STRANGERS_NAMED = 8
+NAME_CHARACTERS = 64
+"""Of a stranger's name that are shown; no vehicle's id has more."""
 
 
 class InFrame(Exception):
@@ -81,10 +83,16 @@ def read_frame(caller: Caller, body: bytes) -> tuple[int, Parts]:
         except (wire.WireError, Unusable) as error:
             parts.unusable[name] = Rejection(reason_of(error), {"field": error.field, "detail": error.detail})
             parts.malformed.append(name)
-    strangers = [name for name in envelope.teammates if name not in caller.record.teammates]
+    known = {caller.record.ego_id, *caller.record.teammates}
+    strangers = [name for name in envelope.teammates if name not in known]
     for name in strangers[:STRANGERS_NAMED]:
-        parts.unusable[str(name)[:64]] = Rejection(Reason.UNAUTHENTICATED, {"detail": "not enrolled in this session"})
+        parts.unusable[_shown(name)] = Rejection(Reason.UNAUTHENTICATED, {"detail": "not enrolled in this session"})
     return frame, parts
+
+
+def _shown(stranger: str) -> str:
+    """A stranger's name, shortened; what is cut off leaves a mark, which no id has, so that it names nobody else."""
+    return stranger if len(stranger) <= NAME_CHARACTERS else f"{stranger[: NAME_CHARACTERS - 1]}…"
 
 
 def reason_of(error: wire.WireError | Refused) -> Reason:

@@ -11,6 +11,7 @@ import pytest
 from cryptography.hazmat.primitives.asymmetric.ed25519 import Ed25519PrivateKey
 
 from robosac import wire
+from robosac.audit import verify
 from robosac.detectors import Message
 from robosac.detectors.decoding import MAX_PEAKS
 from robosac.signatures import show_public_key, sign
@@ -96,6 +97,20 @@ async def test_two_versions_of_a_message_are_an_equivocation(served, session, me
     assert (await served.ego(session).ask(0, messages[EGO])).rejected["rsu"].reason == "distrusted"
     assert await refusals(served, session) == [("rsu", "equivocation")]
     await still_serves(served, session, messages, benign)
+
+
+@pytest.mark.parametrize("name", ["a" * 65, "a" * 64 + "/", EGO, "", "?", "\x00", "é" * 100])
+async def test_a_stranger_is_never_taken_for_somebody_of_the_session(name, served, messages, benign):
+    team = ("a" * 64, "rsu")
+    session = await served.client.open_session(EGO, team, latency_budget_ms=20_000, defense=NONE)
+    sent = {team[0]: benign["car-2"], "rsu": benign["rsu"], name: benign["car-3"]}
+    answer = await served.ego(session).post_frame(0, messages[EGO], sent)
+    assert answer.accepted == team
+    assert not {EGO, *team} & set(answer.rejected)
+    assert [why.reason for why in answer.rejected.values()] == ["unauthenticated"] * (name != EGO)
+    bearer = {"Authorization": f"Bearer {session.ego_token}"}
+    log = await served.http.get(f"/v1/sessions/{session.session_id}/audit", headers=bearer)
+    assert verify(log.content.splitlines(keepends=True)) == []
 
 
 @pytest.mark.parametrize("value", [np.nan, np.inf, -np.inf])
