@@ -192,7 +192,7 @@ class Gathering:
 
     def absence(self, teammate: str, frame: int) -> Rejection:
         """Why there is no message of a teammate for a frame."""
-        if self._pending[teammate].get(frame, ...) is None:
+        if self._pending.get(teammate, {}).get(frame, ...) is None:
             detail = "it sent different messages for this frame"
             return Rejection(Reason.DISTRUSTED, {"detail": detail}, Distrust.EQUIVOCATION)
         missing = Rejection(Reason.MISSING, {"detail": MOVED} if self._moved else {})

@@ -169,9 +169,10 @@ class Sessions:
                 for session_id in await self.store.unused_since(time.time() - self.settings.session_idle_s):
                     if not self._in_use(session_id):
                         await self._end(session_id, "expired")
-                for session_id in [one for one, live in self._live.items() if live.is_quiet or not self._in_use(one)]:
+                for session_id in [one for one in self._live if self._is_idle(one)]:
                     record = await self.store.get(session_id)
-                    if record is None or record.ended_at is not None or self.moving.is_elsewhere(record):
+                    moved = record is not None and self.moving.is_elsewhere(record) and self._is_idle(session_id)
+                    if record is None or record.ended_at is not None or moved:
                         self._forget(session_id)
                 await self.store.purge(time.time() - self.settings.audit_retention_s)
             except Exception:  # a sweep that fails must not be the last one
@@ -252,6 +253,11 @@ class Sessions:
         recently = time.monotonic() - self.settings.session_idle_s
         return live is not None and (live.lock.locked() or live.last_used >= recently)
 
+    def _is_idle(self, session_id: str) -> bool:
+        """Whether it may be that what is held of a session is of no use here any more."""
+        live = self._live.get(session_id)
+        return live is None or live.is_quiet or not self._in_use(session_id)
+
     def _forget(self, session_id: str) -> None:
         live = self._live.pop(session_id, None)
         if live is not None:
@@ -259,11 +265,10 @@ class Sessions:
             live.gathering.clear()
 
     async def _end(self, session_id: str, why: str) -> None:
-        self._forget(session_id)
         with contextlib.suppress(SessionOver):
-            event = SessionEnded(why=why)
+            await self.store.end(session_id, SessionEnded(why=why))
             logger.info("session ended", session_id=session_id, why=why)
-            await self.store.end(session_id, event)
+        self._forget(session_id)  # not before: if the store fails, the session goes on with the messages that wait
         self.metrics.sessions.set(await self.store.count())
 
     def _is_served(self, record: SessionRecord) -> bool:

@@ -1,9 +1,11 @@
+import asyncio
 import json
 
 import pytest
 
 from clients.errors import AccessDenied, SessionNotFound
 from robosac.audit import verify
+from service.errors import StoreUnavailable
 from tests.service.conftest import EGO, TEAM, problem, serve
 
 
@@ -152,13 +154,36 @@ async def test_a_session_does_not_expire_under_a_waiting_ego(messages):
 async def test_idle_sessions_expire():
     async with serve(session_idle_s=0.3) as served:
         idle, busy = await served.open(), await served.open()
-        import asyncio
-
         for _ in range(12):
             await asyncio.sleep(0.05)
             await served.ego(busy).state()
         with pytest.raises(SessionNotFound):
             await served.ego(idle).state()
+
+
+async def test_a_session_that_could_not_be_ended_goes_on_with_the_messages_that_wait(served, messages, monkeypatch):
+    session = await served.open(gather_ms=20)
+    await served.teammate(session, "rsu").send(0, messages["rsu"])
+
+    async def fails(*_):
+        raise StoreUnavailable
+
+    with monkeypatch.context() as patched:
+        patched.setattr(served.gateway.store, "end", fails)
+        bearer = {"Authorization": f"Bearer {session.ego_token}"}
+        refused = await served.http.delete(f"/v1/sessions/{session.session_id}", headers=bearer)
+        problem(refused, 503, "store-unavailable")
+    answer = await served.ego(session).ask(0, messages[EGO])
+    assert "rsu" in {*answer.accepted, *(h for test in answer.hypotheses for h in test.teammates)}
+    await served.ego(session).close()
+
+
+async def test_a_frame_bears_that_its_session_is_forgotten_meanwhile(served, messages):
+    session = await served.open(gather_ms=200)
+    asking = asyncio.create_task(served.ego(session).ask(0, messages[EGO]))
+    await asyncio.sleep(0.05)
+    served.gateway.sessions._forget(session.session_id)
+    assert {why.reason for why in (await asking).rejected.values()} == {"missing"}
 
 
 async def test_an_ended_session_leaves_its_log_and_says_its_head(served, good_frame):
