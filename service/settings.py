@@ -25,6 +25,7 @@ OTHERS = ("ROBOSAC_API_KEY", "ROBOSAC_FUZZ_CASES")
 _OF_KUBERNETES = re.compile(r"ROBOSAC_(SERVICE_(HOST|PORT\w*)|PORT(_\d+_\w+)?)")
 """What a pod is given where a service is called robosac."""
 _YEAR_S = 366 * 86_400.0
+_PATHS = ("api_keys_file", "gateway_key_file", "record")
 _LISTS = ("extra_detectors", "extra_defenses", "api_keys", "allowed_hosts", "viewer_tokens", "token_secrets")
 
 
@@ -189,6 +190,12 @@ class Settings(BaseSettings):
             if _HOST.fullmatch(host) is None:
                 raise ValueError("must be names or addresses, without scheme and port, an IPv6 address in brackets")
         return tuple(host.lower() for host in hosts)
+
+    @field_validator(*_PATHS, mode="before")
+    @classmethod
+    def _none_if_empty(cls, value: object) -> object:
+        """A variable that is set to nothing names no path; a Path would make the working directory of it."""
+        return None if isinstance(value, str) and not value.strip() else value
 
     @field_validator(*_LISTS, mode="before")
     @classmethod

@@ -45,6 +45,15 @@ def test_its_default_is_not(name, environment):
     assert getattr(settings_of_environment(), name) == Settings.model_fields[name].default
 
 
+@pytest.mark.parametrize("value", ["", " "])
+def test_a_path_that_is_set_to_nothing_is_none(value, environment):
+    paths = [name for name, field in Settings.model_fields.items() if field.annotation == Path | None]
+    assert {"record", "api_keys_file", "gateway_key_file"} <= set(paths)
+    environment(**{f"ROBOSAC_{name.upper()}": value for name in paths})
+    settings = settings_of_environment()
+    assert [getattr(settings, name) for name in paths] == [None] * len(paths)
+
+
 @pytest.mark.parametrize(
     ("variable", "meant"),
     [
