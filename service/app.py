@@ -26,6 +26,7 @@ from service.arriving.frames import Frames  # noqa: E402
 from service.arriving.giving_way import GivesWay, Line  # noqa: E402
 from service.arriving.hanging_up import HangingUp  # noqa: E402
 from service.arriving.limits import BodyLimit  # noqa: E402
+from service.arriving.parties import Parties  # noqa: E402
 from service.deciding.admission import Admission  # noqa: E402
 from service.deciding.answering import Deciding  # noqa: E402
 from service.deciding.keeping import Keeping  # noqa: E402
@@ -111,7 +112,8 @@ def create_app(
     )
     app.state.gateway = gateway
     problems.install(app)
-    app.add_middleware(GivesWay, line=Line(lambda: gateway.admission.busy))
+    parties = Parties(gateway.api_keys, gateway.viewer_tokens, gateway.store.seen)
+    app.add_middleware(GivesWay, line=Line(lambda: gateway.admission.busy), party_of=parties)
     app.add_middleware(HangingUp)
     app.add_middleware(BodyLimit, limit=settings.max_body_bytes, timeout_s=settings.body_timeout_s)
     app.add_middleware(Door, check=capacity_check(gateway.admission, gateway.sessions.in_use))

@@ -8,7 +8,6 @@ import time
 from collections import OrderedDict, deque
 from collections.abc import Callable
 
-from starlette.datastructures import Headers
 from starlette.types import ASGIApp, Message, Receive, Scope, Send
 
 AT_A_TIME = 2
@@ -22,11 +21,15 @@ _LOOK_S = 0.004
 _NEVER_WAIT = re.compile(r"/healthz|/v1/live/.*|/v1/sessions/[^/]+/(frames|messages|standby)")
 
 
+Party = tuple[str, str]
+"""Who has the same number of turns as any other, and who of theirs asks, who has as many as the others of theirs."""
+
+
 class Turn:
     """The place of a request among those that wait, and then its turn."""
 
-    def __init__(self, line: Line, party: str) -> None:
-        self._line, self.party = line, party
+    def __init__(self, line: Line) -> None:
+        self._line = line
         self.began: asyncio.Future[None] = asyncio.get_running_loop().create_future()
         self._end: asyncio.TimerHandle | None = None
 
@@ -44,7 +47,8 @@ class Turn:
 
 
 class Line:
-    """Requests that wait: each party's in the order in which they came, and the parties by turns.
+    """Requests that wait: the parties' by turns, of a party its members' by turns, and of a member in the order in
+    which they came.
 
     Parameters
     ----------
@@ -54,15 +58,16 @@ class Line:
 
     def __init__(self, busy: Callable[[], bool]) -> None:
         self._busy = busy
-        self._waiting: OrderedDict[str, deque[Turn]] = OrderedDict()
+        self._waiting: OrderedDict[str, OrderedDict[str, deque[Turn]]] = OrderedDict()
         self._at_work = 0
         self._latest = -1.0
         self._look: asyncio.TimerHandle | None = None
 
-    async def turn(self, party: str) -> Turn:
+    async def turn(self, party: Party) -> Turn:
         """A turn of a party, once it has come."""
-        turn = Turn(self, party)
-        self._waiting.setdefault(party, deque()).append(turn)
+        turn = Turn(self)
+        name, member = party
+        self._waiting.setdefault(name, OrderedDict()).setdefault(member, deque()).append(turn)
         self._go_on()
         try:
             await turn.began
@@ -90,10 +95,13 @@ class Line:
                 turn.begin()
 
     def _next(self) -> Turn:
-        party, turns = self._waiting.popitem(last=False)
+        name, members = self._waiting.popitem(last=False)
+        member, turns = members.popitem(last=False)
         turn = turns.popleft()
         if turns:
-            self._waiting[party] = turns  # behind the others
+            members[member] = turns  # behind the others
+        if members:
+            self._waiting[name] = members
         return turn
 
     def _look_again(self) -> None:
@@ -103,20 +111,20 @@ class Line:
 
 class GivesWay:
     """Middleware that lets requests other than frames and messages in by turns: few at a time, and seldom while frames
-    are in hand. So nobody's openings, logs, pages or mistakes take the time that frames need. Parties, which are told
-    apart by their credentials, or else by their addresses, have the same number of turns. An answer in parts gives way
-    after each.
+    are in hand. So nobody's openings, logs, pages or mistakes take the time that frames need. Parties have the same
+    number of turns (`service.arriving.parties`). An answer in parts gives way after each.
     """
 
-    def __init__(self, app: ASGIApp, line: Line) -> None:
+    def __init__(self, app: ASGIApp, line: Line, party_of: Callable[[Scope], Party]) -> None:
         self._app = app
         self._line = line
+        self._party_of = party_of
 
     async def __call__(self, scope: Scope, receive: Receive, send: Send) -> None:
         if scope["type"] != "http" or _NEVER_WAIT.fullmatch(scope["path"]):
             await self._app(scope, receive, send)
             return
-        party = Headers(scope=scope).get("authorization") or (scope.get("client") or ("",))[0]
+        party = self._party_of(scope)
         turn = await self._line.turn(party)
 
         async def in_parts(message: Message) -> None:

@@ -6,7 +6,9 @@ id of the one token of each vehicle that counts, so that a token can be revoked 
 
 from __future__ import annotations
 
+import base64
 import hmac
+import json
 import re
 import secrets
 import time
@@ -14,7 +16,7 @@ from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass, field
 from datetime import UTC, datetime
 from hashlib import sha256
-from typing import Any
+from typing import Any, NamedTuple
 
 import jwt
 
@@ -108,9 +110,16 @@ class ApiKeys:
         """
         if not self:
             return ""
-        given = sha256((key or "").encode()).digest()
-        if not is_among(key, self._digests):
+        key_id = self.id_of(key)
+        if key_id is None:
             raise Refused(Kind.UNAUTHENTICATED, "an API key is needed as a bearer token")
+        return key_id
+
+    def id_of(self, key: str | None) -> str | None:
+        """What sessions that a key opens are known by, or None if it is none of the keys."""
+        if not is_among(key, self._digests):
+            return None
+        given = sha256((key or "").encode()).digest()
         return sha256(b"robosac key of a session\0" + given).hexdigest()[:KEY_ID_LENGTH]
 
 
@@ -214,6 +223,29 @@ class Tokens:
                 return None
             return claims if isinstance(claims["exp"], int) and isinstance(claims["iat"], int) else None
         return None
+
+
+class Claimed(NamedTuple):
+    """What a token says of itself."""
+
+    session_id: str
+    vehicle_id: str
+    token_id: str
+
+
+def claimed(text: str) -> Claimed | None:
+    """What a token says, true or not; None if it is no token at all. `Tokens.holder` finds out whether it is true."""
+    parts = text.split(".") if len(text) <= TOKEN_BYTES else ()
+    if len(parts) != 3:
+        return None
+    try:
+        claims = json.loads(base64.urlsafe_b64decode(parts[1] + "=="))
+    except (ValueError, RecursionError):
+        return None
+    if not isinstance(claims, dict):
+        return None
+    named = [claim for claim in (claims.get(name) for name in ("sid", "sub", "jti")) if isinstance(claim, str)]
+    return Claimed(*named) if len(named) == len(Claimed._fields) else None
 
 
 def _role(is_ego: bool) -> str:

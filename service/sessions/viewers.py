@@ -32,6 +32,10 @@ class ViewerTokens:
         self._digests = [sha256(token.encode()).digest() for token in tokens]
         self._open = open_to_all and not tokens
 
+    def has(self, token: str | None) -> bool:
+        """Whether it is one of them."""
+        return is_among(token, self._digests)
+
     def check(self, token: str | None) -> None:
         """Refuse whoever may not watch.
 
@@ -40,7 +44,7 @@ class ViewerTokens:
         Refused
             With the kind ``unauthenticated``.
         """
-        if self._open or is_among(token, self._digests):
+        if self._open or self.has(token):
             return
         detail = "a viewer's token is needed as a bearer token"
         if not self._digests:

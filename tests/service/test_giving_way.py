@@ -9,7 +9,9 @@ from starlette.responses import PlainTextResponse, StreamingResponse
 
 from service.arriving import giving_way
 from service.arriving.giving_way import AT_A_TIME, EVERY_S, GivesWay, Line
+from service.arriving.parties import Parties
 from tests.service.conftest import EGO, serve
+from tests.service.credentials import KEY, OTHER_KEY, SECRET, forged, segment
 
 
 class Frames:
@@ -27,16 +29,15 @@ class Requests:
     def __init__(self, line, app=None):
         self.begun = []
         self.let = asyncio.Event()
-        self._app = GivesWay(app or self._answer, line)
+        self._app = GivesWay(app or self._answer, line, lambda scope: scope["party"])
 
     async def _answer(self, scope, receive, send):
         self.begun.append(scope["path"])
         await self.let.wait()
         await PlainTextResponse("done")(scope, receive, send)
 
-    def ask(self, path, credential="", send=None):
-        headers = [(b"authorization", credential.encode())] if credential else []
-        scope = {"type": "http", "method": "GET", "path": path, "headers": headers, "client": ("192.0.2.1", 1)}
+    def ask(self, path, party="", member="", send=None):
+        scope = {"type": "http", "method": "GET", "path": path, "headers": [], "party": (party, member)}
         return asyncio.create_task(self._app(scope, self._receive, send or self._drop))
 
     async def _receive(self):
@@ -53,14 +54,52 @@ async def settled():
 
 async def test_few_requests_are_answered_at_a_time_and_parties_take_turns():
     requests = Requests(Line(Frames()))
-    asked = [requests.ask(f"/greedy/{number}", "Bearer greedy") for number in range(20)]
-    asked += [requests.ask("/modest", "Bearer modest"), requests.ask("/stranger")]
+    asked = [requests.ask(f"/greedy/{number}", "greedy") for number in range(20)]
+    asked += [requests.ask("/modest", "modest"), requests.ask("/stranger")]
     await settled()
     assert requests.begun == ["/greedy/0", "/greedy/1"][:AT_A_TIME]
     requests.let.set()
     await asyncio.gather(*asked)
     assert {"/modest", "/stranger"} <= set(requests.begun[: AT_A_TIME + 4])
     assert len(requests.begun) == 22
+
+
+async def test_the_members_of_a_party_take_turns_within_those_of_the_party():
+    requests = Requests(Line(Frames()))
+    asked = [requests.ask(f"/{number}/{member}", "large", f"{member}") for member in range(4) for number in range(3)]
+    asked += [requests.ask("/alone", "small"), requests.ask("/alone", "small")]
+    await settled()
+    requests.let.set()
+    await asyncio.gather(*asked)
+    large = [path for path in requests.begun if path != "/alone"][AT_A_TIME:]
+    assert {path[-1] for path in large[:4]} == {"0", "1", "2", "3"}
+    assert requests.begun[: AT_A_TIME + 4].count("/alone") == 2
+
+
+async def test_only_credentials_that_count_make_a_party():
+    async with serve(
+        api_key=KEY, api_keys=f"{KEY},{OTHER_KEY}", viewer_tokens="v" * 20, token_secrets=SECRET
+    ) as served:
+        gateway, session, other = served.gateway, await served.open(), await served.open()
+        parties = Parties(gateway.api_keys, gateway.viewer_tokens, gateway.store.seen)
+
+        def party(credential, address="192.0.2.1", scheme="Bearer"):
+            headers = [(b"authorization", f"{scheme} {credential}".encode("latin-1"))] if credential else []
+            return parties({"type": "http", "headers": headers, "client": (address, 1)})
+
+        made_up = [None, "x", KEY[:-1], forged(session.ego_token, jti="0" * 32), forged(session.ego_token, sid="x")]
+        made_up += [*(f"{n}" * 16 for n in range(9)), "a.b.c", "..", "\xff.\xff.\xff", "x" * 5000]
+        made_up += [f"a.{segment(b'[' * 2500)}.c", f"a.{segment(b'[]')}.c", forged(session.ego_token, sid=[1])]
+        assert {party(credential) for credential in made_up} == {party(None)}
+        assert party(None) != party(None, "192.0.2.2")
+        tokens = [session.ego_token, *session.teammate_tokens.values(), other.ego_token]
+        assert {party(token)[0] for token in tokens} == {party(KEY)[0]}
+        assert len({party(token) for token in [*tokens, KEY]}) == len(tokens) + 1
+        assert party(tokens[0], scheme="DPoP") == party(tokens[0])
+        assert len({party(credential)[0] for credential in (None, KEY, OTHER_KEY, "v" * 20)}) == 4
+        renewed = await served.teammate(session, "rsu").renew()
+        assert party(session.teammate_tokens["rsu"]) == party(None)
+        assert party(renewed.token)[0] == party(KEY)[0]
 
 
 @pytest.mark.parametrize("path", ["/healthz", "/v1/sessions/abc/frames", "/v1/sessions/abc/messages", "/v1/live/abc"])

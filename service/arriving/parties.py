@@ -1,0 +1,52 @@
+"""Who asks, as far as turns are concerned: known before anything is looked up, and not by what anybody can make up."""
+
+from __future__ import annotations
+
+from collections.abc import Callable
+
+from starlette.datastructures import Headers
+from starlette.types import Scope
+
+from service.arriving.giving_way import Party
+from service.keeping.record import SessionRecord
+from service.sessions.identity import ApiKeys, claimed
+from service.sessions.viewers import ViewerTokens
+
+
+class Parties:
+    """Tells the parties of requests apart: whoever shows a credential that counts by the API key behind it, the viewers
+    together, and all others by their addresses. Else each made-up credential would have turns of its own.
+
+    Parameters
+    ----------
+    api_keys : ApiKeys
+    viewer_tokens : ViewerTokens
+    seen : callable
+        Gives a session by its id, as it is remembered here, or None.
+    """
+
+    def __init__(
+        self, api_keys: ApiKeys, viewer_tokens: ViewerTokens, seen: Callable[[str], SessionRecord | None]
+    ) -> None:
+        self._api_keys = api_keys
+        self._viewer_tokens = viewer_tokens
+        self._seen = seen
+
+    def __call__(self, scope: Scope) -> Party:
+        """The party of a request."""
+        credential = Headers(scope=scope).get("authorization", "").partition(" ")[2].strip()
+        known = self._known(credential) if credential else None
+        return known or (f"address {(scope.get('client') or ('',))[0]}", "")
+
+    def _known(self, credential: str) -> Party | None:
+        key_id = self._api_keys.id_of(credential)
+        if key_id is not None:
+            return f"key {key_id}", ""
+        if self._viewer_tokens.has(credential):
+            return "viewers", credential
+        named = claimed(credential)
+        record = None if named is None else self._seen(named.session_id)
+        # The id of a token that counts is a secret that only the token tells: no signature needs to be verified here.
+        if named is None or record is None or record.token_ids.get(named.vehicle_id) != named.token_id:
+            return None
+        return f"key {record.key_id}", named.token_id
