@@ -16,7 +16,7 @@ from robosac.defenses.sampling import MAX_BUDGET
 from robosac.detectors import DEFAULT_DETECTOR
 from robosac.possession import read_origin
 from robosac.wire import MAX_FRAME
-from service.keeping.database import read_url
+from service.keeping.urls import read_url
 
 _HOST = re.compile(r"[A-Za-z0-9_.-]+|\[[0-9A-Fa-f:.]+\]")
 PREFIX = "ROBOSAC_"

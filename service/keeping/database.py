@@ -21,8 +21,8 @@ from functools import partial
 from typing import Any, Protocol, TypeVar
 
 from sqlalchemy import Connection, Engine, create_engine, event
-from sqlalchemy.engine import URL, make_url
-from sqlalchemy.exc import ArgumentError, SQLAlchemyError
+from sqlalchemy.engine import URL
+from sqlalchemy.exc import SQLAlchemyError
 from sqlalchemy.ext.asyncio import create_async_engine
 from sqlalchemy.pool import QueuePool
 
@@ -31,6 +31,7 @@ from robosac.faults import describe
 from service.errors import StoreUnavailable
 from service.keeping.limits import Limits
 from service.keeping.together import Piece, Work, do_each, prepare_each
+from service.keeping.urls import read_url
 
 logger = logging.getLogger(__name__)
 
@@ -45,11 +46,6 @@ COMMAND_TIMEOUT_S = 10.0
 CONNECT_TIMEOUT_S = 5.0
 READERS = 2
 WRITTEN_TOGETHER = 64
-_DRIVERS = {
-    "sqlite": "sqlite",
-    "postgresql": "postgresql+asyncpg",
-    "postgresql+asyncpg": "postgresql+asyncpg",
-}
 _creating = threading.Lock()
 
 
@@ -77,25 +73,6 @@ class Database(Protocol):
 
     async def close(self) -> None:
         """Let go of files and connections."""
-
-
-def read_url(text: str) -> URL:
-    """A database's URL with its driver.
-
-    Raises
-    ------
-    ValueError
-        If it is none, or of another kind of database. The message does not show it, since it may hold a password.
-    """
-    try:
-        url = make_url(text)
-    except ArgumentError as error:
-        raise ValueError("not a database URL") from error
-    if url.drivername not in _DRIVERS:
-        raise ValueError(f"a database must be one of {', '.join(_DRIVERS)}, not {url.drivername}")
-    if url.get_backend_name() == "sqlite" and "uri" in url.query:  # which can turn locks off, and name no file
-        raise ValueError("a SQLite database is named by its path, not by a URI")
-    return url.set(drivername=_DRIVERS[url.drivername])
 
 
 def connect(text: str, limits: Limits | None = None) -> Database:

@@ -36,7 +36,7 @@ class Store:
     Parameters
     ----------
     url : str
-        As `service.keeping.database.read_url`.
+        As `service.keeping.urls.read_url`.
     remembered : int
         Sessions that `seen` knows.
     full_every : int

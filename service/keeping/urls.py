@@ -1,0 +1,60 @@
+"""The URL by which a database is named."""
+
+from __future__ import annotations
+
+from sqlalchemy.engine import URL, make_url
+from sqlalchemy.exc import ArgumentError
+
+MOST_TIMEOUT_S = 3600.0
+_DRIVERS = {
+    "sqlite": "sqlite",
+    "postgresql": "postgresql+asyncpg",
+    "postgresql+asyncpg": "postgresql+asyncpg",
+}
+_OPTIONS = {
+    "sqlite": ("timeout",),
+    "postgresql": (
+        *("host", "port", "user", "password", "passfile", "service", "servicefile", "database"),
+        *("ssl", "direct_tls", "target_session_attrs", "krbsrvname", "gsslib", "prepared_statement_cache_size"),
+    ),
+}
+"""What may stand behind the question mark. The drivers have more that no text can be given for, and SQLite's takes
+anything in silence.
+"""
+
+
+def read_url(text: str) -> URL:
+    """A database's URL with its driver.
+
+    Raises
+    ------
+    ValueError
+        If it is none, or of another kind of database, or says what the driver does not understand. The message does
+        not show it, since it may hold a password.
+    """
+    try:
+        url = make_url(text)
+    except (ArgumentError, ValueError) as error:
+        raise ValueError("not a database URL") from error
+    if url.drivername not in _DRIVERS:
+        raise ValueError(f"a database must be one of {', '.join(_DRIVERS)}, not {url.drivername}")
+    kind = url.get_backend_name()
+    if kind == "sqlite" and "uri" in url.query:  # which can turn locks off, and name no file
+        raise ValueError("a SQLite database is named by its path, not by a URI")
+    if not set(url.query) <= set(_OPTIONS[kind]):
+        raise ValueError(f"the URL of a {kind} database may have no other option than {', '.join(_OPTIONS[kind])}")
+    if kind == "sqlite" and "timeout" in url.query and not _is_timeout(url.query["timeout"]):
+        raise ValueError(f"a SQLite database's timeout must be a number of seconds from 0 to {MOST_TIMEOUT_S:g}")
+    url = url.set(drivername=_DRIVERS[url.drivername])
+    try:
+        url.get_dialect()().create_connect_args(url)
+    except (ArgumentError, ValueError, TypeError) as error:
+        raise ValueError(f"not the URL of a {kind} database") from error
+    return url
+
+
+def _is_timeout(value: object) -> bool:
+    try:
+        return isinstance(value, str) and 0 <= float(value) <= MOST_TIMEOUT_S
+    except ValueError:
+        return False
