@@ -73,7 +73,7 @@ class Settings(BaseSettings):
         description="Address by which clients reach the gateway, as proofs must name it; by default any host does.",
     )
     latency_budget_ms: float = Field(
-        200.0, gt=0, le=60_000, description="Budget of sessions that name none: from a frame's head to its answer."
+        200.0, ge=1, le=60_000, description="Budget of sessions that name none: from a frame's head to its answer."
     )
     gather_ms: float = Field(
         100.0,
@@ -93,7 +93,7 @@ class Settings(BaseSettings):
     )
     max_body_bytes: int = Field(32 * 2**20, ge=1024, le=2**40, description="Largest request body.")
     body_timeout_s: float = Field(
-        10.0, gt=0, le=86_400, description="Time that a body may take from first to last byte."
+        10.0, ge=0.1, le=86_400, description="Time that a body may take from first to last byte."
     )
     max_inflight_bytes: int = Field(
         2**29, ge=2**20, le=2**50, description="Bodies of all requests in hand; beyond, more are refused unread."
@@ -101,7 +101,7 @@ class Settings(BaseSettings):
     max_inflight_bytes_per_key: int = Field(
         2**28, ge=2**20, le=2**50, description="The same of the sessions of one API key."
     )
-    max_budget_ms: float = Field(60_000, gt=0, le=60_000, description="Longest latency budget of a session.")
+    max_budget_ms: float = Field(60_000, ge=1, le=60_000, description="Longest latency budget of a session.")
     max_gather_ms: float = Field(60_000, ge=0, le=60_000, description="Longest wait for teammates of a session.")
     max_hypotheses: int = Field(
         1000, ge=1, le=MAX_BUDGET, description="Hypotheses tested in a frame, whatever its budget."
@@ -146,7 +146,7 @@ class Settings(BaseSettings):
     )
     audit_max_records: int = Field(
         2_000_000,
-        ge=1,
+        ge=2,  # the first says that the session was opened
         le=10**12,
         description="Records of one session's log; beyond, its frames are refused. One has about 2 kB.",
     )

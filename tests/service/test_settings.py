@@ -45,6 +45,26 @@ def test_its_default_is_not(name, environment):
     assert getattr(settings_of_environment(), name) == Settings.model_fields[name].default
 
 
+@pytest.mark.parametrize(
+    ("name", "value", "least"),
+    [
+        ("latency_budget_ms", "1e-9", "1"),
+        ("max_budget_ms", "0.999", "1"),
+        ("body_timeout_s", "1e-9", "0.1"),
+        ("audit_max_records", "1", "2"),
+    ],
+)
+def test_what_would_leave_every_frame_without_an_answer_is_refused_with_the_least_that_will_do(
+    name, value, least, environment
+):
+    variable = f"ROBOSAC_{name.upper()}"
+    environment(**{variable: value})
+    with pytest.raises(SettingsError, match=f"^{variable}: .* greater than or equal to {least}$"):
+        settings_of_environment()
+    environment(**{variable: least})
+    settings_of_environment()
+
+
 @pytest.mark.parametrize("value", ["", " "])
 def test_a_path_that_is_set_to_nothing_is_none(value, environment):
     paths = [name for name, field in Settings.model_fields.items() if field.annotation == Path | None]
