@@ -21,6 +21,11 @@ GET = select(*(sessions.c[name] for name in FIELDS)).where(THIS)
 GET_TO_CHANGE = GET.with_for_update()  # SQLite, which knows no such clause, has locked everything by then
 GET_BUT_STATE = select(*(sessions.c[name] for name in FIELDS if name != "state")).where(THIS).with_for_update()
 CHANGE = update(sessions).where(THIS)
+TOUCH = (
+    update(sessions)
+    .where(THIS, OPEN, sessions.c.touched_at < bindparam("used_at"))
+    .values(touched_at=bindparam("used_at"))
+)
 NO_CHANGE = update(sessions).where(false()).values(ended_at=None)
 """A database that takes no changes refuses it all the same; PostgreSQL is asked nothing before the first statement."""
 

@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable, Collection, Mapping
+from collections.abc import Callable, Collection, Mapping, Sequence
 from dataclasses import replace
 from typing import Any
 
@@ -17,7 +17,7 @@ from service.keeping.database import connect
 from service.keeping.limits import Limits
 from service.keeping.patience import Patience
 from service.keeping.record import SessionRecord
-from service.keeping.rows import FIELDS, GET, NO_CHANGE, OPEN, columns, read_row
+from service.keeping.rows import FIELDS, GET, NO_CHANGE, OPEN, TOUCH, columns, read_row
 from service.keeping.sealing import Draft, Ready, Sealing, drafted, sealed
 from service.keeping.seen import Seen
 from service.keeping.tables import audit_lines, kept_messages, sessions
@@ -210,9 +210,8 @@ class Store:
     async def audit(self, session_id: str, after: int, limit: int = PAGE) -> list[str]:
         """Lines with a number above ``after``, in order: the first ``limit`` of them."""
         of_session = (audit_lines.c.session_id == session_id, audit_lines.c.seq > after)
-        return await self._column(
-            select(audit_lines.c.line).where(*of_session).order_by(audit_lines.c.seq).limit(limit)
-        )
+        lines = select(audit_lines.c.line).where(*of_session)
+        return await self._column(lines.order_by(audit_lines.c.seq).limit(limit))
 
     def check_room(self, record: SessionRecord) -> None:
         """Refuse what would be on record in a log that holds as many records as it may.
@@ -226,9 +225,8 @@ class Store:
 
     async def messages(self, session_id: str, frame: int) -> bytes | None:
         """The messages kept of a decided frame."""
-        query = select(kept_messages.c.body).where(
-            kept_messages.c.session_id == session_id, kept_messages.c.frame == frame
-        )
+        of_frame = (kept_messages.c.session_id == session_id, kept_messages.c.frame == frame)
+        query = select(kept_messages.c.body).where(*of_frame)
         return await self._database.read(lambda connection: connection.execute(query).scalar())
 
     async def end(self, session_id: str, event: SessionEnded) -> None:
@@ -236,8 +234,12 @@ class Store:
         await self._append(session_id, event, lambda _: {"ended_at": event.time})
 
     async def unused_since(self, moment: float) -> list[str]:
-        """Open sessions to which nothing was added since then (Unix time)."""
+        """Open sessions to which nothing was added, and that were not touched, since then (Unix time)."""
         return await self._column(select(sessions.c.session_id).where(OPEN, sessions.c.touched_at < moment))
+
+    async def touch(self, used: Mapping[str, float]) -> None:
+        """Note when open sessions were used last (Unix time) where that added nothing to them."""
+        await self._execute(TOUCH, [{"this": session_id, "used_at": at} for session_id, at in used.items()])
 
     async def purge(self, moment: float) -> None:
         """Forget the sessions that ended before then (Unix time), as `service.keeping.purging.purge` does."""
@@ -269,9 +271,8 @@ class Store:
     async def _column(self, query: Select[Any]) -> list[str]:
         return await self._database.read(lambda connection: list(connection.execute(query).scalars()))
 
-    async def _execute(self, statement: Delete | Update) -> int:
-        """Rows that a statement changed."""
-        return await self._database.write(lambda connection: int(connection.execute(statement).rowcount))
+    async def _execute(self, statement: Delete | Update, rows: Sequence[Mapping[str, Any]] | None = None) -> int:
+        return await self._database.write(lambda connection: int(connection.execute(statement, rows).rowcount))
 
     async def _append(
         self,

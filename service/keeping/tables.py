@@ -37,7 +37,7 @@ sessions = Table(
     Column("revision", BigInteger, nullable=False),
     Column("key_id", Text, nullable=False, server_default=""),
     Column("holder", Text, nullable=False, server_default=""),
-    Column("touched_at", Double, nullable=False),  # Unix time of the last audit record
+    Column("touched_at", Double, nullable=False),  # Unix time of the last audit record, or of a later use
 )
 _open, _ended = sessions.c.ended_at.is_(None), sessions.c.ended_at.is_not(None)
 Index("sessions_open", sessions.c.touched_at, sqlite_where=_open, postgresql_where=_open)

@@ -26,6 +26,7 @@ from service.schemas import SessionState
 from service.sessions.detectors import OTHER_WEIGHTS, detector_changed, has_changed
 from service.sessions.gathering import Gathering
 from service.sessions.identity import Tokens
+from service.sessions.idle import Idle
 from service.sessions.journal import Journal
 from service.sessions.live import Caller, LiveSession
 from service.sessions.motion import Motion
@@ -36,7 +37,6 @@ from service.watching.metrics import Metrics
 
 logger = structlog.stdlib.get_logger(__name__)
 
-SWEEP_EVERY_S = 30.0
 COLD_S = 2.0
 """How long the store may take to tell of a session that is not in use here, whose budget is not known yet."""
 
@@ -59,6 +59,7 @@ class Sessions:
 
     def __post_init__(self) -> None:
         self._live: dict[str, LiveSession] = {}
+        self._idle = Idle(self.store, self._live, self.settings.session_idle_s)
         self._standing: set[str] = set()
         try:
             self.defenses = known(self.settings.extra_defenses)
@@ -164,14 +165,14 @@ class Sessions:
     async def expire_idle(self) -> None:
         """End, every so often and for ever, the sessions that nobody has used for too long, and purge old logs."""
         while True:
-            await asyncio.sleep(min(SWEEP_EVERY_S, self.settings.session_idle_s / 2))
+            await asyncio.sleep(self._idle.every_s)
             try:
-                for session_id in await self.store.unused_since(time.time() - self.settings.session_idle_s):
-                    if not self._in_use(session_id):
-                        await self._end(session_id, "expired")
-                for session_id in [one for one in self._live if self._is_idle(one)]:
+                for session_id in await self._idle.unused():
+                    await self._end(session_id, "expired")
+                for session_id in [one for one in self._live if self._idle.may_be_over(one)]:
                     record = await self.store.get(session_id)
-                    moved = record is not None and self.moving.is_elsewhere(record) and self._is_idle(session_id)
+                    moved = record is not None and self.moving.is_elsewhere(record)
+                    moved = moved and self._idle.may_be_over(session_id)
                     if record is None or record.ended_at is not None or moved:
                         self._forget(session_id)
                 await self.store.purge(time.time() - self.settings.audit_retention_s)
@@ -246,17 +247,6 @@ class Sessions:
             self._standing.add(record.session_id)
             await self.store.log(record.session_id, event)
         return record
-
-    def _in_use(self, session_id: str) -> bool:
-        """Whether a frame is in hand, or somebody asked for something lately that left no trace in the store."""
-        live = self._live.get(session_id)
-        recently = time.monotonic() - self.settings.session_idle_s
-        return live is not None and (live.lock.locked() or live.last_used >= recently)
-
-    def _is_idle(self, session_id: str) -> bool:
-        """Whether it may be that what is held of a session is of no use here any more."""
-        live = self._live.get(session_id)
-        return live is None or live.is_quiet or not self._in_use(session_id)
 
     def _forget(self, session_id: str) -> None:
         live = self._live.pop(session_id, None)

@@ -165,6 +165,17 @@ async def test_a_session_that_ended_at_one_gateway_is_over_at_the_other(two, mes
     assert (await other.ego(session).audit())[-1]["event"] == "session_ended"
 
 
+async def test_a_session_that_is_only_read_at_one_gateway_is_not_ended_by_the_other(url):
+    async with serve(database_url=url, session_idle_s=0.6) as one, serve(database_url=url, session_idle_s=0.6):
+        session = await one.open()
+        for _ in range(40):
+            await asyncio.sleep(0.05)
+            await one.ego(session).state()
+        await asyncio.sleep(1.5)
+        with pytest.raises(SessionNotFound):
+            await one.ego(session).state()
+
+
 async def test_teams_that_change_at_both_gateways_at_once(two):
     one, other = two
     session = await one.open(defense={"kind": "none"})

@@ -194,8 +194,9 @@ async def test_idle_sessions_are_found_and_only_ended_ones_are_purged(store):
     idle, ended = await added(store), await added(store, 1)
     await store.decide(a_session(1), a_decision(0), "00" * 32, b"kept")
     await store.end(ended, THE_END)
-    assert await store.unused_since(LATER) == [idle]
-    assert await store.unused_since(time.time() - 60) == []
+    assert [await store.unused_since(moment) for moment in (LATER, time.time() - 60)] == [[idle], []]
+    await store.touch({idle: LATER, ended: LATER})
+    assert await store.unused_since(LATER) == []
     await store.purge(time.time() - 60)
     assert await store.get(ended) is not None
     await store.purge(LATER)
