@@ -31,7 +31,7 @@ from robosac.cli.options import check_attack, load_data, load_detector
 from robosac.detectors import DEFAULT_DETECTOR, Detector
 from robosac.evaluation.frames import another_scene
 from robosac.recording.truth import Truth
-from robosac.scenes import DATA_HELP, DEFAULT_DATA, SOURCES, first_scenes
+from robosac.scenes import DATA_HELP, DEFAULT_DATA, first_scenes, load_source
 from robosac.wire import Packing
 
 RECENT = 12
@@ -185,7 +185,7 @@ async def run_fleet(options: FleetOptions, console: Console) -> FleetSummary:
     if fault := attacks.lacking(attack, detector):
         raise ValueError(fault)
     count = options.first_scene + options.scenes
-    source = SOURCES.make(options.data)
+    source = load_source(options.data)
     scenes = first_scenes(source, "test", count, options.frames)
     summary = FleetSummary(detector)
     screen = _Screen(console, options.scenes * options.frames * options.egos)

@@ -14,7 +14,7 @@ from robosac.calibration.reliability import ReliabilityBin, check
 from robosac.calibration.verdicts import STRETCH, STRETCH_STRIDE, Stretch, Trial, collect, validation_stretches
 from robosac.defenses.group_testing import Calibration, EvidenceModel, GroupTesting
 from robosac.detectors import Detector
-from robosac.scenes import DEFAULT_DATA, SOURCES, Scene, first_scenes
+from robosac.scenes import DEFAULT_DATA, Scene, first_scenes, load_source
 
 _STREAM = 41
 _CHECK = 1
@@ -37,7 +37,7 @@ class Recipe:
     """Ascending; a level each."""
     seed: int = 0
     data: str = DEFAULT_DATA
-    """As `robosac.scenes.SOURCES` takes it."""
+    """As `robosac.scenes.load_source` takes it."""
 
     def __post_init__(self) -> None:
         if not self.attacks or not self.attackers or not self.pose_errors_m:
@@ -130,7 +130,7 @@ def load_attacks(detector: Detector, names: Sequence[str]) -> dict[str, Attack]:
 def _scenes(recipe: Recipe) -> list[Scene]:
     """Those to fit to, and after them those to check on."""
     frames = STRETCH_STRIDE * (recipe.stretches_per_scene - 1) + STRETCH
-    source, count = SOURCES.make(recipe.data), recipe.scenes + recipe.check_scenes
+    source, count = load_source(recipe.data), recipe.scenes + recipe.check_scenes
     return first_scenes(source, "validation", count, frames, max(recipe.attackers))
 
 

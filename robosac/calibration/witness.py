@@ -30,7 +30,7 @@ class WitnessRecipe:
     """What a witness is trained on, and how."""
 
     data: tuple[str, ...] = (DEFAULT_DATA,)
-    """As `robosac.scenes.SOURCES` takes each; all count alike."""
+    """As `robosac.scenes.load_source` takes each; all count alike."""
     scenes: int = 200
     """Of each."""
     frames_per_scene: int = 3

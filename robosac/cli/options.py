@@ -23,7 +23,7 @@ from robosac import detectors
 from robosac.attacks import Attack, Campaign, lacking
 from robosac.cli.blame import blaming
 from robosac.detectors import Detector
-from robosac.scenes import DATA_HELP, SOURCES, WORLDS, SceneSource, World
+from robosac.scenes import DATA_HELP, WORLDS, SceneSource, World, load_source
 
 DetectorName = Annotated[
     str, typer.Option("--detector", "--weights", help="A detector's name, its weights file, or module:callable.")
@@ -45,7 +45,7 @@ def load_detector(name: str) -> Detector:
 def load_data(name: str) -> SceneSource:
     """The scene source of ``--data``."""
     with blaming("--data", ValueError):
-        return SOURCES.make(name)
+        return load_source(name)
 
 
 def load_worlds(names: Sequence[str]) -> dict[str, SceneSource]:
@@ -56,7 +56,7 @@ def load_worlds(names: Sequence[str]) -> dict[str, SceneSource]:
         if len(folders) < len(asked):
             raise ValueError("two of them would have the same folder")
         return {
-            folder: SOURCES.make(name if ":" in name else f"{World.kind}:{name}") for folder, name in folders.items()
+            folder: load_source(name if ":" in name else f"{World.kind}:{name}") for folder, name in folders.items()
         }
 
 

@@ -14,6 +14,7 @@ from robosac.scenes.base import (
     seconds_apart,
     whose_turn,
 )
+from robosac.scenes.checked import CheckedSource
 from robosac.scenes.intersection import FRAME_PERIOD_S, AgentView, IntersectionScene, SceneFrame
 from robosac.scenes.lidar import Lidar
 from robosac.scenes.worlds import WORLDS, World
@@ -30,6 +31,19 @@ SOURCES: Kind[SceneSource] = Kind(
     error=SceneError,
 )
 """All sources by name; `Kind.make` makes one."""
+
+
+def load_source(text: str) -> SceneSource:
+    """The source that ``--data`` asks for; the frames of one that does not ship are checked as they are read.
+
+    Raises
+    ------
+    SceneError
+        If there is no such source, or it is none.
+    """
+    made = SOURCES.make(text)
+    return made if type(made) in SOURCES.shipped.values() else CheckedSource(made)
+
 
 __all__ = [
     "DATA_HELP",
@@ -50,6 +64,7 @@ __all__ = [
     "World",
     "encoded",
     "first_scenes",
+    "load_source",
     "one_scene",
     "seconds_apart",
     "whose_turn",

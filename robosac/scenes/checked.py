@@ -1,0 +1,182 @@
+"""Scenes of one's own, whose frames are checked as they are read.
+
+Boxes with a column too many or a pose that is no pose would not stop an evaluation: they would make its figures wrong.
+So what a foreign source gives is looked at wherever a frame of it is read, and what has a wrong form is an error that
+says where it stands.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Callable, Iterator, Mapping, Sequence
+from contextlib import contextmanager
+from dataclasses import dataclass
+from typing import Any
+
+import numpy as np
+
+from robosac.boxes import FloatArray, pose_fault
+from robosac.scenes.base import Frame, Scene, SceneError, SceneSource, Split, View
+
+BOX_COLUMNS = 5
+_FEW = 100
+"""Returns that are looked at first, since of most views one of them is finite."""
+
+
+@dataclass(frozen=True)
+class CheckedFrame:
+    """A frame whose views have been checked, and whose true boxes are checked when they are asked for."""
+
+    original: Frame
+    where: str
+    """Source, scene and frame, for messages."""
+
+    @property
+    def index(self) -> int:
+        """That of the original."""
+        return self.original.index
+
+    @property
+    def views(self) -> Mapping[str, View]:
+        """Those of the original."""
+        return self.original.views
+
+    def truth(self, ego: str) -> FloatArray:
+        """True boxes (G, 5) of the original.
+
+        Raises
+        ------
+        SceneError
+            If they have another shape, or one is not finite, or they cannot be had.
+        """
+        part = f"truth({ego!r})"
+        with _said(f"{self.where}: {part}"):
+            boxes = self.original.truth(ego)
+        if _shape(boxes) == (0,):
+            return np.empty((0, BOX_COLUMNS))
+        if not isinstance(boxes, np.ndarray) or boxes.ndim != 2 or boxes.shape[1] != BOX_COLUMNS:
+            raise SceneError(f"{self.where}: {part} must be (G, {BOX_COLUMNS}), got {_shown(boxes)}")
+        if not _finite(boxes).all():
+            raise SceneError(f"{self.where}: {part} must be finite numbers")
+        return boxes
+
+    def __getattr__(self, name: str) -> Any:
+        if name in ("original", "where"):  # not there yet, while it is unpickled
+            raise AttributeError(name)
+        return getattr(self.original, name)
+
+
+@dataclass(frozen=True)
+class CheckedScene:
+    """A scene whose frames are checked."""
+
+    scene: Scene
+    source: str
+    """Its source's name, for messages."""
+
+    @property
+    def number(self) -> int:
+        return self.scene.number
+
+    @property
+    def agents(self) -> Sequence[str]:
+        return self.scene.agents
+
+    @property
+    def egos(self) -> Sequence[str]:
+        return self.scene.egos
+
+    @property
+    def length(self) -> int | None:
+        return self.scene.length
+
+    @property
+    def frame_period_s(self) -> float:
+        return self.scene.frame_period_s
+
+    def frame(self, index: int) -> Frame:
+        """A frame of the scene, its views checked.
+
+        Raises
+        ------
+        SceneError
+            If it cannot be had, or a view has not the form that it must have.
+        """
+        where = f"{self.source}, scene {self.number}, frame {index}"
+        with _said(where):
+            frame = self.scene.frame(index)
+            for name, view in frame.views.items():
+                fault = view_fault(view)
+                if fault is not None:
+                    raise SceneError(f"{name}: {fault}")
+        return CheckedFrame(frame, where)
+
+
+class CheckedSource:
+    """A source whose scenes are checked; it keeps scenes for training if the original does."""
+
+    def __init__(self, original: SceneSource) -> None:
+        self.original = original
+        keep: Callable[[], Sequence[Scene]] | None = getattr(original, "training_scenes", None)
+        if keep is not None:
+            self.training_scenes = self._training_scenes
+
+    @property
+    def name(self) -> str:
+        """That of the original."""
+        return self.original.name
+
+    def scenes(self, split: Split) -> Sequence[Scene]:
+        """Those of the original, in its order."""
+        with _said(self.name):
+            return [CheckedScene(scene, self.name) for scene in self.original.scenes(split)]
+
+    def _training_scenes(self) -> Sequence[Scene]:
+        with _said(self.name):
+            kept: Sequence[Scene] = self.original.training_scenes()  # type: ignore[attr-defined]
+            return [CheckedScene(scene, self.name) for scene in kept]
+
+
+def view_fault(view: View) -> str | None:
+    """What is wrong with a view's form; None if nothing is.
+
+    Some returns may be no numbers, as scanners have it where nothing came back; all of them may not. Of a view with
+    the message that was sent only the pose counts.
+    """
+    pose, points = view.pose, view.points
+    if _shape(pose) != (4, 4) or not _finite(pose).all():
+        return f"pose must be 4 x 4 finite numbers, got {_shown(pose)}"
+    fault = pose_fault(pose)
+    if fault is not None:
+        return f"pose {fault}"
+    if getattr(view, "message", None) is not None:
+        return None
+    if not isinstance(points, np.ndarray) or points.ndim != 2 or points.shape[1] < 3:
+        return f"points must be (P, 3), got {_shown(points)}"
+    if len(points) and not any(_finite(some[:, :3]).all(axis=1).any() for some in (points[:_FEW], points)):
+        return "points must be finite numbers, and none is"
+    return None
+
+
+@contextmanager
+def _said(where: str) -> Iterator[None]:
+    """Say of whatever goes wrong where it did."""
+    try:
+        yield
+    except SceneError as error:
+        raise SceneError(f"{where}: {error}") from error
+    except Exception as error:  # the user's code may raise anything
+        said = " ".join(str(error).split())
+        raise SceneError(f"{where}: {type(error).__name__}: {said}") from error
+
+
+def _finite(array: Any) -> Any:
+    """Which entries are finite numbers; none of what holds no numbers."""
+    return np.isfinite(array) if array.dtype.kind in "fiu" else np.zeros(array.shape, dtype=bool)
+
+
+def _shape(value: object) -> tuple[int, ...] | None:
+    return value.shape if isinstance(value, np.ndarray) else None
+
+
+def _shown(value: object) -> str:
+    return str(value.shape) if isinstance(value, np.ndarray) else f"a {type(value).__name__}"
