@@ -69,15 +69,14 @@ def verify(
 def show(file: Log) -> None:
     """Tell what a log says, a sentence a record; 1 if a line is no record. It proves nothing: that is for `verify`."""
     broken = 0
-    with blaming("FILE", OSError), file.open("rb") as lines:
-        for number, line in enumerate(lines, 1):
-            try:
-                record, told = read(line.removesuffix(b"\n")), sentence(line)
-            except RecordError as error:
-                broken += 1
-                _say(f"line {number}: {error}", err=True)
-            else:
-                _say(f"{record.get('seq', '?')} {record.get('time', '')} {told}")
+    for number, line in enumerate(_lines(file), 1):
+        try:
+            record, told = read(line.removesuffix(b"\n")), sentence(line)
+        except RecordError as error:
+            broken += 1
+            _say(f"line {number}: {error}", err=True)
+        else:
+            _say(f"{record.get('seq', '?')} {record.get('time', '')} {told}")
     if broken:
         raise typer.Exit(1)
 
@@ -154,6 +153,14 @@ def report(
     with blaming("--out", OSError):
         write_text(out, text)
     _say(f"{out}: {len(fields['report']['content']['v2xPduEvidence'])} observations of {vehicle}")
+
+
+def _lines(file: Path) -> Iterator[bytes]:
+    """The lines of a file, which is not to blame for what goes wrong between them: whoever reads what is told may be
+    gone.
+    """
+    with blaming("FILE", OSError), file.open("rb") as lines:
+        yield from lines
 
 
 def _read_receipts(file: Path, keys: list[str]) -> Receipts:

@@ -1,4 +1,6 @@
 import json
+import subprocess
+import sys
 from typing import get_args
 
 import pytest
@@ -112,3 +114,14 @@ def test_the_command_shows_a_log_and_obeys_no_word_of_it(events, tmp_path):
     assert "line 3: not JSON" in broken.output
     assert broken.output.splitlines()[-1].endswith(sentence(lines[1]))
     assert CliRunner().invoke(app, ["audit", "show", "/nowhere"]).exit_code == 2
+
+
+def test_whoever_has_read_enough_ends_it_without_a_word(lines, tmp_path):
+    path = tmp_path / "log.jsonl"
+    path.write_bytes(lines[0] * 5000)
+    words = [sys.executable, "-c", "from robosac.cli import app; app()", "audit", "show", str(path)]
+    with subprocess.Popen(words, stdout=subprocess.PIPE, stderr=subprocess.PIPE, text=True) as shown:
+        assert shown.stdout.readline().endswith(".\n")
+        shown.stdout.close()
+        assert shown.stderr.read() == ""
+    assert shown.returncode == 1
