@@ -85,8 +85,6 @@ def _is_for_connections(given: socket.socket) -> bool:
 def _advice(address: object) -> str:
     where = ":".join(map(str, address[:2])) if isinstance(address, tuple) else address
     return (
-        f"another worker serves {where} already, and teammates' messages wait in the memory of one process: start one "
-        "worker (no --workers, no WEB_CONCURRENCY); for more, start gateways on ports of their own and one database, "
-        "behind a proxy that chooses by the session's id in the path, such as HAProxy with deploy/haproxy.cfg "
-        "(docs/scaling.md)"
+        "start one worker (no --workers, no WEB_CONCURRENCY); docs/scaling.md has how several gateways share the work. "
+        f"Another worker serves {where} already, and teammates' messages wait in the memory of one process"
     )

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import os
 from typing import Annotated
 
 import typer
@@ -15,6 +16,8 @@ GRACE_S = 5
 """How long requests in hand may take after a SIGTERM; by their budgets they take less."""
 FAILED_START = 3
 """What uvicorn ends with where the application cannot start; it has said why."""
+WORKERS = "WEB_CONCURRENCY"
+"""The environment's variable by which uvicorn starts several workers."""
 
 
 def main(
@@ -39,8 +42,24 @@ def main(
         except MissingExtra as missing:
             raise typer.BadParameter(str(missing), param_hint="--cluster") from missing
         return
+    workers = os.environ.get(WORKERS, "")
+    if workers.isdecimal() and int(workers) > 1:
+        typer.echo(
+            f"Error: {WORKERS}: docs/scaling.md has how several gateways share the work; one of them has one "
+            f"worker, not {workers}",
+            err=True,
+        )
+        raise typer.Exit(2)
     try:
         # as uvicorn's own command does, the working directory may hold modules of the user's own detectors
-        uvicorn.run("service.app:app", host=host, port=port, http=HTTP, timeout_graceful_shutdown=GRACE_S, app_dir="")
+        uvicorn.run(
+            "service.app:app",
+            host=host,
+            port=port,
+            http=HTTP,
+            workers=1,
+            timeout_graceful_shutdown=GRACE_S,
+            app_dir="",
+        )
     except SystemExit as end:
         raise SystemExit(2 if end.code == FAILED_START else end.code) from end

@@ -74,7 +74,7 @@ def test_two_workers_of_a_server_are_refused_with_a_word_on_what_to_do(tmp_path)
     with running([*UVICORN, "--port", "0"], tmp_path, WEB_CONCURRENCY="2") as (process, log):
         process.wait(120)
         said = log.read_text()
-        assert "another worker serves 127.0.0.1:" in said
+        assert "Another worker serves 127.0.0.1:" in said
         assert "start one worker (no --workers, no WEB_CONCURRENCY)" in said
         assert "stopping the parent process" in said
 

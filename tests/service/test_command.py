@@ -45,6 +45,7 @@ def test_serve_runs_the_gateway_where_it_is_told_until_it_is_terminated(tmp_path
     ("variable", "value", "complaint"),
     [
         ("ROBOSAC_LATENCY_BUDGET_MS", "soon", "Error: ROBOSAC_LATENCY_BUDGET_MS: Input should be a valid number, "),
+        ("WEB_CONCURRENCY", "2", "Error: WEB_CONCURRENCY: docs/scaling.md has how several gateways share the work; "),
         ("ROBOSAC_EXTRA_DETECTORS", "nonesuch:build", "ROBOSAC_EXTRA_DETECTORS: nonesuch:build: ModuleNotFoundError"),
     ],
 )
