@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import asyncio
 import time
-from collections import deque
+from collections import Counter, deque
 from collections.abc import Awaitable, Callable
 from dataclasses import asdict, dataclass, field
 from pathlib import Path
@@ -126,6 +126,7 @@ class _Vehicle:
     def __init__(self, vehicle_id: str, gateway: GatewayClient, options: FleetOptions) -> None:
         self.vehicle_id = vehicle_id
         self.gateway = gateway
+        self.refused: Counter[str] = Counter()
         self._tells, self._packing = options.truth, options.packing
         self._at: dict[str, VehicleClient] = {}
 
@@ -140,7 +141,7 @@ class _Vehicle:
         """Send to an ego; if it did not wait so long, its answer tells who is missing."""
         message = frame.sent[self.vehicle_id]
         try:
-            await _patiently(lambda: self._at[frame.ego_id].send(index, message))
+            await _patiently(lambda: self._at[frame.ego_id].send(index, message), self.refused)
         except FrameConflict as conflict:
             if not conflict.type.endswith("stale-frame"):
                 raise
@@ -149,12 +150,14 @@ class _Vehicle:
         """The answer, and after how many milliseconds it came."""
         started = time.perf_counter()
         truth = Truth(frame.truth, tuple(sorted(frame.attackers))) if self._tells else None
-        answer = await _patiently(lambda: self._at[frame.ego_id].ask(index, frame.message, truth))
+        answer = await _patiently(lambda: self._at[frame.ego_id].ask(index, frame.message, truth), self.refused)
         return answer, (time.perf_counter() - started) * 1e3
 
 
-async def _patiently(call: Callable[[], Awaitable[T]]) -> T:
+async def _patiently(call: Callable[[], Awaitable[T]], refused: Counter[str]) -> T:
     """Call; where the gateway cannot serve now and says when to ask again, do so: the machine may be slow for a while.
+
+    Each refusal after which it is asked again is counted, by the problem's type.
 
     Raises
     ------
@@ -167,6 +170,7 @@ async def _patiently(call: Callable[[], Awaitable[T]]) -> T:
         except GatewayUnavailable as busy:
             if busy.retry_after_s is None:
                 raise
+            refused[busy.type.rpartition(":")[2]] += 1
             await asyncio.sleep(busy.retry_after_s)
     return await call()
 
@@ -228,6 +232,8 @@ async def _run_scene(options: FleetOptions, fleet: Fleet, summary: FleetSummary,
         for ego_id in fleet.egos:
             await vehicles[ego_id].leave()
     finally:
+        for vehicle in vehicles.values():
+            summary.refused.update(vehicle.refused)
         await asyncio.gather(*(vehicle.gateway.aclose() for vehicle in vehicles.values()))
 
 

@@ -58,6 +58,8 @@ class FleetSummary:
     latencies_ms: list[float] = field(default_factory=list)
     steps: list[int] = field(default_factory=list)
     sources: Counter[str] = field(default_factory=Counter)
+    refused: Counter[str] = field(default_factory=Counter)
+    """By problem: requests that the gateway could not serve at first, and that were sent again."""
     with_attacker: int = 0
     in_time: int = 0
     participation: dict[str, Counter[str]] = field(default_factory=dict)
@@ -151,6 +153,7 @@ class FleetSummary:
             "sampling_steps": {"mean": float(np.mean(self.steps)), "max": int(np.max(self.steps))},
             "latency_ms": trial.percentiles(self.latencies_ms),
             "deadline_met_share": self.in_time / self.frames,
+            "refused_first": dict(self.refused),
         }
 
     def print(self, console: Console) -> None:
@@ -187,6 +190,9 @@ class FleetSummary:
             f"99 % {latency['p99']:.1f} ms; "
             f"{values['deadline_met_share']:.1%} within the budget."
         )
+        if count := self.refused.total():
+            requests = "request was" if count == 1 else "requests were"
+            console.print(f"{count} {requests} refused first ({', '.join(self.refused)}) and sent again.")
         if (naming := values["naming"]) is not None:
             after = naming["frames_until_named"]
             console.print(

@@ -4,6 +4,7 @@ import os
 import signal
 import subprocess
 import sys
+from collections import Counter
 from contextlib import nullcontext
 from types import ModuleType, SimpleNamespace
 from typing import Literal
@@ -21,10 +22,12 @@ from clients.errors import FrameConflict, GatewayUnavailable, GatewayUnreachable
 from clients.fleet import FleetOptions, _asked, _Vehicle, close_run, main, run_fleet
 from clients.local_gateway import local_gateway
 from clients.simulation import Fleet
+from clients.summary import FleetSummary
 from robosac import wire
 from robosac.attacks import PGD, load_campaign
 from robosac.defenses.halving import Halving
 from robosac.detectors.embedded import ADVERSARIAL_WEIGHTS
+from robosac.fusion import fuse
 from robosac.scenes import IntersectionScene
 
 
@@ -225,6 +228,27 @@ async def test_a_gateway_that_is_slow_for_a_while_is_asked_again(refusals, retry
     with nullcontext() if asked > refusals else pytest.raises(GatewayUnavailable):
         await vehicle.send(frame, 0)
     assert len(requests) == asked
+    assert vehicle.refused == ({"store-too-slow": asked - 1} if asked > 1 else {})
+
+
+@pytest.mark.parametrize(
+    ("refused", "said"),
+    [
+        ({}, None),
+        ({"overloaded": 1}, "1 request was refused first (overloaded) and sent again."),
+        ({"overloaded": 9, "draining": 2}, "11 requests were refused first (overloaded, draining) and sent again."),
+    ],
+)
+def test_the_summary_tells_what_was_refused_first(refused, said, detector):
+    (frame,) = Fleet(IntersectionScene(3), detector, 1, 0, PGD(steps=1), seed=0).sense(0)
+    result = fuse(detector, Halving(), frame.message, frame.sent, rng=np.random.default_rng(0))
+    summary = FleetSummary(detector, refused=Counter(refused))
+    summary.add(frame, result.answer(0, {}, {"total": 1.0}, frame.ego_id), 10.0)
+    console = Console(file=io.StringIO(), width=120)
+    summary.print(console)
+    text = console.file.getvalue()
+    assert said in text if said else "refused first" not in text
+    assert summary.as_dict()["refused_first"] == refused
 
 
 def test_settings_of_a_defence_need_its_kind():
