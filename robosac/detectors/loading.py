@@ -52,6 +52,8 @@ def load(detector: str = DEFAULT_DETECTOR) -> Detector:
         return loaded.in_precision(precision)
     if detector not in DETECTORS.shipped and there:
         return _open_weights(Path(detector))
+    if detector.endswith(".safetensors") or "/" in detector:
+        raise WeightsError(f"there is no file {detector}")
     return DETECTORS.make(detector)
 
 

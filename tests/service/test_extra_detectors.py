@@ -47,7 +47,7 @@ async def test_other_weights_of_a_shipped_detector_take_its_place():
 @pytest.mark.parametrize(
     ("extra", "complaint"),
     [
-        ("/nowhere.safetensors", "no detector '/nowhere.safetensors'"),
+        ("/nowhere.safetensors", "there is no file /nowhere.safetensors"),
         (f"{ADVERSARIAL_WEIGHTS}, {ADVERSARIAL_WEIGHTS}", "same name"),
         ("nonesuch:build", "No module named 'nonesuch'"),
     ],

@@ -47,7 +47,7 @@ def test_the_version_is_told():
         (["scene", "--out", "x.png", "--seed", "-1"], "--seed"),
         (["evaluate", "--attack", "nonesuch"], "no attack 'nonesuch'"),
         (["evaluate", "--attackers", "3", "--collaborators", "3"], "free of 3 attackers"),
-        (["evaluate", "--weights", "/nowhere"], "no detector '/nowhere': give one of"),
+        (["evaluate", "--weights", "/nowhere"], "there is no file /nowhere"),
         (["evaluate", "--weights", "."], "not a readable"),
         (["evaluate", "--detector", "nonesuch:build"], "No module named 'nonesuch'"),
         (["evaluate", "--scenes", "1001"], "1000 test scenes"),
