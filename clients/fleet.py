@@ -20,7 +20,7 @@ from rich.table import Table
 from clients import trial
 from clients.client import GatewayClient, OpenedSession, VehicleClient
 from clients.errors import FrameConflict, GatewayUnavailable
-from clients.simulation import EgoFrame, Fleet
+from clients.simulation import EgoFrame, Fleet, team_fault
 from clients.standing import shown
 from clients.summary import REPORT, FleetSummary
 from robosac import attacks, defenses, detectors
@@ -31,7 +31,7 @@ from robosac.cli.options import check_attack, load_data, load_detector
 from robosac.detectors import DEFAULT_DETECTOR, Detector
 from robosac.evaluation.frames import another_scene
 from robosac.recording.truth import Truth
-from robosac.scenes import DATA_HELP, DEFAULT_DATA, first_scenes, load_source
+from robosac.scenes import DATA_HELP, DEFAULT_DATA, SceneError, SceneSource, first_scenes, load_source
 from robosac.wire import Packing
 
 RECENT = 12
@@ -245,7 +245,7 @@ async def _exchange(vehicles: dict[str, _Vehicle], frame: EgoFrame, index: int) 
 
 
 def main(  # the options of a command line
-    url: Annotated[str, typer.Option(help="The gateway.")] = "http://127.0.0.1:8000",
+    url: Annotated[str, typer.Option(callback=trial.checked_url, help="The gateway.")] = "http://127.0.0.1:8000",
     scenes: Annotated[int, typer.Option(min=1, help="Sequences, each a session of its own.")] = 4,
     frames: Annotated[int, typer.Option(min=1, help="Frames of a sequence.")] = 25,
     first_scene: Annotated[int, typer.Option(min=0, help="Test scenes to leave out before.")] = 0,
@@ -263,7 +263,9 @@ def main(  # the options of a command line
     sampling_budget: Annotated[int | None, typer.Option(help="Most hypotheses a frame.")] = None,
     collaborators: Annotated[int | None, typer.Option(help="Teammates in a hypothesis.")] = None,
     seed: Annotated[int, typer.Option(help="Of the attackers' choice and starts.")] = 0,
-    budget_ms: Annotated[float | None, typer.Option(min=1, help="Latency budget; by default the gateway's.")] = None,
+    budget_ms: Annotated[
+        float | None, typer.Option(min=1, max=trial.MOST_BUDGET_MS, help="Latency budget; by default the gateway's.")
+    ] = None,
     real_time: Annotated[bool, typer.Option(help="Hold frames to the clock.")] = False,
     report: Annotated[Path | None, typer.Option(help="Folder for summary.json and example.png.")] = None,
     data: Annotated[str, typer.Option(help=DATA_HELP)] = DEFAULT_DATA,
@@ -284,7 +286,7 @@ def main(  # the options of a command line
     own = load_detector(detector)
     check_attack(campaign, own)
     _check_dtype(dtype, own)
-    load_data(data)
+    _check_scenes(load_data(data), first_scene, scenes, frames, egos, attackers)
     chosen = {"attacker_ratio": attacker_ratio, "sampling_budget": sampling_budget, "collaborators": collaborators}
     asked = _asked(defense, {name: value for name, value in chosen.items() if value is not None})
     options = FleetOptions(
@@ -307,6 +309,20 @@ def main(  # the options of a command line
         packing=Packing(dtype, compress),
     )
     close_run(options, trial.run(run_fleet(options, console), console, "The fleet", ValueError), console)
+
+
+def _check_scenes(source: SceneSource, first: int, scenes: int, frames: int, egos: int, attackers: int) -> None:
+    """Refuse what the scenes do not have: so many of them, so many frames, egos or attackers."""
+    with blaming("--data", SceneError):
+        there = source.scenes("test")
+        if len(there) < first + scenes:
+            option = "--first-scene" if first else "--scenes"
+            raise typer.BadParameter(f"{source.name} has {len(there)} test scenes", param_hint=option)
+        for scene in there[first : first + scenes]:
+            if scene.length is not None and scene.length < frames:
+                raise typer.BadParameter(f"scene {scene.number} has {scene.length} frames", param_hint="--frames")
+            if fault := team_fault(scene, egos, attackers):
+                raise typer.BadParameter(fault[1], param_hint=f"--{fault[0]}")
 
 
 def _check_dtype(dtype: str | None, detector: Detector) -> None:

@@ -103,7 +103,10 @@ def replay(
     own: Annotated[
         str | None, typer.Option("--recorded-defense", help="Where the recorded defence is, if it does not ship.")
     ] = None,
-    url: Annotated[str | None, typer.Option(help="A gateway to play it to, at the speed it was recorded.")] = None,
+    url: Annotated[
+        str | None,
+        typer.Option(callback=trial.checked_url, help="A gateway to play it to, at the speed it was recorded."),
+    ] = None,
     api_key: trial.ApiKey = None,
 ) -> None:
     """Decide the recorded frames again; 1 if recorded detector and defence do not come to the recorded answers."""
@@ -202,6 +205,10 @@ def _decide_again(
     other = None if defense is None else _defense(defense, loaded)
     with blaming("--recorded-defense", ValueError):
         kinds = None if own is None else defenses.known([own])
+    kind = opening.defense.get("kind")
+    if defense is None and kind not in (kinds or defenses.shipped()):
+        why = f"the recorded defence is {kind}, which does not ship: say where it is"
+        raise typer.BadParameter(why, param_hint="--recorded-defense")
     if loaded.info.weights_digest != opening.weights_digest:
         console.print(f"{loaded.info.name} has other weights than the recorded {opening.detector}.", highlight=False)
     compared = Compared()

@@ -44,6 +44,20 @@ class EgoFrame:
     """What the attack says that it lies about."""
 
 
+def team_fault(scene: Scene, egos: int, attackers: int) -> tuple[str, str] | None:
+    """What there cannot be so many of in a scene, ``egos`` or ``attackers``, and why; None if there can."""
+    if not 1 <= egos <= len(scene.egos):
+        return "egos", f"must be between 1 and the {len(scene.egos)} that may be one, got {egos}"
+    most = len(_others(scene, egos))
+    if not 0 <= attackers <= most:
+        return "attackers", f"must be between 0 and the {most} vehicles that are no egos, got {attackers}"
+    return None
+
+
+def _others(scene: Scene, egos: int) -> list[str]:
+    return [name for name in scene.agents if name not in scene.egos[:egos]]
+
+
 class Fleet:
     """Vehicles of one scene, some of them attackers.
 
@@ -80,13 +94,9 @@ class Fleet:
         seed: int,
         elsewhere: Scene | None = None,
     ) -> None:
-        others = [name for name in scene.agents if name not in scene.egos[:egos]]
-        if not 1 <= egos <= len(scene.egos):
-            raise ValueError(f"egos must be between 1 and the {len(scene.egos)} that may be one, got {egos}")
-        if not 0 <= attackers <= len(others):
-            raise ValueError(
-                f"attackers must be between 0 and the {len(others)} vehicles that are no egos, got {attackers}"
-            )
+        if fault := team_fault(scene, egos, attackers):
+            raise ValueError(" ".join(fault))
+        others = _others(scene, egos)
         self.scene = scene
         self.egos = scene.egos[:egos]
         self.detector = detector

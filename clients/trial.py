@@ -28,12 +28,25 @@ from robosac.files import write_text
 
 T = TypeVar("T")
 
-Url = Annotated[str | None, typer.Option(help="The gateway; by default one is started for the test.")]
+MOST_BUDGET_MS = 60_000
+"""Longer budgets no gateway grants."""
+
+
+def checked_url(url: str | None) -> str | None:
+    """The URL of a gateway, as an option has it."""
+    if url is not None and not url.startswith(("http://", "https://")):
+        raise typer.BadParameter(f"must begin with http:// or https://, got {url}")
+    return url
+
+
+Url = Annotated[
+    str | None, typer.Option(callback=checked_url, help="The gateway; by default one is started for the test.")
+]
 ApiKey = Annotated[
     str | None, typer.Option(envvar=API_KEY_VARIABLE, help="Opens sessions, where the gateway asks for one.")
 ]
 Seconds = Annotated[float, typer.Option(min=0.5, help="Length of each part.")]
-Budget = Annotated[float, typer.Option(min=1, help="Latency budget.")]
+Budget = Annotated[float, typer.Option(min=1, max=MOST_BUDGET_MS, help="Latency budget.")]
 Force = outputs.Force
 Out = Annotated[Path | None, typer.Option(help="Folder for the report, a JSON file.")]
 

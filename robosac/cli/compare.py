@@ -46,7 +46,7 @@ from robosac.evaluation.comparison.report import REPORT
 from robosac.evaluation.comparison.rows import EARLY
 from robosac.evaluation.comparison.worlds import WORLDS_REPORT
 from robosac.figures import need_figures
-from robosac.scenes import DEFAULT_DATA, SceneError
+from robosac.scenes import DEFAULT_DATA, SceneError, SceneSource
 
 
 def run(  # the options of a command line
@@ -95,6 +95,8 @@ def run(  # the options of a command line
     if world and data != DEFAULT_DATA:
         raise typer.BadParameter("--world says where scenes come from; --data does, too", param_hint="--world")
     chosen, sources = load_detector(detector), load_worlds(world) if world else {"": load_data(data)}
+    if setting:
+        _check_teams(sources, extent, "--world" if world else "--data")
     reports = [str(Path(name, REPORT)) for name in sources] + ([WORLDS_REPORT] if world else [])
     make_folder(out, "--out", force, *reports)
     if recordings is not None:
@@ -129,6 +131,18 @@ def _possible(extent: Extent, detector: Detector, asked: bool) -> tuple[tuple[Se
     if impossible and (asked or len(impossible) == len(faults)):
         raise typer.BadParameter("; ".join(impossible), param_hint="--detector")
     return tuple(setting for setting, fault in faults.items() if not fault), impossible
+
+
+def _check_teams(sources: Mapping[str, SceneSource], extent: Extent, option: str) -> None:
+    """Refuse a setting with more attackers than a scene has teammates."""
+    most = max(extent.settings, key=lambda setting: setting.attackers)
+    for source in sources.values():
+        with blaming(option, SceneError):
+            scenes = source.scenes("test")[: extent.scenes]
+        team = min((len(scene.agents) - 1 for scene in scenes), default=most.attackers)
+        if most.attackers > team:
+            why = f"{most.campaign}:{most.attackers}: a scene of {source.name} has {team} teammates"
+            raise typer.BadParameter(why, param_hint="--setting")
 
 
 def _defenses(only: Sequence[str], own: Sequence[str], detector: Detector) -> tuple[dict[str, Defense], list[str]]:

@@ -55,6 +55,8 @@ def run(  # the options of a command line
         if len(some) < (scenes or 1):
             raise SceneError(f"{source.name} has {len(some)} test scenes")
         team = max((len(scene.agents) - 1 for scene in some), default=0)
+        if attackers > team:
+            raise typer.BadParameter(f"a scene has at most {team} teammates, not {attackers}", param_hint="--attackers")
         if attackers + collaborators > team:
             why = f"no {collaborators} of {team} teammates can be free of {attackers} attackers"
             raise typer.BadParameter(why, param_hint="--collaborators")

@@ -161,7 +161,13 @@ def _chosen(  # the options of a command line
         settings = default_defense(chosen.info) if defense is None else defenses.load(defense)
         defenses.build(settings, lambda: calibration_of(chosen.info))
     with blaming("--data", SceneError):
-        where = one_scene(source, "test", scene, frames, max(1, attackers))
+        count = len(source.scenes("test"))
+        if scene >= count:
+            raise typer.BadParameter(f"{source.name} has {count} test scenes, counted from 0", param_hint="--scene")
+        where = one_scene(source, "test", scene, frames)
+    team = len(where.agents) - 1
+    if attackers > team:
+        raise typer.BadParameter(f"the scene has {team} teammates, not {attackers}", param_hint="--attackers")
     what = attack if attackers else HONEST
     return Scenario(chosen, source, where, what, attackers, frames, seed, pose_error), settings
 

@@ -251,6 +251,26 @@ def test_the_summary_tells_what_was_refused_first(refused, said, detector):
     assert summary.as_dict()["refused_first"] == refused
 
 
+@pytest.mark.parametrize(
+    ("option", "given", "why"),
+    [
+        ("--attackers", "9", "must be between 0 and the 5 vehicles that are no egos, got 9"),
+        ("--egos", "9", "must be between 1 and the 5 that may be one, got 9"),
+        ("--first-scene", "5000", "synthetic has 1000 test scenes"),
+        ("--scenes", "1001", "synthetic has 1000 test scenes"),
+        ("--url", "127.0.0.1:8800", "must begin with http:// or https://, got 127.0.0.1:8800"),
+        ("--budget-ms", "60001", "less than or equal to 60000"),
+        ("--detector", "nosuch.safetensors", "there is no file nosuch.safetensors"),
+    ],
+)
+def test_an_option_that_cannot_be_is_named(option, given, why):
+    result = CliRunner().invoke(command(main), [option, given])
+    assert result.exit_code == 2
+    said = " ".join(result.output.replace("│", "").split())
+    assert option in said
+    assert why in said
+
+
 def test_settings_of_a_defence_need_its_kind():
     result = CliRunner().invoke(command(main), ["--attacker-ratio", "0.4"])
     assert result.exit_code == 2

@@ -98,6 +98,13 @@ def test_what_cannot_be_done_is_said_before_it_is_begun(words, why, path, tmp_pa
     assert why in said
 
 
+def test_a_defence_that_does_not_ship_has_to_be_named(detector, recorded_moments, tmp_path):
+    path = write(tmp_path / "own.mcap", detector, recorded_moments[:1], defense={"kind": "of_my_own"})
+    status, said = run("replay", path)
+    assert status == 2
+    assert "for --recorded-defense: the recorded defence is of_my_own, which does not ship: say where it is" in said
+
+
 def test_a_recording_of_digests_cannot_be_replayed(detector, recorded_moments, tmp_path):
     path = write(tmp_path / "digests.mcap", detector, recorded_moments[:1], bodies=False)
     status, said = run("replay", path)

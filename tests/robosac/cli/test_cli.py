@@ -62,3 +62,20 @@ def test_bad_arguments_are_explained(arguments, complaint, tmp_path, monkeypatch
     result = runner.invoke(app, arguments)
     assert result.exit_code == 2
     assert complaint in " ".join(result.output.replace("│", "").split())
+
+
+@pytest.mark.parametrize(
+    ("words", "option", "why"),
+    [
+        (["evaluate", "--attackers", "6"], "--attackers", "a scene has at most 5 teammates, not 6"),
+        (["compare", "--setting", "pgd:9", "--out", "x"], "--setting", "pgd:9: a scene of synthetic has 5 teammates"),
+        (["show", "frame", "--scene", "5000", "--out", "x.png"], "--scene", "synthetic has 1000 test scenes"),
+    ],
+)
+def test_the_option_that_is_to_blame_is_named(words, option, why, tmp_path, monkeypatch):
+    monkeypatch.chdir(tmp_path)
+    result = runner.invoke(app, words)
+    assert result.exit_code == 2
+    said = " ".join(result.output.replace("│", "").split())
+    assert f"for {option}: {why}" in said
+    assert not list(tmp_path.iterdir())

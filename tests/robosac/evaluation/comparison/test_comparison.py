@@ -270,7 +270,7 @@ def test_the_command_with_all_its_options(tmp_path):
         (["--setting", "nonesuch:1"], "no attack 'nonesuch'"),
         (["--setting", "erase@nonesuch:1"], "unknown behaviour"),
         (["--setting", "erase"], "CAMPAIGN:NUMBER"),
-        (["--setting", "erase:6"], "scene 0 has 5 teammates; 6 are wanted"),
+        (["--setting", "erase:6"], "erase:6: a scene of synthetic has 5 teammates"),
         (["--scenes", "1001"], "synthetic has 1000 test scenes; 1001 are wanted"),
         (["--data", "nonesuch"], "no scene source 'nonesuch'"),
         (["--frames", "5"], "Invalid value for '--frames'"),
