@@ -66,7 +66,8 @@ class Sampling:
     """s, the size of a hypothesis."""
     budgets: tuple[int, ...] = (7, 5, 3, 1)
     """One row of Algorithm 1 for each, with independent draws as in the paper; one for the first of them where no
-    subset is drawn twice in a frame; and one with the gateway's defaults, which choose the hypotheses' size too.
+    subset is drawn twice in a frame; and one of `SampleConsensus` with its other settings by default, which choose the
+    hypotheses' size too.
     """
     repeats: int = 10
     """Runs of Algorithm 1 on each frame, so that the luck of its draws averages out; the fused passes are shared."""
@@ -80,7 +81,7 @@ class Sampling:
         given = {"attacker_ratio": ratio, "collaborators": s}
         rows = {f"Algorithm 1, N = {n}": SampleConsensus.independent(**given, sampling_budget=n) for n in self.budgets}
         rows[f"no subset twice, N = {self.budgets[0]}"] = SampleConsensus(**given, sampling_budget=self.budgets[0])
-        return rows | {"gateway default": SampleConsensus(attacker_ratio=ratio)}
+        return rows | {"sample_consensus": SampleConsensus(attacker_ratio=ratio)}
 
 
 def evaluate_bounds(

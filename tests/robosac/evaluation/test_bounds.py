@@ -35,6 +35,7 @@ def test_steps_and_success_follow_the_exact_law(report):
     assert rows["Algorithm 1, N = 1"].success_rate == pytest.approx(0.4, abs=0.2)
     assert rows["Algorithm 1, N = 7"].mean_steps == pytest.approx(2.4, abs=0.8)
     assert rows["no subset twice, N = 7"].success_rate >= 0.95
+    assert rows["sample_consensus"].success_rate >= 0.95
     assert rows["ego only"].mean_steps is None
 
 
