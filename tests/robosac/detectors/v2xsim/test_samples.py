@@ -73,7 +73,7 @@ def test_evaluate_runs_on_samples(root, weights, tmp_path):
     ("break_it", "complaint"),
     [
         (shutil.rmtree, "is no folder"),
-        (lambda root: [shutil.rmtree(root / f"agent{k}") for k in range(1, 6)], "no 3 of 0 teammates"),
+        (lambda root: [shutil.rmtree(root / f"agent{k}") for k in range(1, 6)], "at most 0 teammates, not 1"),
         (lambda root: (root / "agent3" / "8_0" / "0.npy").write_bytes(b"cos\nsystem\n"), "agent3/8_0/0.npy"),
     ],
 )
