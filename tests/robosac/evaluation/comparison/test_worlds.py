@@ -115,7 +115,7 @@ def test_several_comparisons_are_each_as_by_itself(detector):
         (["--world", "highway", "--data", "world:car-park"], "--data does, too"),
         (["--world", "no.such:module"], "no.such:module: ModuleNotFoundError"),
         (["--world", "v2x-sim:a/b", "--world", "v2x-sim:a-b"], "two of them would have the same folder"),
-        (["--world", "highway", "--setting", "noise:6"], "scene 0 has 5 teammates; 6 are wanted"),
+        (["--world", "highway", "--setting", "noise:6"], "noise:6: a scene of world:highway has 5 teammates"),
     ],
 )
 def test_worlds_that_make_no_sense_are_refused(arguments, complaint, tmp_path):
@@ -129,6 +129,6 @@ def test_all_asks_for_every_world(tmp_path):
         "--world", "all", "--only", "no defence", "--setting", "noise:6", "--scenes", "1", "--out", str(tmp_path)
     )
     assert result.exit_code == 2
-    assert "scene 0 has 5 teammates; 6 are wanted" in result.output
+    assert "noise:6: a scene of world:crossing has 5 teammates" in result.output
     asked = load_worlds(["highway", "all", "highway"])
     assert list(asked) == ["highway", *(name for name in WORLDS if name != "highway")]
