@@ -70,7 +70,7 @@ def _each_once(repairs: Sequence[Repair], answer: Shown, kept: BoolArray) -> tup
     in its place needs no repair, and a faint box gives way to one.
     """
     faint, chosen = answer.boxes[:, 5] < THERE_SCORE, list[Repair]()
-    placed = kept & ~answer.displaced & ~faint
+    placed = kept & ~faint
     for part, at in repairs:
         box = part.boxes[at : at + 1]
         same = pairwise_iou(box, answer.boxes)[0] >= SAME_IOU

@@ -194,18 +194,21 @@ def test_who_moves_a_vehicle_along_itself_may_be_late_and_is_not_named():
     assert last.suspicion[LIAR] > 0.5
 
 
+@pytest.mark.parametrize("kind", ["conflict", "unseen"])
 @pytest.mark.parametrize(("calm", "times"), [(1.0, RULES["conflict"].times), (0.1, 1)])
-def test_a_conflict_over_one_place_counts_once_beside_an_ego_that_flickers(calm, times, monkeypatch):
+def test_a_conflict_over_one_place_counts_once_beside_an_ego_that_flickers(calm, times, kind, monkeypatch):
     monkeypatch.setattr(Steadiness, "calm", calm)
     alone_with_it = World({"car-2": YES, "car-3": YES, "rsu": YES, LIAR: NO}, lambda _: CAR)
+    empty = kind == "unseen"
+    alone_with_it.testimony = replace(alone_with_it.testimony, empty=lambda _, at: np.full(len(at), empty))
     found = Findings(knowledge(), Lies(), tuple(TEAM), ())
     counted = []
     for frame in range(5):
         found.known.memory.frame = frame
         found.learn(alone_with_it.judge(tuple(TEAM), None, frame))
-        before = found.lies.levels.get(LIAR, {}).get("conflict", (0.0, 0.0))[0]
+        before = found.lies.levels.get(LIAR, {}).get(kind, (0.0, 0.0))[0]
         conclude(found, tuple(TEAM))
-        counted.append(found.lies.levels.get(LIAR, {}).get("conflict", (0.0, 0.0))[0] > before)
+        counted.append(found.lies.levels.get(LIAR, {}).get(kind, (0.0, 0.0))[0] > before)
     assert counted == [True] * times + [False] * (5 - times)
 
 

@@ -131,6 +131,16 @@ def test_a_vehicle_that_is_repaired_is_there_once(score):
     assert (place.support.status is Standing.REPAIRED) == repaired
 
 
+def test_two_boxes_out_of_place_that_stand_for_one_vehicle_are_repaired_as_one():
+    testimony = World({"car-2": YES, "car-3": YES, "rsu": YES}, nothing).testimony
+    part = Shown(("car-2", "car-3", "rsu"), np.vstack([SEEN, NEAR]), Hearing(testimony, ()))
+    boxes = np.vstack([SEEN, ASIDE, CAR - [0, 1.6, 0, 0, 0, 0]])
+    answer = Shown(("car-2", "car-3", LIAR, "rsu"), boxes, Hearing(testimony, ()))
+    assert answer.displaced.sum() == 2
+    objects, _ = judge(answer, [answer, part])
+    assert [judged.subset for judged in objects if judged.index >= len(SEEN)] == [part.teammates]
+
+
 def test_where_only_the_ego_is_heard_its_word_is_enough():
     testimony = World({EGO: YES, "car-2": NO}, lambda _: CAR).testimony
     shown = Shown(("car-2",), np.vstack([SEEN, CAR]), Hearing(testimony, TEAM))
