@@ -77,6 +77,33 @@ class Scene(Protocol):
         """The frame of a number from 0 to below ``length``."""
 
 
+@dataclass(frozen=True)
+class SceneAround:
+    """What another scene is, but for its frames."""
+
+    scene: Scene
+
+    @property
+    def number(self) -> int:
+        return self.scene.number
+
+    @property
+    def agents(self) -> Sequence[str]:
+        return self.scene.agents
+
+    @property
+    def egos(self) -> Sequence[str]:
+        return self.scene.egos
+
+    @property
+    def length(self) -> int | None:
+        return self.scene.length
+
+    @property
+    def frame_period_s(self) -> float:
+        return self.scene.frame_period_s
+
+
 @runtime_checkable
 class SceneSource(Protocol):
     """Where scenes come from. It is sent to other processes where several share the work, so it has to be picklable."""

@@ -15,7 +15,7 @@ from typing import Any
 import numpy as np
 
 from robosac.boxes import FloatArray, pose_fault
-from robosac.scenes.base import Frame, Scene, SceneError, SceneSource, Split, View
+from robosac.scenes.base import Frame, Scene, SceneAround, SceneError, SceneSource, Split, View
 
 BOX_COLUMNS = 5
 _FEW = 100
@@ -66,32 +66,11 @@ class CheckedFrame:
 
 
 @dataclass(frozen=True)
-class CheckedScene:
+class CheckedScene(SceneAround):
     """A scene whose frames are checked."""
 
-    scene: Scene
     source: str
     """Its source's name, for messages."""
-
-    @property
-    def number(self) -> int:
-        return self.scene.number
-
-    @property
-    def agents(self) -> Sequence[str]:
-        return self.scene.agents
-
-    @property
-    def egos(self) -> Sequence[str]:
-        return self.scene.egos
-
-    @property
-    def length(self) -> int | None:
-        return self.scene.length
-
-    @property
-    def frame_period_s(self) -> float:
-        return self.scene.frame_period_s
 
     def frame(self, index: int) -> Frame:
         """A frame of the scene, its views checked.

@@ -11,13 +11,13 @@ What is random follows from the scene's number, the frame's, and the agent, so a
 from __future__ import annotations
 
 from abc import ABC, abstractmethod
-from collections.abc import Mapping, Sequence
+from collections.abc import Mapping
 from dataclasses import dataclass, field, replace
 
 import numpy as np
 
 from robosac.boxes import FloatArray, pose_matrix
-from robosac.scenes.base import Frame, Scene, View
+from robosac.scenes.base import Frame, SceneAround, View
 
 _STREAM = 7_000_000
 """Frames of generated scenes draw from streams that begin with the scene's and the frame's number."""
@@ -42,31 +42,8 @@ class DisturbedFrame:
 
 
 @dataclass(frozen=True)
-class Disturbed(ABC):
+class Disturbed(SceneAround, ABC):
     """A scene of which a subclass changes the views."""
-
-    scene: Scene
-    """What is disturbed."""
-
-    @property
-    def number(self) -> int:
-        return self.scene.number
-
-    @property
-    def agents(self) -> Sequence[str]:
-        return self.scene.agents
-
-    @property
-    def egos(self) -> Sequence[str]:
-        return self.scene.egos
-
-    @property
-    def length(self) -> int | None:
-        return self.scene.length
-
-    @property
-    def frame_period_s(self) -> float:
-        return self.scene.frame_period_s
 
     @property
     def teammates(self) -> tuple[str, ...]:
