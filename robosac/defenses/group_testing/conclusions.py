@@ -9,7 +9,7 @@ from dataclasses import replace
 import numpy as np
 
 from robosac.defenses.group_testing.differences import SAME_LIE_M, blame
-from robosac.defenses.group_testing.findings import UNHEARD, Findings
+from robosac.defenses.group_testing.findings import UNHEARD, Findings, one_out
 from robosac.defenses.group_testing.lies import Word
 from robosac.defenses.group_testing.model import CELLS, CLEAN, LIE
 from robosac.defenses.group_testing.objects import Lie, Shown
@@ -130,9 +130,8 @@ def _leave_alone(found: Findings, answer: Hypothesis) -> None:
     that nobody speaks of who is fused tells nothing.
     """
     frame = found.known.memory.frame
-    for name in answer:
-        if tuple(other for other in answer if other != name) in found.decoded:
-            found.lies.left_out[name] = frame
+    for name in one_out(answer, found.decoded):
+        found.lies.left_out[name] = frame
     lying = any(found.lies.worst(name) for name in found.team)
     everybody = not lying and all(found.lies.recently_left_out(name, frame) for name in answer)
     for lie in found.unexplained(answer) if answer in found.shown else ():
@@ -151,13 +150,12 @@ def _comparisons(found: Findings) -> dict[tuple[Hypothesis, Hypothesis], str]:
     attacker's boxes come and go with whoever is fused with it.
     """
     suspicion = found.known.suspicion()
-    comparisons = {}
-    for joined in found.shown:
-        for suspect in joined:
-            without = tuple(name for name in joined if name != suspect)
-            if without in found.shown and all(suspicion[name] <= UNHEARD for name in without):
-                comparisons[joined, without] = suspect
-    return comparisons
+    return {
+        (joined, without): suspect
+        for joined in found.shown
+        for suspect, without in one_out(joined, found.shown).items()
+        if all(suspicion[name] <= UNHEARD for name in without)
+    }
 
 
 def _accuse(found: Findings, name: str, weight: float, lies: Sequence[Lie], conflicts: int) -> None:

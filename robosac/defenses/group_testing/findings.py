@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Collection, Mapping, Sequence
+from collections.abc import Collection, Iterable, Mapping, Sequence
 
 import numpy as np
 
@@ -86,10 +86,13 @@ class Findings:
         without all that vouch for it, is put right.
         """
         lies = self.lies_in(answer)
-        groups = [(suspect,) for suspect in answer] + list({self.vouching(answer, lie) for lie in lies})
-        for group in groups:
-            without = tuple(name for name in answer if name not in group)
-            if group and lies and without in self.shown:
+        if not lies:
+            return lies
+        parts: dict[Hypothesis, Hypothesis] = {(name,): part for name, part in one_out(answer, self.shown).items()}
+        for group in {self.vouching(answer, lie) for lie in lies} - {()}:
+            parts[group] = tuple(name for name in answer if name not in group)
+        for group, without in parts.items():
+            if lies and without in self.shown:
                 done = self.effects(answer, without, group)
                 lies = [a for a in lies if all(np.hypot(*(a.place - b.place)) > SAME_LIE_M for b in done)]
         return lies
@@ -156,3 +159,11 @@ class Findings:
         """A place (2,) of the ego's frame in the world."""
         placed: FloatArray = self.pose[:2, :2] @ place + self.pose[:2, 3]
         return placed
+
+
+def one_out(fused: Hypothesis, decoded: Iterable[Hypothesis]) -> dict[str, Hypothesis]:
+    """By teammate, in the order of those fused: the fusion of all the others, where it was decoded, too."""
+    everybody = set(fused)
+    parts = [part for part in decoded if len(part) == len(fused) - 1 and everybody.issuperset(part)]
+    found = {next(iter(everybody.difference(part))): part for part in parts}
+    return {name: found[name] for name in fused if name in found} if found else {}

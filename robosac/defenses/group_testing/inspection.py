@@ -8,7 +8,7 @@ import numpy as np
 
 from robosac.defenses.group_testing.candidates import UNRESOLVED
 from robosac.defenses.group_testing.conclusions import conclude
-from robosac.defenses.group_testing.findings import Findings
+from robosac.defenses.group_testing.findings import Findings, one_out
 from robosac.defenses.group_testing.objects import Lie, Shown
 from robosac.defenses.group_testing.posterior import EXACT
 from robosac.defenses.group_testing.standing import Judged, judge
@@ -126,7 +126,7 @@ class Inspection:
             return []
         frame, last = self._found.known.memory.frame, self._found.lies.audited
         never = [name for name in whole if name not in last]
-        if never or any(self._without(whole, name) in self._found.decoded for name in whole):
+        if never or one_out(whole, self._found.decoded):
             return never
         return sorted((name for name in whole if frame - last[name] >= AUDIT_FRAMES), key=lambda name: last[name])[:1]
 
@@ -134,7 +134,7 @@ class Inspection:
         """What is wrong in the answer, and explained, while only one of those fused was left out: what two do together
         is explained by either.
         """
-        left_out = sum(tuple(other for other in answer if other != name) in self._found.shown for name in answer)
+        left_out = len(one_out(answer, self._found.shown))
         return self._found.lies_in(answer) if left_out == 1 and len(answer) > 1 else []
 
     def _candidates(self, answer: Hypothesis, lies: Sequence[Lie]) -> list[str]:
