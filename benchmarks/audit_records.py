@@ -37,7 +37,7 @@ def main(
     writer, follows, full, short, spent = Writer(full_every), None, [], [], []
     for event in events(teammates, attackers, frames, seed, signed):
         started = time.perf_counter()
-        record, writer = writer.record(event, follows)
+        record, _, writer = writer.record(event, follows)
         line = Unsealed(record).seal(secrets.token_hex(16), event.frame + 2, GENESIS)
         spent.append(time.perf_counter() - started)
         follows = event.frame

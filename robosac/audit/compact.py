@@ -40,8 +40,9 @@ class Writer:
     since_full: int = 0
     evidence: dict[str, Sequence[Any]] = field(default_factory=dict)
 
-    def record(self, event: FrameAnswered, follows: int | None) -> tuple[dict[str, Any], Writer]:
-        """The record of a decision, and the writer of the next, to be taken once this one is kept.
+    def record(self, event: FrameAnswered, follows: int | None) -> tuple[dict[str, Any], str, Writer]:
+        """The record of a decision; the text of the state after it (`packing.packed_state`), which is long to make; and
+        the writer of the next, to be taken once this one is kept.
 
         Parameters
         ----------
@@ -53,7 +54,8 @@ class Writer:
         told = {} if full else self.evidence
         listed = {name: evidence for name, why in event.rejected.items() if (evidence := _listed(why))}
         following = Writer(self.full_every, event.frame, 0 if full else self.since_full + 1, listed)
-        return compact(event, full=full, told=told), following
+        packed = _packed(event)
+        return _compact_answer(event, packed, full, told), packed[1].decode(), following
 
 
 def _listed(why: RejectedTeammate) -> Sequence[Any]:
@@ -73,7 +75,7 @@ def compact(event: Event, *, full: bool = True, told: Mapping[str, Sequence[Any]
         Evidence that the record before listed.
     """
     if isinstance(event, FrameAnswered):
-        return _compact_answer(event, full, told or {})
+        return _compact_answer(event, _packed(event), full, told or {})
     if isinstance(event, SessionOpened | TeamChanged):
         digest, text = packing.packed_state(event.state)
         rest = event.model_dump(mode="json", exclude={"state"})
@@ -103,14 +105,21 @@ def _rounded(value: Any) -> Any:
     return {name: round(p, 6) for name, p in value.items()} if isinstance(value, Mapping) else round(value, 6)
 
 
-def _compact_answer(answer: FrameAnswered, full: bool, told: Mapping[str, Sequence[Any]]) -> dict[str, Any]:
+def _packed(answer: FrameAnswered) -> tuple[str, bytes]:
+    """Digest and text of the state after a decision."""
+    if answer.state is None:
+        raise ValueError("a decision is put on record with the state after it")
+    return packing.packed_state(answer.state)
+
+
+def _compact_answer(
+    answer: FrameAnswered, packed: tuple[str, bytes], full: bool, told: Mapping[str, Sequence[Any]]
+) -> dict[str, Any]:
     names = sorted(answer.messages)
     by_hand = {"state", "boxes", "support", "contradicted", "messages", "hypotheses", "timings_ms", "suspicion",
                "ego_pose", "accepted", "rejected", "trusted", "state_digest"}  # fmt: skip
     record = answer.model_dump(mode="json", exclude=by_hand)
-    if answer.state is None:
-        raise ValueError("a decision is put on record with the state after it")
-    digest, text = packing.packed_state(answer.state)
+    digest, text = packed
     record.update(
         format=FORMAT,
         state_digest=packing.short_digest(digest),
@@ -132,7 +141,7 @@ def _compact_answer(answer: FrameAnswered, full: bool, told: Mapping[str, Sequen
     if answer.suspicion is not None:
         parts = {name: round(p * MILLIONTHS) for name, p in answer.suspicion.items()}
         record["suspicion"] = [parts.get(name) for name in names] if set(parts) <= set(names) else parts
-    if set(trusted := trusted_in(answer.state)) != set(answer.accepted):
+    if set(trusted := trusted_in(answer.state or {})) != set(answer.accepted):
         record["trusted"] = packing.pack_names(sorted(trusted), names)
     if full:
         record["state"] = packing.deflated(text)

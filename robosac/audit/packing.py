@@ -108,11 +108,11 @@ def pack_supports(supports: Sequence[Support], names: Sequence[str]) -> str:
     names : sequence of str
         Whom the bits stand for, the least first; all witnesses and deniers must be among them.
     """
-    width = -(-len(names) // 8)
+    width, bits = -(-len(names) // 8), _bits(names)
     rows = [
         bytes([_STANDINGS.index(each.status)])
-        + _mask(each.witnesses, names).to_bytes(width, "little")
-        + _mask(each.deniers, names).to_bytes(width, "little")
+        + _mask(each.witnesses, bits).to_bytes(width, "little")
+        + _mask(each.deniers, bits).to_bytes(width, "little")
         for each in supports
     ]
     columns = np.frombuffer(b"".join(rows), dtype=np.uint8).reshape(-1, 1 + 2 * width).T
@@ -152,8 +152,9 @@ def pack_names(chosen: Sequence[str], names: Sequence[str]) -> str | list[str]:
 
     Where they are in another order than these, or others are among them, it stays a list.
     """
-    if set(chosen) <= set(names) and list(chosen) == [name for name in names if name in set(chosen)]:
-        return f"{_mask(chosen, names):x}"
+    among = set(chosen)
+    if among <= set(names) and list(chosen) == [name for name in names if name in among]:
+        return f"{_mask(chosen, _bits(names)):x}"
     return list(chosen)
 
 
@@ -187,9 +188,12 @@ def long_digest(text: str) -> str:
     return raw.hex()
 
 
-def _mask(chosen: Sequence[str], names: Sequence[str]) -> int:
-    places = {name: place for place, name in enumerate(names)}
-    return sum({1 << places[name] for name in chosen})
+def _bits(names: Sequence[str]) -> dict[str, int]:
+    return {name: 1 << place for place, name in enumerate(names)}
+
+
+def _mask(chosen: Sequence[str], bits: Mapping[str, int]) -> int:
+    return sum({bits[name] for name in chosen})
 
 
 def _members(mask: int, names: Sequence[str]) -> list[str]:

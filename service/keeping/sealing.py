@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import json
 from collections import OrderedDict
 from collections.abc import Callable
 from dataclasses import dataclass, field
@@ -82,8 +81,8 @@ class Sealing:
         writer = self._writers.pop(session_id, None) or Writer(self._full_every)
 
         def work() -> ReadyDecision:
-            record, following = writer.record(event, follows)
-            return ReadyDecision(Unsealed(record), json.dumps(event.state), following=following)
+            record, state, following = writer.record(event, follows)
+            return ReadyDecision(Unsealed(record), state, following=following)
 
         return Draft(work)
 

@@ -125,10 +125,9 @@ class Memory:
         self.evidence.pop(teammate, None)
         self.lies.forget(teammate)
         self.steadiness.levels.pop(teammate, None)
-        self.left.pop(teammate, None)
         self.left[teammate] = (suspicion, self.frame)
-        while len(self.left) > MAX_LEFT:
-            del self.left[next(iter(self.left))]
+        while len(self.left) > MAX_LEFT:  # not by their order, which a state that was stored has lost
+            del self.left[min(self.left, key=lambda name: (self.left[name][1], name))]
 
     def welcome(self, teammate: str, prior: float) -> float | None:
         """Suspicion of one that joins: None if it was never here, else what is left of what was known."""

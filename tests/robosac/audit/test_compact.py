@@ -43,14 +43,14 @@ def test_an_answer_reads_back_as_it_was_but_for_rounding(events):
 def test_only_some_records_hold_the_state_and_all_its_digest(events):
     writer, full, follows = Writer(3), [], None
     for frame in range(7):
-        record, writer = writer.record(an_answer(events, frame), follows)
+        record, _, writer = writer.record(an_answer(events, frame), follows)
         follows = frame
         full.append("state" in record)
         read = event_on(on_a_line(record))
         assert read.state_digest == packing.state_digest(an_answer(events).state)
         assert set(read.trusts) == {"rsu", "car-3"}
     assert full == [True, False, False, True, False, False, True]
-    record, _ = writer.record(an_answer(events, 9), 8)  # another process recorded frame 8
+    record, *_ = writer.record(an_answer(events, 9), 8)  # another process recorded frame 8
     assert "state" in record
     assert FULL_EVERY > 1
 
@@ -60,7 +60,7 @@ def test_evidence_is_told_once_until_a_full_record_tells_all(events):
     writer, told = Writer(3), []
     for frame, seen in enumerate([items[:1], items[:2], items[1:], items]):
         answer = an_answer(events, frame, why={"evidence": seen})
-        record, writer = writer.record(answer, frame - 1 if frame else None)
+        record, _, writer = writer.record(answer, frame - 1 if frame else None)
         told.append(expanded(record)["rejected"][0].get("evidence", []))
     assert told == [items[:1], items[1:2], items[2:], items]
 

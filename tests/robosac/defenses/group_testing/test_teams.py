@@ -7,7 +7,7 @@ from robosac.defenses import GroupTesting, Outcome
 from robosac.defenses.group_testing import OPEN, GroupTestingSettings
 from robosac.defenses.group_testing.defense import HIJACKED_OF
 from robosac.defenses.group_testing.lies import RULES
-from robosac.defenses.group_testing.memory import FORGETTING_FRAMES
+from robosac.defenses.group_testing.memory import FORGETTING_FRAMES, MAX_LEFT, Memory
 from tests.robosac.defenses.group_testing.conversing import SEEN, TEAM, make_model, outcome, run_frame
 from tests.robosac.defenses.group_testing.sessions import DEFENSE, named, run, with_settings
 
@@ -65,6 +65,16 @@ def test_a_team_that_changes(rng):
         stranger, abs=5e-3
     )  # who knows of an attack
     assert 0.05 < stranger < 0.25
+
+
+def test_the_latest_who_left_are_remembered_in_whatever_order_they_are_kept():
+    memory = Memory()
+    for number in range(MAX_LEFT):
+        memory.frame = number
+        memory.leave(f"car-{MAX_LEFT - number:04d}", 0.5)
+    memory = Memory.from_state(json.loads(json.dumps(memory.to_state(), sort_keys=True)))
+    memory.leave("one more", 0.5)
+    assert set(memory.left) == {"one more", *(f"car-{MAX_LEFT - number:04d}" for number in range(1, MAX_LEFT))}
 
 
 def test_an_absent_teammate_keeps_what_is_known_of_it(rng):
