@@ -68,8 +68,8 @@ def judge(lies: Sequence[Lie], shown: Shown, truth: FloatArray, ideal: FloatArra
     """Judge the lies of a frame.
 
     - A *ghost* holds if a box with score >= .3 lies within 2 m of it that is not the best match of a true box.
-    - An *erased* vehicle is missing if no box has an IoU >= .3 with it. Where the ideal fusion does not find it either,
-      there is nothing to judge.
+    - An *erased* vehicle, or a *dimmed* one, is missing if no box with score >= .3 has an IoU >= .3 with it. Where the
+      ideal fusion does not find it either, there is nothing to judge.
     - A *moved* one holds if the nearest box within 2 m of the lie or of the truth, score >= .3, is nearer to the lie.
 
     Parameters
@@ -133,7 +133,8 @@ def _apart(box: FloatArray, boxes: FloatArray) -> FloatArray:
 
 
 def _overlap(box: FloatArray, boxes: FloatArray) -> FloatArray:
-    overlap: FloatArray = pairwise_iou(box[None], boxes)[0]
+    """IoU (n,) of a vehicle with boxes (n, 6), 0 with those that do not count."""
+    overlap: FloatArray = np.where(boxes[:, 5] >= SCORE, pairwise_iou(box[None], boxes)[0], 0.0)
     return overlap
 
 

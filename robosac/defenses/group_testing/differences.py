@@ -11,7 +11,7 @@ import numpy as np
 
 from robosac.boxes import BoolArray, FloatArray, IntArray, pairwise_iou
 from robosac.defenses.group_testing.claims import DENIES, SUPPORTS, WEIGHTY, two_witnesses
-from robosac.defenses.group_testing.objects import AWAY, CERTAIN, PLACED_SCORE, SHOWN_SCORE, THERE_SCORE, Lie, Shown
+from robosac.defenses.group_testing.objects import AWAY, CERTAIN, PLACED_SCORE, SHOWN_SCORE, Lie, Shown
 
 OWN_DENIES = -4.0
 """Whose own message denies a place so far is not to blame for a box there."""
@@ -30,6 +30,8 @@ SAME_BOX_M = 1.5
 """Boxes of two fusions that are centred so near each other show the same vehicle."""
 SAME_LIE_M = 3.0
 """Lies so near each other are about one object."""
+SHOWN_IOU = 0.3
+"""A box shows a vehicle from this IoU on. A vehicle half of its length ahead of itself is lost where it is."""
 CRISP_SCORE = 0.5
 
 
@@ -138,11 +140,11 @@ def gone_alone(joined: Shown, without: Shown, suspects: Collection[str]) -> IntA
 
 
 def _lost(joined: Shown, without: Shown) -> tuple[BoolArray, FloatArray]:
-    """Which boxes (n,) of the second fusion nothing in the first one overlaps, and by how much (n,) the logarithm of
+    """Which boxes (n,) of the second fusion nothing in the first one shows, and by how much (n,) the logarithm of
     their odds is higher there.
     """
-    there = joined.boxes[joined.boxes[:, 5] >= THERE_SCORE]
-    lost: BoolArray = pairwise_iou(without.boxes, there).max(axis=1, initial=0.0) < 0.05
+    shown = joined.boxes[joined.boxes[:, 5] >= SHOWN_SCORE]
+    lost: BoolArray = pairwise_iou(without.boxes, shown).max(axis=1, initial=0.0) < SHOWN_IOU
     return lost, without.odds_at(without.boxes[:, :2]) - joined.odds_at(without.boxes[:, :2])
 
 

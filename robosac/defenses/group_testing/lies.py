@@ -18,7 +18,8 @@ class Rule:
     """How often an honest teammate may seem to lie in one way.
 
     In each frame a level goes up by ``gain`` for each lie, of which at most ``most`` count, and down by ``drift``; it
-    is never below 0 (a cumulative sum: Page, Continuous Inspection Schemes, Biometrika 41, 1954).
+    is never below 0 (a cumulative sum: Page, Continuous Inspection Schemes, Biometrika 41, 1954), nor above
+    `MOST_LEVEL` times ``names``: whoever lied for long is as soon trusted again as whoever lied for seconds.
     """
 
     gain: float
@@ -46,6 +47,7 @@ RULES: Mapping[str, Rule] = {
     "conflict": Rule(1.0, 3, 0.5, 6.0, ((3.0, 2.0), (4.5, 4.0), (6.0, 4.0)), times=3),
     "unseen": Rule(1.0, 3, 0.5, 6.0, ((3.0, 2.0), (4.5, 4.0), (6.0, 4.0)), malice=False, times=3),
 }
+MOST_LEVEL = 1.5
 QUIET_FRAMES = 9
 LONGEST_QUIET = 24
 """A place where something seemed wrong, but nobody had the effect, is left alone for so many frames, at first and at
@@ -120,6 +122,7 @@ class Lies:
         for kind, rule in RULES.items():
             before, highest = known.get(kind, (0.0, 0.0))
             level = max(0.0, before + rule.gain * min(counts.get(kind, 0), rule.most) - rule.drift)
+            level = min(level, MOST_LEVEL * rule.names)
             weight += sum(w for step, w in rule.weights if highest < step <= level)
             known.pop(kind, None)
             if level:

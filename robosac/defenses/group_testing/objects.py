@@ -20,13 +20,11 @@ from robosac.defenses.protocol import Hypothesis
 from robosac.testimony import Testimony
 
 SHOWN_SCORE = 0.3
-"""Boxes from this score on claim something."""
+"""Boxes from this score on claim something. Fainter ones are as good as none: whoever dims a vehicle takes it away."""
 PLACED_SCORE = 0.4
 """Boxes from this score on have to be in their place."""
 SURE_SCORE = 0.9
 """A fusion is sure of a box of this score or more. Of such a vehicle somebody has seen something."""
-THERE_SCORE = 0.15
-"""Where a box has this score or more, something is shown."""
 STANDING_SUM = 10.0
 """A vehicle stands where the sum of L is so much."""
 CERTAIN = 4.0
@@ -281,12 +279,16 @@ class Shown:
         return odds
 
     def _covered(self, places: FloatArray) -> BoolArray:
-        """Whether places (n, 2) lie in boxes, or at their rims."""
-        boxes = self.boxes[self.boxes[:, 5] >= THERE_SCORE]
+        """Whether places (n, 2) lie in boxes that are shown, or beside them; before and behind them only if the ego or
+        two teammates support the box: else it may be that vehicle, shown where it is not.
+        """
+        shown = self.boxes[:, 5] >= SHOWN_SCORE
+        boxes, known = self.boxes[shown], two_witnesses(self.claims.supporting[:, shown])
+        length = np.where(known, boxes[:, 2] / 2 + RIM_M, np.maximum(boxes[:, 2] / 2, REACH_M))
         x, y = places[:, :1] - boxes[:, 0], places[:, 1:] - boxes[:, 1]
         cos, sin = np.cos(boxes[:, 4]), np.sin(boxes[:, 4])
         along, across = x * cos + y * sin, y * cos - x * sin
-        inside = (np.abs(along) <= boxes[:, 2] / 2 + RIM_M) & (np.abs(across) <= boxes[:, 3] / 2 + RIM_M)
+        inside = (np.abs(along) <= length) & (np.abs(across) <= boxes[:, 3] / 2 + RIM_M)
         covered: BoolArray = np.atleast_1d(inside.any(axis=1))
         return covered
 

@@ -9,15 +9,17 @@ import numpy as np
 
 from robosac.answers import Standing, Support
 from robosac.boxes import BoolArray, FloatArray, pairwise_iou
-from robosac.defenses.group_testing.claims import DENIES, LEANS, NEARLY_SUPPORTS, SUPPORTS
+from robosac.defenses.group_testing.claims import DENIES, LEANS, NEARLY_SUPPORTS, SUPPORTS, two_witnesses
 from robosac.defenses.group_testing.differences import AWAY_EFFECT, gone, gone_alone
-from robosac.defenses.group_testing.objects import THERE_SCORE, Shown
+from robosac.defenses.group_testing.objects import SHOWN_SCORE, Shown
 from robosac.defenses.protocol import JudgedBox
 
 SAME_M = 2.5
 """A box of another fusion, centred so near, stands for the same vehicle."""
 SAME_IOU = 0.3
 """Boxes that overlap so much stand for the same vehicle."""
+OVERLAP_IOU = 0.1
+"""No two vehicles overlap so much."""
 Repair = tuple[Shown, int]
 """A box of another fusion."""
 Judged = tuple[tuple[JudgedBox, ...], tuple[JudgedBox, ...]]
@@ -67,17 +69,20 @@ def judge(answer: Shown, decoded: Sequence[Shown]) -> Judged:
 
 def _each_once(repairs: Sequence[Repair], answer: Shown, kept: BoolArray) -> tuple[list[Repair], BoolArray]:
     """The repairs, and the boxes (n,) of the answer that stay, so that no vehicle is there twice: what the answer has
-    in its place needs no repair, and a faint box gives way to one.
+    in its place needs no repair. A faint box gives way to one, and so does a box that overlaps it on the word of those
+    alone whom the part does without: they have moved the vehicle there.
     """
-    faint, chosen = answer.boxes[:, 5] < THERE_SCORE, list[Repair]()
+    faint, chosen = answer.boxes[:, 5] < SHOWN_SCORE, list[Repair]()
     placed = kept & ~faint
     for part, at in repairs:
         box = part.boxes[at : at + 1]
-        same = pairwise_iou(box, answer.boxes)[0] >= SAME_IOU
+        overlap = pairwise_iou(box, answer.boxes)[0]
+        same = overlap >= SAME_IOU
         again = any(pairwise_iou(box, other.boxes[i : i + 1])[0, 0] >= SAME_IOU for other, i in chosen)
         if not again and not (same & placed).any():
             chosen.append((part, at))
-            kept = kept & ~(same & faint)
+            others = answer.claims.without(set(answer.teammates) - set(part.teammates))
+            kept = kept & ~(same & faint) & ~((overlap >= OVERLAP_IOU) & ~two_witnesses(others.supporting))
     return chosen, kept
 
 

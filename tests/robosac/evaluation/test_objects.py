@@ -39,7 +39,9 @@ def test_a_ghost_holds_where_a_box_stands_for_no_vehicle():
 def test_an_erased_vehicle_is_missing_where_the_oracle_finds_it():
     assert holds(ERASED, (0, 0, 0.9))
     assert holds(ERASED, (0, 0, 0.9), (10.0, 1.5, 0.9))
-    assert not holds(ERASED, (10.3, 0.2, 0.2))
+    assert not holds(ERASED, (10.3, 0.2, 0.3))
+    assert holds(ERASED, (10.3, 0.2, 0.29))
+    assert judge([ERASED], Shown(boxes()), TRUTH, boxes((10.3, 0.2, 0.29))) == ()
     assert judge([ERASED], Shown(boxes()), TRUTH, boxes((0, 0, 0.9))) == ()
 
 

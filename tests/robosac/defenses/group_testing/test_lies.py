@@ -1,12 +1,14 @@
 """What is remembered of lies, and when they are too many."""
 
 import json
+import math
 
 import numpy as np
 import pytest
 
 from robosac.defenses.group_testing.lies import (
     LONGEST_QUIET,
+    MOST_LEVEL,
     MOST_QUIET,
     PLACE_FRAMES,
     QUIET_FRAMES,
@@ -34,6 +36,17 @@ def test_a_level_rises_with_lies_and_sinks_without(kind):
     lies.add("a", {})
     assert level(lies, kind) == pytest.approx(2 * rule.gain - 3 * rule.drift)
     for _ in range(50):
+        lies.add("a", {})
+    assert lies.levels == {}
+
+
+@pytest.mark.parametrize("kind", RULES)
+def test_after_long_lies_a_level_sinks_as_soon_as_after_short_ones(kind):
+    lies, rule = Lies(), RULES[kind]
+    for _ in range(1000):
+        lies.add("a", {kind: rule.most})
+    assert level(lies, kind) == MOST_LEVEL * rule.names > rule.names
+    for _ in range(math.ceil(MOST_LEVEL * rule.names / rule.drift)):
         lies.add("a", {})
     assert lies.levels == {}
 

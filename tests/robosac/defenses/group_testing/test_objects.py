@@ -107,8 +107,9 @@ def test_a_vehicle_gone_is_blamed_on_whoever_takes_it_away():
     heard = hearing(**SEEN, d=NO)
     assert found(heard, NOTHING, car()) == ["gone"]
     assert found(heard, car(off=(5.0, 0.0)), car()) == ["gone"]  # moved out of its place
-    assert found(heard, car(), car()) == []
-    assert found(heard, car(score=0.2), car()) == []  # faint, but there
+    assert found(heard, car(off=(3.3, 0.0)), car()) == ["gone"]  # by less than its length
+    assert found(heard, car(score=0.2), car()) == ["gone"]  # as good as none
+    assert found(heard, car(score=0.35), car()) == []
     assert found(heard, NOTHING, car(score=0.45)) == []  # never crisp
     assert found(heard, NOTHING, NOTHING) == []  # gone without it too
     assert found(heard, NOTHING, NOTHING, suspect="a") == []
@@ -170,7 +171,8 @@ def test_a_hole_is_where_vehicles_stand_and_nothing_is_shown():
     assert hole.kind == "gone"
     assert hole.place == pytest.approx(PLACE, abs=0.1)  # where they see it, not the middle of a place
     assert Shown(TEAM, np.vstack([REST, car()]), heard).lies == []
-    assert Shown(TEAM, np.vstack([REST, car(score=0.2, off=(1.0, 0.5))]), heard).lies == []
+    assert Shown(TEAM, np.vstack([REST, car(score=0.3, off=(1.0, 0.5))]), heard).lies == []
+    assert len(Shown(TEAM, np.vstack([REST, car(score=0.29, off=(1.0, 0.5))]), heard).holes) == 1
     assert [lie.kind for lie in Shown(TEAM, car(), heard).lies] == ["gone"]  # the other one
 
 
