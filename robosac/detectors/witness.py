@@ -33,7 +33,12 @@ LARGEST = 50.0
 is laid over the ego's map no number.
 """
 HIGHEST_M = 10.0
-"""A pose whose z is not the height above ground, but above the sea, counts as this high."""
+"""A sensor that is higher counts as this high."""
+MAST_M = 20.0
+USUAL_M = 1.7
+"""A z below 0 or above the first is no height above ground, but above the sea, say. The sensor is then taken to be as
+high as a car's: of a network that never saw such heights nothing can be believed.
+"""
 AT_ONCE = 8
 """Messages read together: between groups it is looked at whether there is time for another one."""
 AROUND_M = 2.0
@@ -146,7 +151,8 @@ class Layout:
         x, y = x.expand(self.height, -1), y[:, None].expand(-1, self.width)
         r = torch.hypot(x, y)
         fixed = torch.stack([x / 32, y / 32, r / 32, x / r, y / r, r.log() / 3])
-        height = torch.tensor(heights, dtype=torch.float32).clamp(0.0, HIGHEST_M)[:, None, None, None] / 5
+        told = [min(height, HIGHEST_M) if 0.0 <= height <= MAST_M else USUAL_M for height in heights]
+        height = torch.tensor(told, dtype=torch.float32)[:, None, None, None] / 5
         return torch.cat([fixed.expand(len(heights), -1, -1, -1), height.expand(-1, 1, self.height, self.width)], 1)
 
 

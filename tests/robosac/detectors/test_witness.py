@@ -10,7 +10,7 @@ import torch
 from robosac.boxes import pose_matrix
 from robosac.detectors import DetectorInfo, Message, TensorSpec
 from robosac.detectors.weights_file import WeightsError
-from robosac.detectors.witness import AT_ONCE, GEOMETRY, HIGHEST_M, Layout, Witness, WitnessNetwork
+from robosac.detectors.witness import AT_ONCE, GEOMETRY, HIGHEST_M, USUAL_M, Layout, Witness, WitnessNetwork
 from robosac.testimony import LAYERS
 
 MAP = {"other": TensorSpec("float16", (2, 8, 8)), "map": TensorSpec("float32", (4, 16, 16))}
@@ -128,13 +128,17 @@ def test_maps_are_read_alike_however_they_lie_in_memory():
 
 
 def test_the_network_is_told_where_cells_are():
-    geometry = Layout.of(INFO, 1.0).geometry([2.5, 400.0])
+    geometry = Layout.of(INFO, 1.0).geometry([2.5, 5.0])
     assert geometry.shape == (2, GEOMETRY, 16, 16)
     east, north = geometry[0, :2, 3, 12] * 32
     assert (float(east), float(north)) == (18.0, -18.0)
     np.testing.assert_allclose(geometry[0, 2] ** 2, geometry[0, 0] ** 2 + geometry[0, 1] ** 2, rtol=1e-5)
     assert float(geometry[0, -1, 0, 0]) == 0.5
-    assert float(geometry[1, -1, 0, 0]) == HIGHEST_M / 5
+
+
+def test_a_height_above_the_sea_is_none_above_ground():
+    told = Layout.of(INFO, 1.0).geometry([0.0, 1.7, 5.0, 12.0, 400.0, -3.0, math.nan])[:, -1, 0, 0] * 5
+    np.testing.assert_allclose(told, [0.0, 1.7, 5.0, HIGHEST_M, USUAL_M, USUAL_M, USUAL_M], rtol=1e-6)
 
 
 def test_what_is_read_is_divided_by_the_usual_size(rng):
