@@ -197,8 +197,13 @@ def _centres(height: int, width: int, half_extent_m: float) -> FloatArray:
 
 
 def planar(ego_pose: FloatArray, poses: Sequence[FloatArray]) -> FloatArray:
-    """The ego's plane in each sender's frame (n, 3, 3), of their poses world_from_sensor (4, 4)."""
-    relative = np.linalg.inv(np.stack(poses)) @ ego_pose
+    """The ego's plane in each sender's frame (n, 3, 3), of their poses world_from_sensor (4, 4). How high they say they
+    are does not count, as in `robosac.detectors.warp.sampling_matrix`.
+    """
+    senders = np.stack(poses)
+    level = np.tile(ego_pose, (len(poses), 1, 1))
+    level[:, 2, 3] = senders[:, 2, 3]
+    relative = np.linalg.inv(senders) @ level
     found = np.tile(np.eye(3), (len(poses), 1, 1))
     found[:, :2, :2], found[:, :2, 2] = relative[:, :2, :2], relative[:, :2, 3]
     return found

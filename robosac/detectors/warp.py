@@ -15,7 +15,8 @@ def sampling_matrix(ego_pose: FloatArray, pose: FloatArray, half_extent_m: float
     Parameters
     ----------
     ego_pose, pose : (4, 4) ndarray
-        world_from_sensor of the ego and of the teammate; their motion in the plane counts.
+        world_from_sensor of the ego and of the teammate; their motion in the plane counts, and not how high they say
+        they are.
     half_extent_m : float
         Maps cover +- this, in metres, in both directions.
     mirrored : bool
@@ -26,7 +27,9 @@ def sampling_matrix(ego_pose: FloatArray, pose: FloatArray, half_extent_m: float
     (2, 3) float64 ndarray
         For `torch.nn.functional.affine_grid`: normalised ego coordinates (x, y) to normalised teammate coordinates.
     """
-    relative = np.linalg.inv(pose) @ ego_pose
+    level = ego_pose.copy()
+    level[2, 3] = pose[2, 3]  # seen from a tilted sensor, what is said to be higher would lie farther
+    relative = np.linalg.inv(pose) @ level
     matrix = relative[:2, [0, 1, 3]].copy()
     matrix[:, 2] /= half_extent_m
     if mirrored:

@@ -3,6 +3,7 @@ import torch
 
 from robosac.boxes import from_world, pose_matrix
 from robosac.detectors.warp import sampling_matrix, warp
+from robosac.testimony import planar
 
 CELLS, HALF = 32, 32.0
 
@@ -34,6 +35,17 @@ def test_the_own_frame_is_left_as_it_is():
     features = blob(5.0, -9.0)
     moved = warp(features, torch.from_numpy(sampling_matrix(pose, pose, HALF)).float()[None])
     np.testing.assert_allclose(moved, features, atol=1e-5)
+
+
+def test_how_high_tilted_sensors_say_they_are_moves_nothing():
+    """One of them counts metres from the ground, and the other from the sea."""
+    tilt = np.eye(4)
+    tilt[[0, 0, 2, 2], [0, 2, 0, 2]] = np.cos(0.05), np.sin(0.05), -np.sin(0.05), np.cos(0.05)
+    ego, teammate = (pose_matrix(*place) @ tilt for place in ((3.0, -8.0, 1.7, 0.7), (-6.0, 2.0, 5.0, -2.1)))
+    expected = sampling_matrix(ego, teammate, HALF)
+    teammate[2, 3] += 100.0
+    np.testing.assert_allclose(sampling_matrix(ego, teammate, HALF), expected, atol=1e-9)
+    np.testing.assert_allclose(planar(ego, [teammate])[0, :2, 2], HALF * expected[:, 2], atol=1e-9)
 
 
 def test_outside_the_teammates_map_there_is_nothing():
