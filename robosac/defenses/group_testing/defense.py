@@ -22,7 +22,7 @@ from robosac.defenses.group_testing.model import LIE, CalibrationError, Evidence
 from robosac.defenses.group_testing.posterior import Hazards, Posterior
 from robosac.defenses.protocol import Conversation, Reference, State, named_in, trusted_in
 from robosac.defenses.sampling import MAX_BUDGET
-from robosac.defenses.settings import DefenseSettings
+from robosac.defenses.settings import LEAST, DefenseSettings
 
 DEFAULT_POSE_ERROR_M = 0.2
 """To expect more error than there is costs some sharpness; to expect less names honest teammates."""
@@ -112,7 +112,8 @@ class GroupTesting:
     """Bayesian group testing over the team, with memory; the number of attackers is not assumed.
 
     1. The posterior over (who attacks, whose view is complementary, kind of attack) goes one frame on: hijacks, as many
-       in a large team as in one of `HIJACKED_OF`, or somebody would always be in doubt there; recoveries.
+       in a large team as in one of `HIJACKED_OF`, or somebody would always be in doubt there; recoveries. Neither is
+       ever impossible: what is remembered is rounded, and from 0 no evidence leads back.
     2. The next subset is the one with the greatest ``max(0, U(m) - best U so far) + .06 bits(m) - .004``: what it gains
        as an answer, and what it is expected to tell. Nothing above 0, the frame's budget, or the deadline ends the
        search.
@@ -197,8 +198,10 @@ class GroupTesting:
         self._welcome(posterior, memory, team)
         first = memory.frame == 0
         if not first:
-            hijack = settings.hijack * HIJACKED_OF / max(HIJACKED_OF, len(posterior.members))
-            posterior.step(Hazards(hijack, settings.recovery, settings.kind_change))
+            told = settings.hijack, settings.recovery, settings.kind_change
+            hijack, recovery, change = (max(hazard, LEAST) for hazard in told)
+            hijack *= HIJACKED_OF / max(HIJACKED_OF, len(posterior.members))
+            posterior.step(Hazards(hijack, recovery, change))
             memory.strangeness.step()
         posterior.regroup(unresolved(posterior.marginals()))
         known = Knowledge(self.model, posterior, memory)

@@ -94,6 +94,16 @@ def test_a_hijacked_teammate_is_found_and_one_that_recovers_is_used_again(rng):
     assert "car-4" not in again.state["memory"]["evidence"]
 
 
+@pytest.mark.parametrize("hazards", [{"hijack": 0}, {"hijack": 0, "recovery": 0, "kind_change": 0}])
+def test_who_was_long_honest_is_found_though_nobody_is_expected_to_be_hijacked(hazards, rng):
+    """What is believed is rounded when it is kept: after some honest frames an attack would be impossible."""
+    defense = with_settings(**hazards)
+    honest, _ = run(defense, [], 40, rng)
+    decision, _ = run(defense, ["car-4"], 14, rng, honest.state)
+    assert decision.suspicion["car-4"] > 0.99
+    assert set(decision.accepted) == set(TEAM) - {"car-4"}
+
+
 def test_an_attacker_that_spoils_what_an_honest_one_joins_is_blamed_itself(rng):
     """It agrees with the ego, and moves boxes only where others are in the fusion: alone it is steady, so that it is
     left out, and not named.
