@@ -10,6 +10,7 @@ from dataclasses import dataclass, field
 from itertools import combinations
 from pathlib import Path
 from typing import Any
+from urllib.parse import quote, unquote
 
 import numpy as np
 
@@ -112,7 +113,7 @@ def save(path: Path, frames: Mapping[int, DecodedOnce], whole: bool) -> None:
     ]
     boxes = [frame.boxes[subset] for _, frame in ordered for subset in subsets(frame.team)]
     tensors: dict[str, Any] = {
-        f"{index}/{name}/{tensor}": values
+        f"{index}/{quote(name, safe='')}/{quote(tensor, safe='')}": values
         for index, frame in ordered
         for name, message in _messages(frame).items()
         if whole or name in frame.attackers
@@ -146,7 +147,7 @@ def load(
         for key in file.files:
             if key.count("/") == 2:
                 index, name, tensor = key.split("/")
-                held.setdefault((int(index), name), {})[tensor] = file[key]
+                held.setdefault((int(index), unquote(name)), {})[unquote(tensor)] = file[key]
     whole = all((entry["index"], EGO) in held for entry in head)
     honest = [None] * len(head) if whole else unattacked([entry["index"] for entry in head])
     frames = {}

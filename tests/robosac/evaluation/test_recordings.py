@@ -9,7 +9,7 @@ from robosac.detectors import Message
 from robosac.evaluation.encounters import acts
 from robosac.evaluation.frames import EvaluationFrame, misplaced
 from robosac.evaluation.playing import FaultyDefense, play
-from robosac.evaluation.recordings import Recordings, load, record, save
+from robosac.evaluation.recordings import Recordings, decoded, load, record, save
 from robosac.scenes import IntersectionScene
 
 SCENE = IntersectionScene(4)
@@ -61,6 +61,18 @@ def test_frames_survive_a_file(whole, recorded, tmp_path):
         for sent, kept in ((before.ego, after.ego), *((before.teammates[n], after.teammates[n]) for n in TEAM)):
             np.testing.assert_array_equal(kept.pose, sent.pose)
             np.testing.assert_array_equal(kept.tensors["features"], sent.tensors["features"])
+
+
+def test_vehicles_may_have_any_names_in_a_file(recorded, tmp_path):
+    honest, _, _ = recorded
+    names = dict(zip(TEAM, ("site/1", "site", "50%2F é"), strict=True))
+    boxes = {frozenset(names[n] for n in subset): each for subset, each in honest.boxes.items()}
+    renamed = decoded(replace(honest, teammates={names[n]: m for n, m in honest.teammates.items()}), boxes)
+    save(tmp_path / "x.npz", {0: renamed}, whole=True)
+    again = load(tmp_path / "x.npz", honest.detector, lambda _: [])[0]
+    assert set(again.team) == set(names.values())
+    for name, sent in honest.teammates.items():
+        np.testing.assert_array_equal(again.teammates[names[name]].tensors["features"], sent.tensors["features"])
 
 
 def test_a_recording_gives_testimony_of_the_messages_it_keeps(recorded):
