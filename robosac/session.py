@@ -2,15 +2,16 @@
 
 from __future__ import annotations
 
-from collections.abc import Mapping, Sequence
+from collections.abc import Iterable, Mapping, Sequence
 from typing import Any, Literal
 
 import numpy as np
 
 from robosac.ahead import Ahead
+from robosac.budget import DomainError
 from robosac.calibrated import calibration_of, screening_for
 from robosac.deadline import Deadline
-from robosac.defenses import Defense, DefenseSettings, SampleConsensus, State, build
+from robosac.defenses import EGO, Defense, DefenseSettings, SampleConsensus, State, build
 from robosac.defenses.group_testing import GroupTestingSettings
 from robosac.detectors import Detector, DetectorInfo, Message, Preparer
 from robosac.fusion import FrameRun, FusionResult
@@ -41,8 +42,9 @@ def changed_team(defense: Defense, state: State, team: Sequence[str]) -> State:
     Raises
     ------
     robosac.budget.DomainError
-        If the defence's settings make no sense for it.
+        If the defence's settings make no sense for it, or an id cannot be one.
     """
+    _check_ids("team", team)
     alone, memory = separated(state)
     return joined(defense.change_team(alone, list(team)), memory)
 
@@ -55,7 +57,7 @@ class Session:
     detector : Preparer
         Any `Detector`.
     team : sequence of str
-        All teammates, present or not.
+        All teammates, present or not: texts, none empty and none twice.
     defense : Defense, optional
         By default `default_defense` of the detector, which then must be a whole `Detector`.
     saved : mapping, optional
@@ -72,6 +74,11 @@ class Session:
         What the defence and the tests of messages remember, JSON values.
     previous : PreviousAnswer or None
         The latest answer, if anybody was fused into it.
+
+    Raises
+    ------
+    robosac.budget.DomainError
+        If the id of a teammate cannot be one.
 
     Examples
     --------
@@ -96,6 +103,7 @@ class Session:
         rng: np.random.Generator | None = None,
         screening: Screening | Literal["calibrated"] | None = "calibrated",
     ) -> None:
+        _check_ids("team", team)
         self.detector = detector
         self.screening = screening_for(detector.info) if screening == "calibrated" else screening
         self.defense = defense or _default(detector)
@@ -120,7 +128,8 @@ class Session:
             Its number; frames of successive numbers are one frame period apart.
         ego : Message
         teammates : mapping of teammate id to Message
-            Those present in this frame, checked against the detector's layout.
+            Those present in this frame, checked against the detector's layout. Who is not in the team joins it, and is
+            remembered until `change_team`.
         deadline : Deadline, optional
             By default there is time for all.
         detector : Preparer, optional
@@ -156,6 +165,7 @@ class Session:
         detector: Preparer | None = None,
     ) -> Steps[FusionResult]:
         """Decide as `decide` does, but pause before each pass, so that the work of others can take turns with it."""
+        _check_ids("teammates", teammates)
         deadline = deadline or Deadline()
         if isinstance(detector, Ahead):
             deadline.expect(detector.pass_s)
@@ -172,7 +182,7 @@ class Session:
         Raises
         ------
         robosac.budget.DomainError
-            If the defence's settings make no sense for it.
+            If the defence's settings make no sense for it, or an id cannot be one.
         """
         self.state = changed_team(self.defense, self.state, team)
 
@@ -182,6 +192,24 @@ class Session:
         The generator of the draws is not part of it: whoever knew it could foresee them.
         """
         return {"state": dict(self.state), "previous": None if self.previous is None else self.previous.as_json()}
+
+
+def _check_ids(field: str, names: Iterable[object]) -> None:
+    """Say which id cannot be one: in the middle of a frame it would cost all answers."""
+    known = set()
+    for index, name in enumerate(names):
+        if not isinstance(name, str):
+            fault = f"is no text: {name!r}"
+        elif name == EGO:
+            fault = "is empty, which stands for the ego"
+        elif not name.isascii() and name != name.encode(errors="ignore").decode():
+            fault = f"cannot be written as UTF-8: {name!r}"
+        elif name in known:
+            fault = f"is there twice: {name!r}"
+        else:
+            known.add(name)
+            continue
+        raise DomainError(f"{field}: id {index} {fault}")
 
 
 def _default(detector: Preparer) -> Defense:

@@ -6,6 +6,7 @@ import pytest
 import robosac
 from robosac.answers import Reason, Source
 from robosac.boxes import pose_matrix
+from robosac.budget import DomainError
 from robosac.deadline import Deadline
 from robosac.defenses import GroupTesting, Reference, SampleConsensus, StaticTeam
 from robosac.detectors import Message
@@ -86,3 +87,31 @@ def test_by_default_attackers_are_named(detector, ego_message, attacked):
 def test_a_recording_does_not_say_which_defence_is_the_default():
     with pytest.raises(TypeError, match="which defence"):
         Session(FakeDetector(), tuple(TEAM))
+
+
+@pytest.mark.parametrize(
+    ("name", "fault"),
+    [("", "is empty"), ("\ud800", "cannot be written as UTF-8: '\\\\ud800'"), (7, "is no text: 7")],
+)
+def test_an_id_that_cannot_be_one_is_told_before_any_frame(name, fault):
+    session = Session(FakeDetector(), tuple(TEAM), StaticTeam())
+    with pytest.raises(DomainError, match=f"team: id 1 {fault}"):
+        Session(FakeDetector(), ["a", name], StaticTeam())
+    with pytest.raises(DomainError, match=f"team: id 1 {fault}"):
+        session.change_team(["a", name])
+    with pytest.raises(DomainError, match=f"teammates: id 1 {fault}"):
+        session.answer(0, EGO, {"a": TEAM["a"], name: TEAM["b"]})
+
+
+def test_nobody_is_in_a_team_twice():
+    with pytest.raises(DomainError, match="team: id 2 is there twice: 'a'"):
+        Session(FakeDetector(), ["a", "b", "a"], StaticTeam())
+
+
+@pytest.mark.parametrize("name", ["車-1", "\x00", " ", "x" * 10_000, "ego"])
+def test_any_other_text_is_an_id(name, detector, messages):
+    team = dict(zip([name, "a", "b"], list(messages.values())[1:], strict=False))
+    session = robosac.Session(detector, list(team), rng=np.random.default_rng(0))
+    answer = session.answer(0, messages["car-1"], team)
+    assert (answer.fault, name in answer.suspicion) == (None, True)
+    assert robosac.Session(detector, list(team), saved=json.loads(json.dumps(session.save()))).state == session.state
