@@ -20,11 +20,16 @@ if TYPE_CHECKING:
     from rerun import RecordingStream
 
 APPLICATION = "robosac"
+FAR_M = 10_000.0
+"""The viewer keeps places in single precision: half a metre is its step at 5 000 km, 1 mm here."""
 _ACCEPTED, _REJECTED = FOUND_COLOUR, STANDING_COLOURS[Standing.CONTRADICTED]
 
 
 def write_rerun(session: RecordedSession, path: Path) -> None:
     """Write a session's poses, boxes, truth and suspicion; all boxes are in the world's frame.
+
+    Where the ego begins farther than `FAR_M` from the world's origin along an axis, whole kilometres are taken off; the
+    text ``origin`` says how many.
 
     Parameters
     ----------
@@ -44,18 +49,31 @@ def write_rerun(session: RecordedSession, path: Path) -> None:
         stream = rr.RecordingStream(APPLICATION, recording_id=session.opening.session_id)
         stream.save(beside)
         stream.log("world", rr.ViewCoordinates.RIGHT_HAND_Z_UP, static=True)
+        origin = _origin(session)
+        if origin.any():
+            text = "All places are metres from ({:.0f}, {:.0f}, {:.0f}) of the world.".format(*origin)
+            stream.log("origin", rr.TextDocument(text), static=True)
         for frame in session.frames:
             stream.set_time("time", timestamp=np.datetime64(frame.time_ns, "ns"))
             stream.set_time("frame", sequence=frame.number)
-            _log(stream, rr, frame, session.opening.ego_id)
+            _log(stream, rr, frame, session.opening.ego_id, origin)
         stream.flush()
         stream.disconnect()
 
 
-def _log(stream: RecordingStream, rr: Any, frame: RecordedFrame, ego_id: str) -> None:
-    answer, pose = frame.answer, frame.poses[ego_id]
+def _origin(session: RecordedSession) -> FloatArray:
+    """What is taken off all places (3,), metres."""
+    if not session.frames:
+        return np.zeros(3)
+    first: FloatArray = session.frames[0].poses[session.opening.ego_id][:3, 3]
+    return np.where(np.abs(first) > FAR_M, np.round(first / 1e3) * 1e3, 0.0)
+
+
+def _log(stream: RecordingStream, rr: Any, frame: RecordedFrame, ego_id: str, origin: FloatArray) -> None:
+    answer, pose = frame.answer, frame.poses[ego_id].copy()
+    pose[:3, 3] -= origin
     for name, turn in zip(frame.poses, quaternions(list(frame.poses.values())), strict=True):
-        place = frame.poses[name][:3, 3]
+        place = frame.poses[name][:3, 3] - origin
         stream.log(f"world/vehicles/{name}", rr.Transform3D(translation=place, quaternion=turn))
         colour = _ACCEPTED if name == ego_id or name in answer.accepted else _REJECTED
         shape = rr.Boxes3D(half_sizes=[[0.4, 0.4, 0.4]], colors=[_rgb(colour)], labels=[name])

@@ -1,10 +1,13 @@
 import json
+from dataclasses import replace
 
+import numpy as np
 import pytest
 from matplotlib.image import imread
 from mcap.reader import make_reader
 from PIL import Image
 
+from robosac.boxes import pose_matrix
 from robosac.interfaces.ros2 import TOPICS
 from robosac.playback.plain import write_cpm, write_ros2
 from robosac.playback.views import NoFfmpeg, write_moving, write_pictures
@@ -33,6 +36,26 @@ def test_rerun_reads_what_is_written_for_it(session, tmp_path):
         rows[part.entity_path] = rows.get(part.entity_path, 0) + part.num_rows
     assert {"/world/boxes", "/world/truth", "/world/vehicles/car-1", "/suspicion/car-2", "/decision"} <= rows.keys()
     assert rows["/world/boxes"] == 2
+
+
+def test_far_from_the_origin_rerun_keeps_its_precision(session, tmp_path):
+    """As in UTM; single precision would move everything by up to 25 cm."""
+    chunk = pytest.importorskip("rerun.chunk", reason="rerun-sdk is not installed")
+    from robosac.playback.rerun_file import write_rerun
+
+    def moved(frame):
+        poses = {name: pose_matrix(500_000.0, 5_400_000.0, 0.0, 0.0) @ pose for name, pose in frame.poses.items()}
+        return replace(frame, poses=poses)
+
+    def places(session, path):
+        write_rerun(session, path)
+        parts = {part.entity_path: part for part in chunk.RrdReader(path).stream() if "vehicles" in part.entity_path}
+        batch = parts["/world/vehicles/car-1"].to_record_batch()
+        return np.array(batch.column("Transform3D:translation").to_pylist()).reshape(-1, 3)
+
+    near = places(session, tmp_path / "near.rrd")
+    far = places(replace(session, frames=[moved(frame) for frame in session.frames]), tmp_path / "far.rrd")
+    np.testing.assert_allclose(far, near, atol=1e-4)
 
 
 def test_rerun_reads_the_recording_itself(session):
