@@ -27,7 +27,7 @@ from robosac.answers import Distrust, Likeness, Reason
 from robosac.defenses import EGO, Rejection
 from robosac.detectors import Message
 from robosac.screening.fingerprints import Fingerprint, fingerprints, likeness, packed
-from robosac.screening.past import KEPT_FRAMES, Anchor, Past, Place, Sent, recent
+from robosac.screening.past import Anchor, Past, Place, Sent, is_kept, recent
 
 MARGIN = 2.0
 """A message may be so many times as large as the largest of the calibration: other worlds have other maps."""
@@ -172,7 +172,7 @@ class _Seen:
             if each.digest == digest:
                 again = True
                 sent.append(Sent(digest, each.first, self.frame, each.place))
-            elif self.frame - each.last < KEPT_FRAMES:
+            elif is_kept(each.last, self.frame):
                 sent.append(each)
         if not again and not self.print.blank:
             sent.append(Sent(digest, self.frame, self.frame, self.place))
@@ -181,7 +181,7 @@ class _Seen:
     def _anchor(self, screening: Screening) -> Anchor:
         """The one of before while it is recent and not far; one that repeats itself is kept, to be found out again."""
         before = self.past.anchor
-        if before is not None and self.frame - before.frame < KEPT_FRAMES:
+        if before is not None and is_kept(before.frame, self.frame):
             far = self.moved_from(before.place) > MOVED_M
             if not far or screening._repeated(self) is not None:
                 return before

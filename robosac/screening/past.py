@@ -11,7 +11,7 @@ from robosac.boxes import FloatArray
 from robosac.screening.fingerprints import unpacked
 
 KEPT_FRAMES = 5
-"""What was sent is remembered for so many frames."""
+"""What was sent is remembered for so many frames; where numbers begin anew, what is as many ahead is forgotten, too."""
 Place = tuple[float, float]
 """x and y in the world, metres, rounded to 1 cm."""
 
@@ -71,7 +71,12 @@ class Past:
         }
 
 
+def is_kept(then: int, frame: int) -> bool:
+    """Whether what was sent in a frame is still remembered in another."""
+    return abs(frame - then) < KEPT_FRAMES
+
+
 def recent(past: Mapping[str, Any], frame: int) -> bool:
     """Whether a vehicle that is not in this frame has sent something lately; ``past`` is as JSON."""
     last: int = max((entry[2] for entry in past["sent"]), default=past["anchor"][0])
-    return frame - last < KEPT_FRAMES
+    return is_kept(last, frame)

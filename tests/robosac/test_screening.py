@@ -115,6 +115,17 @@ def test_what_was_sent_long_ago_is_forgotten(draw):
     assert set(play.memory) == {EGO, "b"}
 
 
+def test_what_was_sent_is_forgotten_though_frames_are_counted_anew(draw):
+    """As by a counter of 8 bits, or where a clip is played again and again in one session."""
+    play, most = Frames(draw), 0
+    for number in range(60):
+        play.frame = number % 12
+        play(a=at(2.0 * number, draw()), **({"b": at(9.0, draw())} if number == 11 else {}))
+        most = max(most, len(play.memory["a"]["sent"]))
+    assert most <= KEPT_FRAMES
+    assert "b" not in play.memory
+
+
 def test_a_near_repetition_is_closer_than_two_scans_of_one_place(draw, rng):
     play, frozen = Frames(draw), draw()
     found = [why(play(a=at(4.0 * frame, noisy(frozen, 0.02, rng)))).get("a") for frame in range(9)]
