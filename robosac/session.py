@@ -61,7 +61,7 @@ class Session:
     defense : Defense, optional
         By default `default_defense` of the detector, which then must be a whole `Detector`.
     saved : mapping, optional
-        What `save` gave: the session goes on from there.
+        What `save` gave: the session goes on from there, with the team that it had.
     rng : numpy.random.Generator, optional
         All randomness of the defence; seeded by the operating system by default, so that nobody can foresee it.
     screening : Screening, optional
