@@ -9,6 +9,7 @@ from fastapi.security import HTTPAuthorizationCredentials, HTTPBearer
 from fastapi.security.http import HTTPBase
 
 from robosac.possession import HEADER, Call
+from service.arriving.paths import path_of
 from service.gateway import Gateway
 from service.sessions.live import Caller
 
@@ -54,8 +55,7 @@ Ego = Annotated[Caller, Depends(_ego)]
 
 
 async def _check_possession(request: Request, gateway: GatewayDep, caller: Caller, token: str | None) -> Caller:
-    path = request.scope["path"].removeprefix(request.scope.get("root_path", ""))
-    call = Call(request.method, path, token or "")
+    call = Call(request.method, path_of(request.scope), token or "")
     await gateway.possession.check(caller, call, request.headers.getlist(HEADER))
     return caller
 

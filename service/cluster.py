@@ -19,6 +19,7 @@ from starlette.datastructures import Headers
 from starlette.types import ASGIApp, Scope
 
 from robosac.extras import need
+from service.arriving.paths import path_of
 from service.errors import Kind, Refused
 from service.settings import PREFIX
 
@@ -52,7 +53,7 @@ def check_routed(scope: Scope) -> None:
     Refused
         With the kind ``misrouted``.
     """
-    found = _IN_A_SESSION.match(scope["path"])
+    found = _IN_A_SESSION.match(path_of(scope))
     if found is not None and Headers(scope=scope).get(SESSION_HEADER) != found[1]:
         detail = f"the header {SESSION_HEADER} must be the session's id, as the cluster finds the session by it"
         raise Refused(Kind.MISROUTED, detail, SESSION_HEADER)

@@ -11,6 +11,7 @@ from starlette.datastructures import Headers
 from starlette.types import ASGIApp, Receive, Scope, Send
 
 from service import problems
+from service.arriving.paths import path_of
 from service.deciding.admission import Admission
 from service.errors import Kind, Refused
 from service.sessions.live import LiveSession
@@ -59,7 +60,7 @@ def check_head(scope: Scope) -> None:
 
 def check_local(scope: Scope) -> None:
     """Refuse other machines, but for `OPEN_PATHS`: for a gateway whose sessions anybody can open."""
-    if scope["path"] not in OPEN_PATHS and not is_local(scope):
+    if path_of(scope) not in OPEN_PATHS and not is_local(scope):
         detail = "without an API key the gateway serves its own machine only; set ROBOSAC_API_KEYS"
         raise Refused(Kind.LOOPBACK_ONLY, detail)
 
@@ -93,7 +94,7 @@ def host_check(names: Collection[str]) -> Callable[[Scope], None]:
         return host == "localhost" or host in names or _is_loopback(host)
 
     def check(scope: Scope) -> None:
-        if scope["path"] in OPEN_PATHS:
+        if path_of(scope) in OPEN_PATHS:
             return
         headers = Headers(scope=scope)
         hosts = headers.getlist("host")
@@ -130,7 +131,7 @@ def capacity_check(admission: Admission, in_use: Callable[[str], LiveSession | N
     """
 
     def check(scope: Scope) -> None:
-        found = _FRAMES_PATH.fullmatch(scope["path"]) if scope["method"] == "POST" else None
+        found = _FRAMES_PATH.fullmatch(path_of(scope)) if scope["method"] == "POST" else None
         live = in_use(found[1]) if found else None
         if found and live is not None:
             admission.check(live.key, found[1], live.budget_s)

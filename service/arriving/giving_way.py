@@ -10,6 +10,8 @@ from collections.abc import Callable
 
 from starlette.types import ASGIApp, Message, Receive, Scope, Send
 
+from service.arriving.paths import path_of
+
 AT_A_TIME = 2
 """Requests that are answered at a time."""
 EVERY_S = 0.05
@@ -121,7 +123,7 @@ class GivesWay:
         self._party_of = party_of
 
     async def __call__(self, scope: Scope, receive: Receive, send: Send) -> None:
-        if scope["type"] != "http" or _NEVER_WAIT.fullmatch(scope["path"]):
+        if scope["type"] != "http" or _NEVER_WAIT.fullmatch(path_of(scope)):
             await self._app(scope, receive, send)
             return
         party = self._party_of(scope)

@@ -8,6 +8,8 @@ import structlog
 from starlette.requests import ClientDisconnect
 from starlette.types import ASGIApp, Message, Receive, Scope, Send
 
+from service.arriving.paths import path_of
+
 logger = structlog.stdlib.get_logger(__name__)
 
 PATIENCE_S = 30.0
@@ -23,7 +25,7 @@ class HangingUp:
         self._patience_s = patience_s
 
     async def __call__(self, scope: Scope, receive: Receive, send: Send) -> None:
-        if scope["type"] != "http" or not scope["path"].startswith(PATH):
+        if scope["type"] != "http" or not path_of(scope).startswith(PATH):
             await self._app(scope, receive, send)
             return
         hung_up = False

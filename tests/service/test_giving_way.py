@@ -36,8 +36,8 @@ class Requests:
         await self.let.wait()
         await PlainTextResponse("done")(scope, receive, send)
 
-    def ask(self, path, party="", member="", send=None):
-        scope = {"type": "http", "method": "GET", "path": path, "headers": [], "party": (party, member)}
+    def ask(self, path, party="", member="", send=None, **more):
+        scope = {"type": "http", "method": "GET", "path": path, "headers": [], "party": (party, member), **more}
         return asyncio.create_task(self._app(scope, self._receive, send or self._drop))
 
     async def _receive(self):
