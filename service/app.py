@@ -187,9 +187,9 @@ async def _running(gateway: Gateway, settings: Settings, tokens: Tokens, tracing
             blamed_on("ROBOSAC_EXTRA_DETECTORS", engine.start()),
         )
         gateway.recorder.start()
-        await tokens.start(store)
-        await gateway.keys.start(store)
-        gateway.metrics.sessions.set(await store.count())
+        for reads in (tokens.start, gateway.keys.start):
+            await blamed_on("ROBOSAC_DATABASE_URL", reads(store))
+        gateway.metrics.sessions.set(await blamed_on("ROBOSAC_DATABASE_URL", store.count()))
         if settings.detector not in engine.detectors:
             known = list(engine.detectors)
             raise ValueError(f"ROBOSAC_DETECTOR: unknown detector {settings.detector!r}; known: {known}")

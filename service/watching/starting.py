@@ -4,24 +4,30 @@ from __future__ import annotations
 
 import sys
 from collections.abc import Awaitable
+from typing import TypeVar
 
 from starlette.types import ASGIApp, Message, Receive, Scope, Send
 
 from robosac.faults import describe
 from service.errors import StoreUnavailable
+from service.settings import PREFIX
+
+T = TypeVar("T")
 
 
-async def blamed_on(variable: str, starting: Awaitable[None]) -> None:
-    """Wait for a part of the gateway to start.
+async def blamed_on(variable: str, starting: Awaitable[T]) -> T:
+    """Wait for a part of the gateway to start, or for what it needs to.
 
     Raises
     ------
     ValueError
-        If it cannot, with the variable that is to blame.
+        If it cannot, with the variable that is to blame: this one, or another that the fault names itself.
     """
     try:
-        await starting
+        return await starting
     except ValueError as fault:
+        if str(fault).startswith(PREFIX):
+            raise
         raise ValueError(f"{variable}: {fault}") from fault
     except StoreUnavailable as fault:
         cause = fault.__cause__ or fault

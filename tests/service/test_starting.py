@@ -1,8 +1,12 @@
+import sqlite3
+from contextlib import closing
+
 import pytest
 
 from service.app import create_app
 from service.settings import Settings
 from service.watching.starting import Starting
+from tests.service.conftest import serve
 
 
 async def started(app):
@@ -36,6 +40,25 @@ async def test_a_setting_that_keeps_the_gateway_from_starting_is_named_in_a_line
     told, _ = await started(create_app(Settings(**{"database_url": "sqlite://", **settings})))
     assert told.startswith(complaint)
     assert "\n" not in told
+
+
+async def test_a_database_that_cannot_be_used_is_named_in_a_line(tmp_path):
+    url = f"sqlite:///{tmp_path / 'sessions.db'}"
+    async with serve(database_url=url):
+        pass
+    spoils = {
+        "CREATE TRIGGER spoilt BEFORE INSERT ON secrets BEGIN SELECT RAISE(ABORT, 'no changes'); END": "no changes",
+        "UPDATE alembic_version SET version_num = '9999'": "the database is of a later version of the gateway",
+    }
+    for spoil, complaint in spoils.items():
+        with closing(sqlite3.connect(tmp_path / "sessions.db")) as database:
+            database.execute("DELETE FROM secrets")
+            database.execute(spoil)
+            database.commit()
+        told, _ = await started(create_app(Settings(database_url=url)))
+        assert told.startswith("ROBOSAC_DATABASE_URL: ")
+        assert complaint in told
+        assert "\n" not in told
 
 
 async def test_a_fault_that_is_no_setting_keeps_its_traceback():

@@ -19,21 +19,29 @@ def upgrade(connection: Connection) -> None:
 
     Raises
     ------
-    alembic.util.CommandError
-        If the database is of a later version than this one.
+    ValueError
+        If the database is of a later version than this one, or of another program.
     """
     lock(connection)
-    if _revision(connection) == HEAD:
+    revision = _revision(connection)
+    if revision == HEAD:
         return
     if connection.dialect.name == "postgresql":  # a step may rewrite what takes longer than a frame may wait
         connection.execute(text("SET LOCAL statement_timeout = 0"))
         connection.execute(text("SET LOCAL idle_in_transaction_session_timeout = 0"))
     from alembic import command  # noqa: PLC0415 - 0.2 s that most starts need not spend
     from alembic.config import Config  # noqa: PLC0415
+    from alembic.util import CommandError  # noqa: PLC0415
 
     config = Config(Path(__file__).parent / "alembic.ini")
     config.attributes["connection"] = connection
-    command.upgrade(config, "head")
+    try:
+        command.upgrade(config, "head")
+    except CommandError as error:
+        raise ValueError(
+            f"the database is of a later version of the gateway, or another program's: its schema is {revision}, "
+            f"this version's {HEAD}"
+        ) from error
 
 
 def lock(connection: Connection) -> None:
