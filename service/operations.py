@@ -16,12 +16,14 @@ operations = APIRouter(tags=["operations"])
 _TEXT = "text/plain; version=0.0.4; charset=utf-8"
 
 
+@operations.head("/healthz", include_in_schema=False)
 @operations.get("/healthz", responses=description.status("alive", "It lives."))
 async def healthz() -> dict[str, str]:
     """Whether the process lives."""
     return {"status": "alive"}
 
 
+@operations.head("/readyz", include_in_schema=False)
 @operations.get("/readyz", responses={**description.status("ready", "It is ready."), **documented(503)})
 async def readyz(gateway: GatewayDep) -> dict[str, str]:
     """Whether the gateway is warm and able to serve, and its database takes changes."""

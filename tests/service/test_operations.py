@@ -25,6 +25,16 @@ async def test_alive_at_once_and_ready_after_the_warm_up():
         problem(await http.get("/readyz"), 503, "not-ready")
 
 
+async def test_who_watches_may_ask_for_the_heads_alone(served):
+    for path in ("/healthz", "/readyz"):
+        head, whole = await served.http.head(path), await served.http.get(path)
+        assert (head.status_code, head.content) == (200, b"")
+        assert head.headers["content-length"] == str(len(whole.content))
+    served.gateway.stop()
+    head = await served.http.head("/readyz")
+    assert (head.status_code, head.content) == (503, b"")
+
+
 async def test_metrics_count_what_happened(served, ego_message, attacked, messages):
     session = await served.open(defense={"kind": "sample_consensus", "sampling_budget": 7, "collaborators": 3})
     for frame in range(4):
