@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import os
 from pathlib import Path
 from typing import BinaryIO
 
@@ -83,6 +84,11 @@ class RecordingFile:
     def size(self) -> int:
         """Bytes so far."""
         return self._file.tell()
+
+    @property
+    def is_removed(self) -> bool:
+        """Whether somebody has removed the file, so that nothing can be read any more of what is written to it."""
+        return os.fstat(self._file.fileno()).st_nlink == 0
 
     def add(self, moment: Moment, dropped: int = 0) -> None:
         """Add a frame, after so many that were not added."""

@@ -78,10 +78,15 @@ class Folder:
         Raises
         ------
         OSError
-            If it cannot be written. What was written before stays readable, and the next frame begins a new file.
+            If it cannot be written. What was written before stays readable, and the next frame begins a new file, as it
+            does where somebody has removed the one before.
         """
         now, session_id = time.monotonic(), record.session_id
-        opened = self._files.get(session_id) or self._begin(record, moment)
+        opened = self._files.get(session_id)
+        if opened is not None and opened.file.is_removed:
+            self._files.pop(session_id).file.abandon()
+            opened = None
+        opened = opened or self._begin(record, moment)
         opened.used = now
         try:
             before = opened.file.size

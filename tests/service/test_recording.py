@@ -70,6 +70,26 @@ async def until_recorded(served, frames):
             await asyncio.sleep(0.01)
 
 
+async def test_where_a_recording_is_removed_the_next_frame_begins_another(fleet, tmp_path):
+    folder = tmp_path / "recordings"
+    async with serve(record=folder) as served:
+        session = await served.open()
+        driven = drive(served, session, fleet)
+        await anext(driven)
+        await until_recorded(served, 1)
+        (first,) = folder.iterdir()
+        first.unlink()
+        await anext(driven)
+        await until_recorded(served, 2)
+        (second,) = folder.iterdir()
+        second.unlink()
+        folder.rmdir()
+        await anext(driven)
+        async with asyncio.timeout(20):
+            while 'unrecorded_frames_total{why="disk"} 1.0' not in (await served.http.get("/metrics")).text:
+                await asyncio.sleep(0.01)
+
+
 async def test_only_sessions_that_ask_are_recorded_where_the_operator_says_so(fleet, tmp_path):
     database, folder = f"sqlite:///{tmp_path}/db", tmp_path / "recordings"
     settings = {"record": folder, "record_sessions": "asked", "record_messages": "digests", "database_url": database}
