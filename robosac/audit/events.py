@@ -237,7 +237,10 @@ def event_on(line: bytes) -> Event | None:
 
 def event_of(record: Mapping[str, Any]) -> Event | None:
     """As `event_on`, of a record that was read already."""
-    kind = _KINDS.get(str(record.get("event")))
+    name = record.get("event")
+    if not isinstance(name, str):
+        raise RecordError("event: must be a string")
+    kind = _KINDS.get(name)
     if kind is None:
         return None
     try:
