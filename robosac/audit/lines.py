@@ -2,12 +2,16 @@
 
 from __future__ import annotations
 
+import codecs
 import json
 import re
 from collections.abc import Mapping
 from typing import Any, NoReturn
 
 import rfc8785
+
+_FOREIGN = {codecs.BOM_UTF8: "a byte order mark", b"\x1f\x8b": "the mark of gzip"}
+"""What other programs put before a text, or before what they have packed."""
 
 
 class RecordError(ValueError):
@@ -37,10 +41,19 @@ def read(line: bytes) -> dict[str, Any]:
     try:
         record = _READER.decode(line.decode())
     except (ValueError, RecursionError) as error:
-        raise RecordError(f"not JSON: {error}") from error
+        raise RecordError(f"not JSON: {_why(line, error)}") from error
     if not isinstance(record, dict):
         raise RecordError("not JSON: no object")
     return record
+
+
+def _why(line: bytes, error: Exception) -> str:
+    if not line.strip():
+        return "the line is empty"
+    for begin, what in _FOREIGN.items():
+        if line.startswith(begin):
+            return f"it begins with {what}"
+    return f"{error.msg}: character {error.pos + 1}" if isinstance(error, json.JSONDecodeError) else str(error)
 
 
 def is_canonical(line: bytes, record: Mapping[str, Any]) -> bool:

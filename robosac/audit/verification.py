@@ -160,7 +160,9 @@ class _Verification:
             return None
         self._seq = record["seq"] if type(record.get("seq")) is int else None
         if not is_canonical(line, record):
-            self._find(Fault.NOT_CANONICAL, "not the canonical form (RFC 8785) of what it says")
+            changed = "it ends with a carriage return, as where a program has changed the ends of lines"
+            what = changed if line.endswith(b"\r") else "not the canonical form (RFC 8785) of what it says"
+            self._find(Fault.NOT_CANONICAL, what)
             return None
         return record
 

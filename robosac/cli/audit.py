@@ -4,10 +4,15 @@ from __future__ import annotations
 
 import json
 import re
+import shutil
+import tempfile
 from collections.abc import Iterable, Iterator
+from contextlib import contextmanager
+from dataclasses import dataclass
 from datetime import UTC, datetime
+from itertools import islice
 from pathlib import Path
-from typing import Annotated
+from typing import Annotated, BinaryIO
 
 import typer
 
@@ -42,16 +47,9 @@ def verify(
     promised = None if receipts is None else _read_receipts(receipts, gateway_key or [])
     if head is not None and re.fullmatch("[0-9a-f]{64}", head) is None:
         raise typer.BadParameter("must be 64 hexadecimal digits, lower case", param_hint="--head")
-    count, last = 0, b""
-
-    def counted(lines: Iterable[bytes]) -> Iterator[bytes]:
-        nonlocal count, last
-        for last in lines:
-            count += 1
-            yield last
-
     with blaming("FILE", OSError), file.open("rb") as lines:
-        findings = verification.verify(counted(lines), head, promised)
+        log = _Counted(lines)
+        findings = verification.verify(log, head, promised)
     for finding in findings:
         _say(finding)
     for doubt in promised.doubts if promised else ():
@@ -59,10 +57,11 @@ def verify(
     if findings:
         _say(f"{file}: findings: {len(findings)}")
         raise typer.Exit(1)
+    last = log.last.removesuffix(b"\n")
     if promised is not None:
-        _say(f"{file}: as {len(promised.heads)} receipts promised")
+        _say(f"{file}: as {len(promised.of(read(last)['session_id']))} receipts promised")
     proved = "which is the head given" if head else "to be compared with a head from elsewhere"
-    _say(f"{file}: {count} records, nothing wrong; head {digest(last.decode().removesuffix(chr(10)))}, {proved}")
+    _say(f"{file}: {log.count} records, nothing wrong; head {digest(last.decode())}, {proved}")
 
 
 @app.command()
@@ -135,14 +134,16 @@ def report(
     """Write what a log says against a vehicle, in the terms of ETSI TS 103 759; 1 if it says nothing or is broken."""
     if out is not None:
         check_file(out, "--out", force)
-    with blaming("FILE", OSError), file.open("rb") as lines:
-        findings = verification.verify(lines)
-    if findings:
-        _say(f"{file}: {findings[0]}; see robosac audit verify", err=True)
-        raise typer.Exit(1)
     try:
-        with blaming("FILE", OSError), file.open("rb") as lines:
-            fields = misbehaviour.report(lines, vehicle, datetime.now(UTC))
+        with blaming("FILE", OSError), _open_again_and_again(file) as lines:
+            log = _Counted(lines)
+            findings = verification.verify(log)
+            if findings:
+                _say(f"{file}: {findings[0]}; see robosac audit verify", err=True)
+                raise typer.Exit(1)
+            lines.seek(0)
+            checked = islice(lines, log.count)  # the log may have grown meanwhile
+            fields = misbehaviour.report(checked, vehicle, datetime.now(UTC))
     except misbehaviour.NothingToReport as nothing:
         _say(f"{file}: {nothing}", err=True)
         raise typer.Exit(1) from nothing
@@ -153,6 +154,33 @@ def report(
     with blaming("--out", OSError):
         write_text(out, text)
     _say(f"{out}: {len(fields['report']['content']['v2xPduEvidence'])} observations of {vehicle}")
+
+
+@dataclass
+class _Counted:
+    """Lines, of which is known how many were read and what the last one is."""
+
+    lines: Iterable[bytes]
+    count: int = 0
+    last: bytes = b""
+
+    def __iter__(self) -> Iterator[bytes]:
+        for line in self.lines:
+            self.count, self.last = self.count + 1, line
+            yield line
+
+
+@contextmanager
+def _open_again_and_again(file: Path) -> Iterator[BinaryIO]:
+    """A file that can be read more than once, as a pipe cannot."""
+    with file.open("rb") as given:
+        if given.seekable():
+            yield given
+            return
+        with tempfile.TemporaryFile() as copy:
+            shutil.copyfileobj(given, copy)
+            copy.seek(0)
+            yield copy
 
 
 def _lines(file: Path) -> Iterator[bytes]:

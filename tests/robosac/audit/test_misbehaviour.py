@@ -1,5 +1,7 @@
 import base64
 import json
+import subprocess
+import sys
 from datetime import UTC, datetime
 
 import numpy as np
@@ -115,6 +117,15 @@ def test_of_whom_the_log_says_nothing_nothing_is_reported(lines, vehicle):
 def run(*arguments):
     result = CliRunner().invoke(app, ["audit", "report", *map(str, arguments)])
     return result.exit_code, result.output
+
+
+def test_the_command_reads_a_pipe_as_it_reads_a_file(lines):
+    words = [sys.executable, "-c", "from robosac.cli import app; app()", "audit", "report", "/dev/stdin"]
+    done = subprocess.run(
+        [*words, "--vehicle", "car-2"], check=False, input=b"".join(lines), capture_output=True, timeout=60
+    )
+    assert done.returncode == 0, done.stderr
+    assert json.loads(done.stdout)["report"]["content"]["v2xPduEvidence"]
 
 
 def test_the_command_writes_a_report_from_a_sound_log_only(lines, tmp_path):

@@ -143,7 +143,8 @@ def test_what_the_gateway_did_not_sign_is_not_used(events):
 def test_the_command_checks_receipts(events, tmp_path):
     lines = written(events)
     log, receipts = tmp_path / "log.jsonl", tmp_path / "receipts.jsonl"
-    receipts.write_text(receipt(lines, 7).model_dump_json() + "\n")
+    both = receipt(lines, 7), receipt(lines, 7, session="another's, of which nothing is checked")
+    receipts.write_text("".join(each.model_dump_json() + "\n" for each in both))
     log.write_bytes(b"".join(lines))
     command = ["audit", "verify", str(log), "--receipts", str(receipts)]
     done = CliRunner().invoke(app, [*command, "--gateway-key", PUBLIC])

@@ -98,6 +98,21 @@ def test_a_line_that_is_no_canonical_json_is_told(lines, line, fault):
     assert faults([*lines[:3], line + b"\n", *lines[4:]]) == [(4, fault)]
 
 
+@pytest.mark.parametrize(
+    ("line", "words"),
+    [
+        (b"", "the line is empty"),
+        (b'\xef\xbb\xbf{"a":1}', "it begins with a byte order mark"),
+        (b"\x1f\x8b\x08\x00", "it begins with the mark of gzip"),
+        (b'{"a":"b', "Unterminated string starting at: character 6"),
+        (b'{"a":1}\r', "it ends with a carriage return"),
+    ],
+)
+def test_what_other_programs_made_of_a_line_is_told(line, words):
+    (finding, *_) = verify([line + b"\n"])
+    assert words in finding.detail
+
+
 def test_an_empty_log_is_told():
     assert faults([]) == [(0, Fault.MISPLACED)]
 
