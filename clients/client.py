@@ -17,7 +17,7 @@ from typing import Any, TypedDict, Unpack
 import httpx
 from cryptography.hazmat.primitives.asymmetric.ed25519 import Ed25519PrivateKey
 
-from clients.errors import GatewayError, GatewayUnreachable, RequestRefused, refusal
+from clients.errors import NO_TYPE, GatewayError, GatewayUnreachable, ProtocolError, RequestRefused, refusal
 from clients.receipts import ReceiptBook
 from clients.vehicle import MSGPACK, RenewedToken, VehicleClient, bearer, told
 from robosac.answers import FrameAnswer, LogReceipt
@@ -41,6 +41,7 @@ AGAIN_FOR_S, AGAIN_FIRST_S, AGAIN_EVERY_S = 1.0, 0.02, 0.2
 moment, and with which pauses.
 """
 DRAINING, STORE_UNAVAILABLE = "urn:robosac:problem:draining", "urn:robosac:problem:store-unavailable"
+EVENTS = "text/event-stream"
 SILENCE_S = 40.0
 """A stream on which nothing came for so long is broken."""
 API_KEY_VARIABLE = "ROBOSAC_API_KEY"
@@ -203,7 +204,7 @@ class GatewayClient:
                     if response.is_success:
                         return response
                     if not (may_again and _is_to_be_sent_again(response, method, path)):
-                        raise _refusal(response)
+                        raise self._not_served(response)
             await asyncio.sleep(pause_s)
             if self._http.is_closed:
                 raise GatewayUnreachable(f"{method} {path}: the client was closed before it could be sent again")
@@ -218,22 +219,42 @@ class GatewayClient:
         ):
             if not response.is_success:
                 await response.aread()
-                raise _refusal(response)
+                raise self._not_served(response)
+            if not response.headers.get("content-type", "").startswith(EVENTS):
+                raise ProtocolError(f"{self._where(path)} answers no stream of events")
             name = ""
             async for line in response.aiter_lines():
                 field, _, value = line.partition(": ")
                 if field == "event":
                     name = value
                 elif field == "data":
-                    yield name, json.loads(value)
+                    try:
+                        said = json.loads(value)
+                    except ValueError as error:
+                        raise ProtocolError(f"{self._where(path)}: an event that is not JSON: {error}") from error
+                    yield name, said
 
     @contextlib.asynccontextmanager
     async def _reached(self, method: str, path: str) -> AsyncIterator[None]:
         try:
             yield
         except (httpx.HTTPError, httpx.InvalidURL) as error:
-            where = f"{method} {self._http.base_url.join(path)}"
+            where = f"{method} {self._where(path)}"
             raise GatewayUnreachable(f"{where}: {type(error).__name__} {error}; is the gateway running?") from error
+
+    def _where(self, path: str) -> str:
+        return f"{_shown(self._http.base_url).rstrip('/')}{path}"
+
+    def _not_served(self, response: httpx.Response) -> GatewayError:
+        if response.has_redirect_location:
+            where = f"{response.request.method} {_shown(response.request.url)}"
+            return ProtocolError(f"{where} is redirected to {response.headers['location']}; ask there")
+        return _refusal(response)
+
+
+def _shown(url: httpx.URL) -> str:
+    """A URL without a password."""
+    return str(url.copy_with(userinfo=b""))
 
 
 def _is_to_be_sent_again(response: httpx.Response, method: str, path: str) -> bool:
@@ -262,7 +283,7 @@ def _told(response: httpx.Response, problem: Mapping[str, Any]) -> RequestRefuse
     retry = response.headers.get("retry-after", "")
     return refusal(response.status_code)(
         response.status_code,
-        str(problem.get("type", "about:blank")),
+        str(problem.get("type", NO_TYPE)),
         str(problem.get("detail", response.reason_phrase)),
         problem.get("field"),
         float(retry) if retry.isdecimal() else None,

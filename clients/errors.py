@@ -15,6 +15,9 @@
 
 from __future__ import annotations
 
+NO_TYPE = "about:blank"
+"""``type`` of a problem that is nothing but its status (RFC 9457), and of what is no problem at all."""
+
 
 class GatewayError(Exception):
     """Base of everything this package raises."""
@@ -45,7 +48,8 @@ class RequestRefused(GatewayError):
     def __init__(
         self, status: int, type_: str, detail: str, field: str | None = None, retry_after_s: float | None = None
     ) -> None:
-        super().__init__(f"{status} {type_.rsplit(':', 1)[-1]}: {f'{field}: ' if field else ''}{detail}")
+        named = "" if type_ == NO_TYPE else f" {type_.rsplit(':', 1)[-1]}"
+        super().__init__(f"{status}{named}: {f'{field}: ' if field else ''}{detail}")
         self.status = status
         self.type = type_
         self.detail = detail

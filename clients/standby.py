@@ -7,7 +7,14 @@ from collections import OrderedDict
 from collections.abc import AsyncIterator, Awaitable, Callable
 from typing import Any
 
-from clients.errors import FrameConflict, GatewayError, GatewayUnavailable, GatewayUnreachable, RequestRefused
+from clients.errors import (
+    FrameConflict,
+    GatewayError,
+    GatewayUnavailable,
+    GatewayUnreachable,
+    ProtocolError,
+    RequestRefused,
+)
 
 KEPT_FRAMES = 6
 """Latest messages that can be sent again; the gateway takes no more ahead by default."""
@@ -50,24 +57,31 @@ class Standby:
         pause_s = FIRST_PAUSE_S
         while True:
             taken = dict(self._sent)  # what is sent from now on goes where the stream goes, or later
+            stood = False
             try:
                 async for event, said in self._events():
                     if event == "standing":
-                        pause_s = FIRST_PAUSE_S
                         await self._send_again(taken, said)
+                        stood, pause_s = True, FIRST_PAUSE_S
                         self.standing.set()
-                continue
-            except (GatewayUnreachable, GatewayUnavailable):
-                await asyncio.sleep(pause_s)
-                pause_s = min(2 * pause_s, LONGEST_PAUSE_S)
+                if stood:
+                    continue
+            except (GatewayUnreachable, GatewayUnavailable, ProtocolError):
+                pass
             except RequestRefused:
                 return
             finally:
                 self.standing.clear()
+            await asyncio.sleep(pause_s)
+            pause_s = min(2 * pause_s, LONGEST_PAUSE_S)
 
     async def _send_again(self, taken: dict[int, bytes], said: dict[str, Any]) -> None:
+        try:
+            answered, waiting = int(said["answered"]), frozenset(said["waiting"])
+        except (TypeError, KeyError, ValueError) as error:
+            raise ProtocolError("not what a gateway says to whoever stands by") from error
         for frame, body in sorted(taken.items()):
-            if frame > said["answered"] and frame not in said["waiting"]:
+            if frame > answered and frame not in waiting:
                 try:
                     await self._send(body)
                 except FrameConflict:  # answered meanwhile

@@ -204,7 +204,9 @@ class VehicleClient:
         while True:
             asked = {"after": after, "limit": AUDIT_PAGE}
             response = await self._request("GET", f"{self._path}/audit", params=asked, headers=self.bearer)
-            lines = response.text.split("\n")[:-1]  # and not where Unicode would also break a line
+            *lines, rest = response.text.split("\n")  # and not where Unicode would also break a line
+            if rest or not all(line.startswith("{") for line in lines):
+                raise ProtocolError(f"not what {self._path}/audit answers: records, a line each")
             for line in lines:
                 yield line
             after += len(lines)

@@ -1,3 +1,5 @@
+import asyncio
+
 import httpx
 import numpy as np
 import pytest
@@ -131,6 +133,60 @@ async def test_a_gateway_that_does_not_answer_is_unreachable(error):
         assert not await client.ready()
         with pytest.raises(GatewayUnreachable):
             await client.detectors()
+
+
+@pytest.mark.parametrize("content", ["<html>hello</html>", "<html>\n</html>\n", '{"seq":1}\n{"se', "null"])
+async def test_what_is_no_log_is_a_protocol_error(content):
+    async with gateway(lambda _: httpx.Response(200, text=content)) as client:
+        with pytest.raises(ProtocolError, match="a line each"):
+            await client.vehicle("s", "e", "t").audit_lines()
+
+
+async def test_a_redirection_is_told_with_where_it_leads():
+    def elsewhere(_):
+        return httpx.Response(308, headers={"Location": "https://gateway/v1/detectors"})
+
+    async with gateway(elsewhere) as client:
+        with pytest.raises(ProtocolError, match="redirected to https://gateway/v1/detectors"):
+            await client.detectors()
+
+
+async def test_a_refusal_that_is_no_problem_is_told_by_its_status():
+    async with gateway(lambda _: httpx.Response(500, text="<html>")) as client:
+        with pytest.raises(GatewayUnavailable, match=r"^500: Internal Server Error$"):
+            await client.detectors()
+
+
+async def test_an_unreachable_gateway_is_told_with_its_prefix_and_without_a_password():
+    def fail(_):
+        raise httpx.ConnectError("refused")
+
+    transport = httpx.MockTransport(fail)
+    async with GatewayClient("http://me:secret@gateway/gw/", transport=transport) as client:
+        with pytest.raises(GatewayUnreachable, match=r"^GET http://gateway/gw/v1/detectors: "):
+            await client.detectors()
+
+
+@pytest.mark.parametrize(
+    ("media_type", "content"),
+    [
+        ("text/html", "<html>"),
+        ("text/event-stream", ""),
+        ("text/event-stream", "event: standing\ndata: {\n\n"),
+        ("text/event-stream", "event: standing\ndata: {}\n\n"),
+        ("text/event-stream", "event: standing\ndata: 5\n\n"),
+    ],
+)
+async def test_whoever_stands_by_asks_seldom_where_no_gateway_answers(media_type, content):
+    asked = []
+
+    def answer(_):
+        asked.append(1)
+        return httpx.Response(200, text=content, headers={"Content-Type": media_type})
+
+    async with gateway(answer) as client, client.vehicle("s", "rsu", "t").standing_by():
+        await asyncio.sleep(0.3)
+    assert 2 <= len(asked) <= 6
 
 
 @pytest.mark.parametrize("content", [b"", b"junk", b"\x80", wire.pack({"frame": 1, "boxes": 3})])
