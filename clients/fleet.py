@@ -3,8 +3,9 @@
 from __future__ import annotations
 
 import asyncio
+import contextlib
 import time
-from collections import Counter, deque
+from collections import Counter
 from collections.abc import Awaitable, Callable
 from dataclasses import asdict, dataclass, field
 from pathlib import Path
@@ -12,19 +13,16 @@ from typing import Annotated, Any, TypeVar
 
 import torch
 import typer
-from rich.console import Console, Group
-from rich.live import Live
-from rich.progress import BarColumn, MofNCompleteColumn, Progress, TextColumn, TimeRemainingColumn
-from rich.table import Table
+from rich.console import Console
 
 from clients import trial
 from clients.client import GatewayClient, OpenedSession, VehicleClient
 from clients.errors import FrameConflict, GatewayUnavailable
+from clients.screen import Screen
 from clients.simulation import EgoFrame, Fleet, team_fault
-from clients.standing import shown
 from clients.summary import REPORT, FleetSummary
 from robosac import attacks, defenses, detectors
-from robosac.answers import FrameAnswer, Reason
+from robosac.answers import FrameAnswer
 from robosac.attacks import CAMPAIGN_HELP
 from robosac.cli.blame import blaming
 from robosac.cli.options import check_attack, load_data, load_detector
@@ -34,9 +32,12 @@ from robosac.recording.truth import Truth
 from robosac.scenes import DATA_HELP, DEFAULT_DATA, SceneError, SceneSource, first_scenes, load_source
 from robosac.wire import Packing
 
-RECENT = 12
 PATIENCE = 5
 """How often a message is sent to a gateway that cannot serve now."""
+MOST_PAUSE_S = 30.0
+"""Whoever is told to ask later than that gives up."""
+LEAVING_S = 2.0
+"""For closing the sessions of a run that is ended early."""
 T = TypeVar("T")
 
 
@@ -61,63 +62,6 @@ class FleetOptions:
     data: str = DEFAULT_DATA
     truth: bool = False
     packing: Packing | None = None
-
-
-class _Screen:
-    """The live table."""
-
-    def __init__(self, console: Console, total: int) -> None:
-        self._progress = Progress(
-            TextColumn("{task.description}"), BarColumn(), MofNCompleteColumn(), TimeRemainingColumn(), console=console
-        )
-        self._task = self._progress.add_task("frames", total=total)
-        self._rows: deque[tuple[str, ...]] = deque(maxlen=RECENT)
-        self.live = Live(self._render(), console=console, refresh_per_second=8, transient=True)
-
-    def add(self, scene: int, frame: EgoFrame, answer: FrameAnswer, latency_ms: float) -> None:
-        """Show one answered frame; attackers are red."""
-
-        def names(vehicles: Any) -> str:
-            return " ".join(f"[red]{v}[/red]" if v in frame.attackers else v for v in vehicles) or "-"
-
-        dissent = [v for v, entry in answer.rejected.items() if entry.reason is Reason.DISSENSUS]
-        best = max((h.jaccard_index for h in answer.hypotheses), default=float("nan"))
-        self._rows.append(
-            (
-                str(scene),
-                str(answer.frame),
-                frame.ego_id,
-                answer.source.replace("_", " "),
-                names(answer.accepted),
-                names(dissent),
-                shown(answer),
-                str(answer.sampling_steps),
-                f"{best:.2f}",
-                f"{latency_ms:.0f}",
-            )
-        )
-        self._progress.advance(self._task)
-        self.live.update(self._render())
-
-    def _render(self) -> Group:
-        table = Table()
-        for heading in (
-            "scene",
-            "frame",
-            "ego",
-            "source",
-            "accepted",
-            "in dissensus",
-            "boxes",
-            "steps",
-            "best J",
-            "ms",
-        ):
-            is_number = heading in ("scene", "frame", "boxes", "steps", "best J", "ms")
-            table.add_column(heading, justify="right" if is_number else "left")
-        for row in self._rows:
-            table.add_row(*row)
-        return Group(table, self._progress)
 
 
 class _Vehicle:
@@ -168,7 +112,7 @@ async def _patiently(call: Callable[[], Awaitable[T]], refused: Counter[str]) ->
         try:
             return await call()
         except GatewayUnavailable as busy:
-            if busy.retry_after_s is None:
+            if busy.retry_after_s is None or busy.retry_after_s > MOST_PAUSE_S:
                 raise
             refused[busy.type.rpartition(":")[2]] += 1
             await asyncio.sleep(busy.retry_after_s)
@@ -192,7 +136,7 @@ async def run_fleet(options: FleetOptions, console: Console) -> FleetSummary:
     source = load_source(options.data)
     scenes = first_scenes(source, "test", count, options.frames)
     summary = FleetSummary(detector)
-    screen = _Screen(console, options.scenes * options.frames * options.egos)
+    screen = Screen(console, options.scenes * options.frames * options.egos)
     with screen.live:
         for scene in scenes[options.first_scene :]:
             other = another_scene(source, "test", scene)
@@ -201,10 +145,11 @@ async def run_fleet(options: FleetOptions, console: Console) -> FleetSummary:
     return summary
 
 
-async def _run_scene(options: FleetOptions, fleet: Fleet, summary: FleetSummary, screen: _Screen) -> None:
+async def _run_scene(options: FleetOptions, fleet: Fleet, summary: FleetSummary, screen: Screen) -> None:
     vehicles = {
         name: _Vehicle(name, GatewayClient(options.url, options.api_key), options) for name in fleet.scene.agents
     }
+    opened: list[_Vehicle] = []
     try:
         for ego_id in fleet.egos:
             session = await vehicles[ego_id].gateway.open_session(
@@ -215,6 +160,8 @@ async def _run_scene(options: FleetOptions, fleet: Fleet, summary: FleetSummary,
                 latency_budget_ms=options.budget_ms,
                 frame_period_ms=fleet.scene.frame_period_s * 1e3,
             )
+            vehicles[ego_id].enrol(ego_id, session)
+            opened.append(vehicles[ego_id])
             if session.detector["weights_digest"] != fleet.detector.info.weights_digest:
                 raise ValueError(f"the gateway's {fleet.detector.info.name} has other weights than the fleet's")
             summary.defense = session.defense
@@ -229,12 +176,21 @@ async def _run_scene(options: FleetOptions, fleet: Fleet, summary: FleetSummary,
             for frame, (answer, latency_ms) in zip(frames, answers, strict=True):
                 await asyncio.to_thread(summary.add, frame, answer, latency_ms)
                 screen.add(fleet.scene.number, frame, answer, latency_ms)
-        for ego_id in fleet.egos:
-            await vehicles[ego_id].leave()
+        while opened:
+            await opened[-1].leave()
+            opened.pop()
     finally:
+        await _leave(opened)
         for vehicle in vehicles.values():
             summary.refused.update(vehicle.refused)
         await asyncio.gather(*(vehicle.gateway.aclose() for vehicle in vehicles.values()))
+
+
+async def _leave(egos: list[_Vehicle]) -> None:
+    """Close what a run leaves open that is ended early, as far as the gateway still answers."""
+    with contextlib.suppress(TimeoutError):
+        async with asyncio.timeout(LEAVING_S):
+            await asyncio.gather(*(ego.leave() for ego in egos), return_exceptions=True)
 
 
 async def _exchange(vehicles: dict[str, _Vehicle], frame: EgoFrame, index: int) -> tuple[FrameAnswer, float]:
@@ -346,11 +302,13 @@ def _asked(defense: str | None, given: dict[str, Any]) -> dict[str, Any] | None:
 
 
 def close_run(options: FleetOptions, summary: FleetSummary, console: Console) -> None:
-    """Print the summary and write the report where one is wanted."""
-    summary.print(console)
+    """Write the report where one is wanted, and print the summary; whoever reads that may have gone."""
+    picture = None
     if options.report is not None:
         settings = {name: value for name, value in asdict(options).items() if name not in ("report", "url", "api_key")}
         picture = summary.write(options.report, settings)
+    summary.print(console)
+    if options.report is not None:
         console.print(f"Report: {options.report / REPORT} and {picture}")
 
 

@@ -146,7 +146,7 @@ async def local_gateway(
         database_url = os.environ.get("ROBOSAC_DATABASE_URL", f"sqlite:///{folder}/robosac.db")
         process = GatewayProcess(log, database_url, api_key, settings=settings)
         try:
-            with _cancelled_by_sigterm():
+            with cancelled_by_sigterm():
                 await process.ready()
                 yield process.url
         finally:
@@ -154,9 +154,14 @@ async def local_gateway(
 
 
 @contextlib.contextmanager
-def _cancelled_by_sigterm() -> Iterator[None]:
-    """Let a SIGTERM end the block as an exception would, so that the gateway does not outlive it."""
+def cancelled_by_sigterm() -> Iterator[None]:
+    """Let a SIGTERM end the block as an exception would, so that no gateway outlives it, and no session. Whoever
+    handles the signal already goes on to.
+    """
     loop, task = asyncio.get_running_loop(), asyncio.current_task()
+    if signal.getsignal(signal.SIGTERM) is not signal.SIG_DFL:
+        yield
+        return
     try:
         loop.add_signal_handler(signal.SIGTERM, task.cancel if task else loop.stop)
     except (NotImplementedError, RuntimeError, ValueError):  # not on this platform, or not in the main thread

@@ -17,10 +17,11 @@ import typer
 from rich.box import SIMPLE_HEAD
 from rich.console import Console
 from rich.table import Table
+from rich.text import Text
 
 from clients.client import API_KEY_VARIABLE, GatewayClient
 from clients.errors import GatewayError
-from clients.local_gateway import local_gateway
+from clients.local_gateway import cancelled_by_sigterm, local_gateway
 from robosac.cli import outputs
 from robosac.extras import MissingExtra
 from robosac.figures import need_figures
@@ -34,8 +35,16 @@ MOST_BUDGET_MS = 60_000
 
 def checked_url(url: str | None) -> str | None:
     """The URL of a gateway, as an option has it."""
-    if url is not None and not url.startswith(("http://", "https://")):
+    if url is None:
+        return None
+    if not url.lower().startswith(("http://", "https://")):
         raise typer.BadParameter(f"must begin with http:// or https://, got {url}")
+    try:
+        read = httpx.URL(url)
+    except (httpx.InvalidURL, ValueError) as error:
+        raise typer.BadParameter(f"{url} is no URL: {error}") from error
+    if not read.host or not 0 < (read.port or 1) < 2**16:
+        raise typer.BadParameter(f"{url} names no {'port' if read.host else 'host'} that there can be")
     return url
 
 
@@ -89,14 +98,25 @@ async def gateway_to_try(
 def run(trial: Coroutine[Any, Any, T], console: Console, what: str, *others: type[Exception]) -> T:
     """The outcome of a trial; ends the program where the gateway, whoever waits, or another such error ends it."""
     failures: tuple[type[Exception], ...] = (GatewayError, OSError, *others)
+
+    async def ended_in_order() -> T:
+        with cancelled_by_sigterm():
+            return await trial
+
+    outputs.spell_what_can_be()
     try:
-        return asyncio.run(trial)
+        return asyncio.run(ended_in_order())
     except asyncio.CancelledError:
         console.print(f"[red]{what} was ended.[/red]")
         sys.exit(143)
     except failures as error:
-        console.print(f"[red]{what} stopped:[/red] {error}")
+        console.print(Text.assemble((f"{what} stopped:", "red"), " ", _printable(str(error))))
         sys.exit(1)
+
+
+def _printable(text: str) -> str:
+    """What a gateway may have said, which a terminal must not obey."""
+    return "".join(c if c.isprintable() or c == "\n" else repr(c)[1:-1] for c in text)
 
 
 def write(report: Any, out: Path | None, name: str, console: Console) -> None:

@@ -16,6 +16,7 @@ from typing import Any
 import typer
 from typer.core import TyperCommand, TyperGroup
 
+from robosac.cli.outputs import spell_what_can_be
 from robosac.extras import MissingExtra
 
 OWN = {
@@ -92,6 +93,7 @@ class Commands(TyperGroup):
 
     def invoke(self, ctx: Any) -> Any:
         words = [*ctx._protected_args, *ctx.args]
+        spell_what_can_be()
         try:
             return super().invoke(ctx)
         except typer.BadParameter as refused:

@@ -6,7 +6,9 @@ was interrupted has left.
 
 from __future__ import annotations
 
+import io
 import os
+import sys
 from pathlib import Path
 from typing import Annotated
 
@@ -16,6 +18,13 @@ from robosac.cli.blame import blaming
 from robosac.files import is_special
 
 Force = Annotated[bool, typer.Option("--force", help="Overwrite what an earlier run has written.")]
+
+
+def spell_what_can_be() -> None:
+    """Let a terminal or file that has not every character show a question mark instead of ending the command."""
+    for stream in (sys.stdout, sys.stderr):
+        if isinstance(stream, io.TextIOWrapper):
+            stream.reconfigure(errors="replace")
 
 
 def check_file(path: Path, option: str, force: bool) -> None:

@@ -1,3 +1,4 @@
+import asyncio
 import io
 import json
 import os
@@ -19,7 +20,7 @@ from typer.testing import CliRunner
 from clients.client import GatewayClient, OpenedSession
 from clients.demo import main as demo_main
 from clients.errors import FrameConflict, GatewayUnavailable, GatewayUnreachable
-from clients.fleet import FleetOptions, _asked, _Vehicle, close_run, main, run_fleet
+from clients.fleet import FleetOptions, _asked, _patiently, _Vehicle, close_run, main, run_fleet
 from clients.local_gateway import local_gateway
 from clients.simulation import Fleet
 from clients.summary import FleetSummary
@@ -140,6 +141,41 @@ def test_a_fleet_asks_for_a_defence_of_ones_own_by_its_kind(monkeypatch):
     assert _asked("own:build", {}) == {"kind": "own", "consensus_threshold": 0.4}
     assert _asked("static_team", {"collaborators": 2}) == {"kind": "static_team", "collaborators": 2}
     assert _asked(None, {}) is None
+
+
+async def test_a_run_that_ends_early_leaves_no_session_open(tmp_path, monkeypatch):
+    console = Console(file=io.StringIO())
+
+    async def fails(*_):
+        raise GatewayUnreachable("gone for a moment")
+
+    async with local_gateway(tmp_path / "gateway.log", settings={"ROBOSAC_MAX_SESSIONS": "2"}) as url:
+        with monkeypatch.context() as patched:
+            patched.setattr("clients.fleet._exchange", fails)
+            for _ in range(2):
+                with pytest.raises(GatewayUnreachable, match="for a moment"):
+                    await run_fleet(options(url, egos=2, frames=1), console)
+        assert (await run_fleet(options(url, egos=2, frames=1), console)).frames == 2
+
+
+async def test_nobody_waits_as_long_as_a_stranger_says():
+    async def busy():
+        raise GatewayUnavailable(503, "about:blank", "maintenance", retry_after_s=86_400.0)
+
+    with pytest.raises(GatewayUnavailable, match="maintenance"):
+        await asyncio.wait_for(_patiently(busy, Counter()), 5)
+
+
+def test_the_report_is_written_though_nobody_reads_the_summary(tmp_path):
+    written = []
+
+    def gone(_):
+        raise BrokenPipeError
+
+    summary = SimpleNamespace(print=gone, write=lambda folder, _: written.append(folder))
+    with pytest.raises(BrokenPipeError):
+        close_run(options("http://gateway", report=tmp_path), summary, Console(file=io.StringIO()))
+    assert written == [tmp_path]
 
 
 async def test_a_fleet_with_other_weights_than_the_gateway_stops(tmp_path):

@@ -1,4 +1,5 @@
 import json
+import os
 import subprocess
 import sys
 from typing import get_args
@@ -114,6 +115,16 @@ def test_the_command_shows_a_log_and_obeys_no_word_of_it(events, tmp_path):
     assert "line 3: not JSON" in broken.output
     assert broken.output.splitlines()[-1].endswith(sentence(lines[1]))
     assert CliRunner().invoke(app, ["audit", "show", "/nowhere"]).exit_code == 2
+
+
+def test_a_terminal_that_has_not_every_character_shows_what_it_has(events, tmp_path):
+    refused = next(event for event in events if event["event"] == "message_refused")
+    path = tmp_path / "log.jsonl"
+    path.write_bytes(b"".join(seal_all([{**refused, "detail": "a name of 65 characters, \u00e9\u2026"}])))
+    words = [sys.executable, "-c", "from robosac.cli import app; app()", "audit", "show", str(path)]
+    environment = {**os.environ, "PYTHONIOENCODING": "latin-1"}
+    done = subprocess.run(words, check=False, capture_output=True, encoding="latin-1", env=environment)
+    assert (done.returncode, "characters, \u00e9?" in done.stdout) == (0, True), done.stderr
 
 
 def test_whoever_has_read_enough_ends_it_without_a_word(lines, tmp_path):
