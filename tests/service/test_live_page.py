@@ -168,6 +168,14 @@ def test_the_api_is_described_without_the_internet(browser, gateway):
     assert all(logo in complaint for complaint in page.complaints())
 
 
+def test_a_link_that_names_no_session_leads_to_the_page_all_the_same(browser, gateway):
+    page = Page(browser, gateway.process.url)
+    for link, said in (("%", "Connected"), ("0123456789abcdef", "No frame of this session was answered lately")):
+        page.driver.get("about:blank")
+        page.driver.get(f"{page.url}/#{link}")
+        page.until(f"document.querySelector('#state').innerText.startsWith({said!r})")
+
+
 def test_a_fleet_with_an_attacker_is_watched(browser, gateway, fleet):
     url = gateway.process.url
     page = Page(browser, url)

@@ -8,9 +8,18 @@ const POLL_MS = 2000;
 const SILENCE_MS = 40000; // the gateway says something every 15 s
 const TOKEN = 'robosac-viewer-token';
 
+/** The session that the address names; the newest where it names none that can be. */
+function linked() {
+  try {
+    return decodeURIComponent(location.hash.slice(1));
+  } catch {
+    return '';
+  }
+}
+
 const state = {
   frames: [], audit: new Map(), about: null, cursor: -1, live: true, radius: 36, dropped: 0,
-  chosen: decodeURIComponent(location.hash.slice(1)), watched: '', stream: null, heard: 0, drawn: 0,
+  chosen: linked(), watched: '', stream: null, heard: 0, drawn: 0,
 };
 const token = () => sessionStorage.getItem(TOKEN) || '';
 const shown = makeLegend(byId('legend'), () => draw());
@@ -64,7 +73,7 @@ function choose(sessions) {
   const wanted = state.chosen || (stays ? state.watched : newest ? newest.session_id : '');
   const there = sessions.some((session) => session.session_id === wanted);
   if (!there) {
-    if (!state.stream) say(sessions.length ? 'The session has no frames yet' : 'Connected; no session has frames yet');
+    if (!state.stream) say(state.chosen ? 'No frame of this session was answered lately' : 'Connected; no session has frames yet');
     return;
   }
   if (wanted !== state.watched) {
@@ -205,7 +214,7 @@ byId('scrub').addEventListener('input', (event) => go(Number(event.target.value)
 byId('table-details').addEventListener('toggle', () => draw());
 addEventListener('resize', () => draw());
 matchMedia('(prefers-color-scheme: dark)').addEventListener('change', () => draw());
-addEventListener('hashchange', () => { state.chosen = decodeURIComponent(location.hash.slice(1)); });
+addEventListener('hashchange', () => { state.chosen = linked(); });
 
 const KEYS = {
   ' ': () => toggle(), ArrowLeft: () => go(state.cursor - 1), ArrowRight: () => go(state.cursor + 1),
