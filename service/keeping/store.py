@@ -208,10 +208,10 @@ class Store:
         await self._append(session_id, event, lambda _: {})
 
     async def audit(self, session_id: str, after: int, limit: int = PAGE) -> list[str]:
-        """Lines with a number above ``after``, in order: the first ``limit`` of them."""
-        of_session = (audit_lines.c.session_id == session_id, audit_lines.c.seq > after)
-        lines = select(audit_lines.c.line).where(*of_session)
-        return await self._column(lines.order_by(audit_lines.c.seq).limit(limit))
+        """The ``limit`` lines with the numbers after ``after``, in order, or as many of them as there are."""
+        numbered = audit_lines.c.seq.between(after + 1, after + limit)
+        lines = select(audit_lines.c.line).where(audit_lines.c.session_id == session_id, numbered)
+        return await self._column(lines.order_by(audit_lines.c.seq))
 
     def check_room(self, record: SessionRecord) -> None:
         """Refuse what would be on record in a log that holds as many records as it may.

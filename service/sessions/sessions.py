@@ -135,8 +135,9 @@ class Sessions:
 
     async def _pages(self, session_id: str, after: int, last: int) -> AsyncIterator[str]:
         while after < last:
-            lines = await self.store.audit(session_id, after, min(PAGE, last - after))
-            if not lines:  # purged meanwhile: what was sent must not look whole
+            page = min(PAGE, last - after)
+            lines = await self.store.audit(session_id, after, page)
+            if len(lines) < page:  # it is being purged, from its beginning on: what was sent must not look whole
                 raise SessionOver("the log was purged")
             after += len(lines)
             yield "\n".join(lines) + "\n"

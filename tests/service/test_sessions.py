@@ -2,10 +2,14 @@ import asyncio
 import json
 
 import pytest
+from sqlalchemy import delete
 
 from clients.errors import AccessDenied, SessionNotFound
 from robosac.audit import verify
-from service.errors import StoreUnavailable
+from robosac.audit.events import TokenRenewed
+from service.errors import SessionOver, StoreUnavailable
+from service.keeping.store import PAGE
+from service.keeping.tables import audit_lines
 from tests.service.conftest import EGO, TEAM, problem, serve
 
 
@@ -26,6 +30,19 @@ async def test_a_session_answers_with_everything_its_vehicles_need(served):
     assert session.detector["name"] == "intersection-mean"
     assert session.defense["collaborators"] == 3
     assert session.defense["consensus_threshold"] == 0.3
+
+
+async def test_a_log_that_is_purged_while_it_is_read_never_looks_whole(served):
+    session, store = await served.open(), served.gateway.store
+    note = TokenRenewed(vehicle_id=EGO, expires_at="2026-01-01T00:00:00Z")
+    await asyncio.gather(*(store.log(session.session_id, note) for _ in range(3 * PAGE)))
+    await served.ego(session).close()
+    pages = await served.gateway.sessions.audit_log(session.session_id, session.ego_token, 0, 10**6)
+    assert (await anext(pages)).count("\n") == PAGE
+    beginning = delete(audit_lines).where(audit_lines.c.seq <= PAGE + 9)
+    await store._database.write(lambda connection: connection.execute(beginning))
+    with pytest.raises(SessionOver, match="purged"):
+        await anext(pages)
 
 
 async def test_state_and_end(served, good_frame):
