@@ -23,6 +23,8 @@ MAX_MAP = 1024
 MAX_STRING = 2**16
 MAX_ENTRIES = 2**16
 """Entries of all arrays and maps of a body: small containers by the million would cost far more than their bytes."""
+_LEAST_SHARE = 256
+"""Entries that a teammate's part may have in any case where parts are unpacked one by one."""
 
 
 @dataclass(frozen=True)
@@ -43,6 +45,8 @@ class FrameEnvelope:
     teammates: Mapping[str, Any]
     states: Mapping[str, bytes] = field(default_factory=dict)
     """As `pack_frame` takes them."""
+    unreadable: Mapping[str, WireError] = field(default_factory=dict)
+    """By teammate, what is wrong with a part that breaks msgpack or the limits; it is not among the others."""
 
 
 def pack_message(
@@ -113,7 +117,7 @@ def pack(value: Any) -> bytes:
     return packed
 
 
-def unpack(body: bytes, *, trusted: bool = False) -> Any:
+def unpack(body: bytes, *, trusted: bool = False, most_entries: int = MAX_ENTRIES) -> Any:
     """A body of plain types, within limits.
 
     Parameters
@@ -121,6 +125,8 @@ def unpack(body: bytes, *, trusted: bool = False) -> Any:
     body : bytes
     trusted : bool
         Whether it comes from the gateway itself, whose results may be long; then only its length bounds it.
+    most_entries : int
+        Of all arrays and maps together.
 
     Raises
     ------
@@ -133,8 +139,8 @@ def unpack(body: bytes, *, trusted: bool = False) -> Any:
     def count(container: Any) -> Any:
         nonlocal entries
         entries += 1 + len(container)
-        if entries > MAX_ENTRIES and not trusted:
-            raise ValueError(f"more than {MAX_ENTRIES} entries in all")
+        if entries > most_entries and not trusted:
+            raise ValueError(f"more than {most_entries} entries in all")
         return container
 
     try:
@@ -162,12 +168,63 @@ def read_message(body: bytes) -> MessageEnvelope:
 
 
 def read_frame(body: bytes) -> FrameEnvelope:
-    """The parts of a whole frame; each is left to `check_message`."""
-    fields = Fields(unpack(body))
+    """The parts of a whole frame; each is left to `check_message`. A teammate's part that breaks msgpack or the limits
+    spoils no other.
+    """
+    try:
+        value: Any = unpack(body)
+        unreadable: dict[str, WireError] = {}
+    except WireError as error:
+        value, unreadable = _unpack_apart(body, error)
+    fields = Fields(value)
     teammates = named(fields.take("teammates", dict), "teammates")
     states = fields.value.get("states")
     kept = states if isinstance(states, dict) and all(isinstance(text, bytes) for text in states.values()) else {}
-    return FrameEnvelope(_frame(fields), fields.take("ego"), teammates, kept)
+    return FrameEnvelope(_frame(fields), fields.take("ego"), teammates, kept, unreadable)
+
+
+def _unpack_apart(body: bytes, fault: WireError) -> tuple[dict[Any, Any], dict[str, WireError]]:
+    """A frame with those teammates' parts that can be unpacked by themselves, and what is wrong with the others.
+
+    Raises
+    ------
+    WireError
+        The ``fault`` of the frame as a whole, if it is not one of teammates' parts.
+    """
+    try:
+        members = _members(body)
+        parts = _members(members.pop("teammates"))
+        frame = {name: unpack(member) for name, member in members.items()}
+    except Exception as error:  # as of `unpack`
+        raise fault from error
+    read: dict[Any, Any] = {}
+    unreadable: dict[str, WireError] = {}
+    share = max(MAX_ENTRIES // max(len(parts), 1), _LEAST_SHARE)
+    for name, part in parts.items():
+        try:
+            read[name] = unpack(part, most_entries=share)
+        except WireError as error:
+            if not isinstance(name, str):
+                raise fault from error
+            unreadable[name] = WireError(error.code, f"teammates.{name}", error.detail)
+    return {**frame, "teammates": read}, unreadable
+
+
+def _members(body: bytes) -> dict[Any, bytes]:
+    """The members of a map, still packed; what is wrong inside them is not looked at."""
+    walker = msgpack.Unpacker(strict_map_key=False, max_buffer_size=len(body), max_str_len=MAX_STRING)
+    walker.feed(body)
+    size = walker.read_map_header()
+    if size > MAX_MAP:
+        raise ValueError(f"more than {MAX_MAP} members")
+    members = {}
+    for _ in range(size):
+        name, start = walker.unpack(), walker.tell()
+        walker.skip()
+        members[name] = body[start : walker.tell()]
+    if walker.tell() != len(body):
+        raise ValueError("bytes are left over")
+    return members
 
 
 def check_message(payload: Any, info: DetectorInfo, role: Role, path: str = "") -> Message:

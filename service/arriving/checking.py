@@ -76,15 +76,17 @@ def read_frame(caller: Caller, body: bytes) -> tuple[int, Parts]:
     except (wire.WireError, Unusable) as error:
         raise InFrame(error, frame) from error
     for name in caller.record.teammates:
-        if name not in envelope.teammates:
+        if name not in envelope.teammates and name not in envelope.unreadable:
             continue
         try:
+            if name in envelope.unreadable:
+                raise envelope.unreadable[name]
             parts.messages[name] = check(caller, name, frame, envelope.teammates[name], f"teammates.{name}")
         except (wire.WireError, Unusable) as error:
             parts.unusable[name] = Rejection(reason_of(error), {"field": error.field, "detail": error.detail})
             parts.malformed.append(name)
     known = {caller.record.ego_id, *caller.record.teammates}
-    strangers = [name for name in envelope.teammates if name not in known]
+    strangers = [name for name in (*envelope.teammates, *envelope.unreadable) if name not in known]
     for name in strangers[:STRANGERS_NAMED]:
         parts.unusable[_shown(name)] = Rejection(Reason.UNAUTHENTICATED, {"detail": "not enrolled in this session"})
     return frame, parts

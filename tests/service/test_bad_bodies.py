@@ -210,6 +210,46 @@ async def test_a_teammate_cannot_break_the_frame_that_carries_its_part(served, g
         assert (reasons["car-3"], reasons["7"]) == ("malformed", "unauthenticated")
 
 
+def nested(depth):
+    value = 0
+    for _ in range(depth):
+        value = [value]
+    return value
+
+
+BEYOND = {
+    "a pose of 65 numbers": {"pose": [0.0] * 65},
+    "a tensor as a list": {"tensors": {"features": {"data": [0] * 70_000}}},
+    "a tensor as text": {"tensors": {"features": {"data": "0" * 131_072}}},
+    "many names": {str(i): 0 for i in range(1025)},
+    "many small containers": [[[]] * 64] * 64 * 20,
+    "no text": {"pose": b"\xff\xfe".decode("latin-1")},
+    "deep": nested(400),
+}
+
+
+@pytest.mark.parametrize("part", BEYOND.values(), ids=list(BEYOND))
+async def test_a_teammates_part_beyond_the_limits_costs_that_teammate_only(served, good_frame, part):
+    session = await served.open()
+    frame = msgpack.unpackb(good_frame(0))
+    frame["teammates"] |= {"car-3": part, "stranger": part}
+    body = msgpack.packb(frame).replace("\xff\xfe".encode(), b"\xff\xfe\xff\xff")  # as long, and no UTF-8
+    answered = await served.post(session, "frames", body)
+    assert answered.status_code == 200, answered.text
+    rejected = {entry["vehicle_id"]: entry for entry in answered.json()["rejected"]}
+    assert (rejected["car-3"]["reason"], rejected["stranger"]["reason"]) == ("malformed", "unauthenticated")
+    assert rejected["car-3"]["field"].startswith("teammates.car-3")
+    assert {"car-2", "car-4", "car-5", "rsu"}.isdisjoint(
+        name for name, entry in rejected.items() if entry["reason"] == "malformed"
+    )
+
+
+async def test_an_egos_part_beyond_the_limits_refuses_the_frame(served, good_frame):
+    session = await served.open()
+    body = altered(good_frame(0), "ego.pose", [0.0] * 65)
+    problem(await served.post(session, "frames", body), 400, "malformed-msgpack")
+
+
 async def test_only_strings_are_names(served, good_frame):
     session = await served.open()
     frame = msgpack.unpackb(good_frame(0))
