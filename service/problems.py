@@ -129,7 +129,8 @@ def install(app: FastAPI) -> None:
             detail = f"not JSON: {first.get('ctx', {}).get('error', first['msg'])}"
             return response(Refused(Kind.MALFORMED_JSON, detail))
         where = [str(part) for part in first["loc"] if part not in ("body", "query", "path", *shipped())]
-        return response(Refused(Kind.INVALID_REQUEST, str(first["msg"]), ".".join(where) or "body"))
+        detail = str(first["msg"]).removeprefix("Value error, ")
+        return response(Refused(Kind.INVALID_REQUEST, detail, ".".join(where) or "body"))
 
     @app.exception_handler(HTTPException)
     async def _http(_: Request, error: HTTPException) -> JSONResponse:

@@ -24,7 +24,7 @@ from pydantic import (
 
 from robosac.answers import LogReceipt
 from robosac.calibrated import calibration_digest, calibration_of
-from robosac.defenses import DefenseSettings, Kinds, check_numbers, shipped
+from robosac.defenses import DefenseSettings, Kinds, check_kinds, check_numbers, shipped
 from robosac.defenses.group_testing import CalibrationError
 from robosac.detectors import DetectorInfo
 from robosac.signatures import read_public_key
@@ -36,6 +36,11 @@ VehicleId = Annotated[str, StringConstraints(pattern=ID_PATTERN)]
 
 class _Request(BaseModel):
     model_config = ConfigDict(extra="forbid", frozen=True, allow_inf_nan=False)
+
+    @model_validator(mode="before")
+    @classmethod
+    def _check_kinds(cls, values: object) -> object:
+        return check_kinds(cls, values)
 
     @field_validator("*")
     @classmethod

@@ -28,7 +28,7 @@ from robosac.defenses.protocol import (
 )
 from robosac.defenses.registry import Kinds, build, known, load, read_settings, shipped
 from robosac.defenses.sample_consensus import SampleConsensus
-from robosac.defenses.settings import ConsensusSettings, DefenseSettings, check_numbers
+from robosac.defenses.settings import ConsensusSettings, DefenseSettings, check_kinds, check_numbers
 from robosac.defenses.static_team import StaticTeam
 from robosac.defenses.undefended import Undefended
 
@@ -62,6 +62,7 @@ __all__ = [
     "Undefended",
     "Verdict",
     "build",
+    "check_kinds",
     "check_numbers",
     "explain_rejections",
     "known",

@@ -91,7 +91,8 @@ def read_settings(settings: Mapping[str, Any], kinds: Kinds | None = None) -> De
         return model.model_validate(settings)
     except ValidationError as error:
         first = error.errors(include_url=False)[0]
-        raise DomainError(": ".join([str(kind), *map(str, first["loc"]), first["msg"]])) from error
+        told = first["msg"].removeprefix("Value error, ")
+        raise DomainError(": ".join([str(kind), *map(str, first["loc"]), told])) from error
 
 
 def build(

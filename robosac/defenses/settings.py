@@ -3,9 +3,10 @@
 from __future__ import annotations
 
 import inspect
-from typing import TYPE_CHECKING, Any, ClassVar, Self, cast, get_args
+from typing import TYPE_CHECKING, Any, ClassVar, LiteralString, Self, cast, get_args
 
-from pydantic import BaseModel, ConfigDict, Field, field_validator
+from pydantic import BaseModel, ConfigDict, Field, ValidationError, field_validator, model_validator
+from pydantic_core import InitErrorDetails, PydanticCustomError
 
 from robosac.consensus import DEFAULT_THRESHOLD
 from robosac.defenses.protocol import Defense, Reference
@@ -38,6 +39,42 @@ def check_numbers(value: object) -> object:
     return value
 
 
+def check_kinds(model: type[BaseModel], values: object) -> object:
+    """Refuse what would only be read as a number or a truth value: true as 1, text as a number; others are given back.
+
+    Raises
+    ------
+    ValidationError
+        If a field's value, or a part of it, is of another kind than the model says.
+    """
+    faults = []
+    for name, value in values.items() if isinstance(values, dict) else ():
+        field = model.model_fields.get(name)
+        fault = None if field is None else _fault(value, _kinds(field.annotation))
+        if fault is not None:
+            faults.append(InitErrorDetails(type=PydanticCustomError("kind", fault), loc=(name,), input=value))
+    if faults:
+        raise ValidationError.from_exception_data(model.__name__, faults)
+    return values
+
+
+def _fault(value: object, kinds: set[type]) -> LiteralString | None:
+    if isinstance(value, tuple | list):
+        return next((fault for part in value if (fault := _fault(part, kinds))), None)
+    if not kinds or not kinds <= {int, float, bool} or not isinstance(value, bool | int | float | str | bytes):
+        return None
+    if bool in kinds:
+        return None if isinstance(value, bool) else "must be true or false"
+    return "must be a number" if isinstance(value, bool | str | bytes) else None
+
+
+def _kinds(annotation: object) -> set[type]:
+    """The plain types that an annotation names, at any depth."""
+    if parts := get_args(annotation):
+        return set().union(*map(_kinds, parts))
+    return {kind for kind in (int, float, bool, str, bytes) if annotation is kind}
+
+
 def _say_in_short(schema: dict[str, Any], model: type[DefenseSettings]) -> None:
     """In the API's description a line says what a defence does, and sessions have to say which one they want."""
     schema["description"] = model.summary()
@@ -59,6 +96,11 @@ class DefenseSettings(BaseModel):
     budgets: ClassVar[tuple[str, ...]] = ()
     """Settings that say how many hypotheses a frame may take."""
     kind: str
+
+    @model_validator(mode="before")
+    @classmethod
+    def _check_kinds(cls, values: object) -> object:
+        return check_kinds(cls, values)
 
     @field_validator("*")
     @classmethod

@@ -54,6 +54,36 @@ async def test_an_absurd_number_is_refused_by_its_name(served):
             assert name in told.get("field", "") or name in told["detail"] or "pose error" in told["detail"], told
 
 
+def truths(model):
+    """The fields of a model that hold true or false."""
+    described = model.model_json_schema()["properties"].items()
+    return [
+        name for name, schema in described if {"type": "boolean"}.items() <= schema.get("anyOf", [schema])[0].items()
+    ]
+
+
+async def test_only_numbers_are_numbers_and_only_true_and_false_are_truth_values(served):
+    wrong = [(kind, name, value) for kind, name in FIELDS for value in (True, False, "1", "0.2", "")]
+    for kind, model in {None: SessionRequest, **defenses.shipped()}.items():
+        wrong += [(kind, name, value) for name in truths(model) for value in (0, 1, "true", "no")]
+    assert {(None, "record", 1), ("group_testing", "compare_frames", "no")} < {*wrong}
+    for kind, name, value in wrong:
+        _, several = numbers(defenses.shipped()[kind] if kind else SessionRequest).get(name, (None, False))
+        setting = {name: [value] if several else value}
+        fields = {"defense": {"kind": kind, **setting}} if kind else setting
+        opened = await served.http.post("/v1/sessions", json={"ego_id": EGO, "teammates": TEAM, **fields})
+        assert opened.status_code == 422, (kind, name, value, opened.text)
+        told = opened.json()
+        assert told["field"] == (f"defense.{name}" if kind else name), told
+        assert told["detail"] in ("must be a number", "must be true or false"), told
+
+
+async def test_an_integer_may_be_written_with_a_point_and_a_number_without(served):
+    defense = {"kind": "sample_consensus", "sampling_budget": 7.0, "collaborators": 2}
+    session = await served.open(defense=defense, latency_budget_ms=3000)
+    assert session.defense["sampling_budget"] == 7
+
+
 def extreme(schema, *, low):
     """The least or the greatest number that a schema allows, and that is not too near to 0."""
     if low:
