@@ -30,7 +30,7 @@ from service.arriving.parties import Parties  # noqa: E402
 from service.deciding.admission import Admission  # noqa: E402
 from service.deciding.answering import Deciding  # noqa: E402
 from service.deciding.keeping import Keeping  # noqa: E402
-from service.description import TAGS, completed  # noqa: E402
+from service.description import AT_THE_DOORS, TAGS, completed  # noqa: E402
 from service.engine import Engine  # noqa: E402
 from service.gateway import Gateway  # noqa: E402
 from service.keeping.gateway_keys import GatewayKeys  # noqa: E402
@@ -125,9 +125,8 @@ def create_app(
     app.add_middleware(Door, check=check_head)
     app.add_middleware(Arrival, watch=gateway.watch)
     app.add_middleware(Starting)
-    app.include_router(v1)
-    app.include_router(operations)
-    app.include_router(pages)
+    for router in (v1, operations, pages):
+        app.include_router(router, responses=AT_THE_DOORS)
     api_pages(app)
     return app
 

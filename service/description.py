@@ -196,22 +196,26 @@ def status(word: str, description: str) -> Answers:
 
 OF_TENSORS: dict[str, Any] = {"requestBody": {"required": True, "content": {}}}
 """`completed` says more."""
+AT_THE_DOORS = documented(403, 414, 421, 431)
+"""Whatever is asked: by whom, by which name of the gateway, and in a head of which size."""
 _OF_EGO, _OF_JSON = documented(401, 403, 404), documented(400, 408, 413, 415)
 _PROVEN = documented(401, 403, 404, 429)
+_ON_RECORD = documented(507)
 _AUDIT_HEAD = {"Audit-Head": {"description": "SHA-256 of the log's last record.", "schema": {"type": "string"}}}
 DETECTORS: Answers = {200: _answer(DetectorList, "All detectors.")}
 KEYS: Answers = {200: _answer(GatewayKeyList, "All keys.")}
 OPENED: Answers = {**_OF_JSON, **documented(401), 201: _answer(SessionCreated, "The session and its tokens.")}
 STATE: Answers = {**_OF_EGO, 200: _answer(SessionState, "The session now.")}
 ENDED: Answers = {**_PROVEN, 204: {"description": "It has ended.", "headers": _AUDIT_HEAD}}
-RENEWED: Answers = {**documented(401, 404, 429), 201: _answer(RenewedToken, "The fresh token.")}
-JOINED: Answers = {**_PROVEN, **_OF_JSON, **documented(409), 201: _answer(ChangedTeam, "The team now.")}
-LEFT: Answers = {**_PROVEN, 204: {"description": "It has left."}}
+RENEWED: Answers = {**documented(401, 404, 429), **_ON_RECORD, 201: _answer(RenewedToken, "The fresh token.")}
+JOINED: Answers = {**_PROVEN, **_OF_JSON, **_ON_RECORD, **documented(409), 201: _answer(ChangedTeam, "The team now.")}
+LEFT: Answers = {**_PROVEN, **_ON_RECORD, **documented(409), 204: {"description": "It has left."}}
 AUDIT: Answers = {**_OF_EGO, **_as_text(JSONL, AUDIT_LINE, "A record a line.")}
 DECIDED: Answers = {
     **_OF_EGO,
     **_OF_JSON,
-    **documented(409, 507),
+    **_ON_RECORD,
+    **documented(409),
     200: _negotiated(FrameAnswer, "The answer to the frame."),
 }
 TAKEN: Answers = {**DECIDED, 202: _negotiated(Receipt, "A teammate's message is kept for its frame.")}

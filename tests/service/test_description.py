@@ -22,7 +22,7 @@ from service.settings import Settings
 from tests.robosac.test_wire import EGO as TINY_EGO
 from tests.robosac.test_wire import INFO as TINY
 from tests.robosac.test_wire import TEAMMATE as TINY_TEAMMATE
-from tests.service.conftest import TEAM
+from tests.service.conftest import TEAM, serve
 
 MSGPACK = "application/vnd.msgpack"
 ROUTES = [
@@ -113,6 +113,41 @@ def test_examples_of_records_and_refusals_are_such(description):
                     if "application/problem+json" in answer["content"]:
                         kind = content["example"]["type"].removeprefix(TYPE_PREFIX)
                         assert str(ANSWERS[kind][0]) == status
+
+
+@pytest.mark.parametrize(("method", "path"), ROUTES)
+async def test_what_is_refused_at_the_doors_is_described(served, method, path, description):
+    answers = description["paths"][path][method]["responses"]
+    asked = path.format(sid="x", frame=0, vehicle_id="rsu")
+    heads = {
+        403: ({"Origin": "http://elsewhere.example"}, ""),
+        414: ({}, "?" + "x" * 3000),
+        421: ({"Host": "elsewhere.example"}, ""),
+        431: ({f"x-{i}": "1" for i in range(200)}, ""),
+    }
+    for status, (headers, query) in heads.items():
+        if (refused := await served.http.request(method, asked + query, headers=headers)).status_code == status:
+            schema = answers[str(status)]["content"]["application/problem+json"]["schema"]
+            jsonschema_rs.validate(schema, refused.json())
+        else:
+            assert path == "/healthz", (status, refused.text)
+
+
+async def test_that_a_log_is_full_is_described_where_more_would_be_written(description):
+    async with serve(audit_max_records=2) as served:
+        session = await served.open()
+        headers = {"Authorization": f"Bearer {session.ego_token}"}
+        of_session, team = "/v1/sessions/{sid}", {"json": {"teammates": ["car-9"]}}
+        actual = of_session.format(sid=session.session_id)
+        assert (await served.http.post(f"{actual}/teammates", headers=headers, **team)).status_code == 201
+        for method, path, body in (
+            ("post", "/teammates", {"json": {"teammates": ["car-8"]}}),
+            ("delete", "/teammates/{vehicle_id}", {}),
+            ("post", "/token", {}),
+        ):
+            asked = actual + path.format(vehicle_id="rsu")
+            assert (await served.http.request(method, asked, headers=headers, **body)).status_code == 507
+            assert "507" in description["paths"][of_session + path][method]["responses"]
 
 
 async def test_what_is_answered_is_described(served, description, ego_message, benign):
