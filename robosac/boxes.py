@@ -2,7 +2,8 @@
 
 A box is ``x, y, length, width, yaw``: centre and sides in metres, yaw in radians counter-clockwise from +x to the box's
 length. Further columns (a score) may follow and are ignored by the geometry. The frame is the caller's, and is the same
-for both arguments wherever two sets of boxes meet.
+for both arguments wherever two sets of boxes meet. Lists of numbers will do for arrays; what has another shape is a
+`ValueError` that names the argument.
 """
 
 from __future__ import annotations
@@ -25,6 +26,43 @@ _CLOSED = _UNIT_CORNERS[[0, 1, 2, 3, 0]]
 _NMS_BLOCK = 64
 
 
+def as_boxes(boxes: Any, name: str = "boxes", columns: int = 5) -> FloatArray:
+    """Boxes as a float64 array (n, 5+); an empty list is no box.
+
+    Parameters
+    ----------
+    boxes : (n, 5+) array_like
+    name : str
+        The argument's, for the error.
+    columns : int
+        As many at least.
+
+    Raises
+    ------
+    ValueError
+        If they are not numbers of that shape.
+    """
+    try:
+        array: FloatArray = np.asarray(boxes, dtype=np.float64)
+    except (TypeError, ValueError) as error:
+        raise ValueError(f"{name} must be numbers of shape (n, {columns}+): {error}") from error
+    if array.shape == (0,):
+        return np.empty((0, columns))
+    if array.ndim != 2 or array.shape[1] < columns:
+        raise ValueError(f"{name} must be of shape (n, {columns}+), got {array.shape}")
+    return array
+
+
+def _as_pose(pose: Any) -> FloatArray:
+    try:
+        matrix: FloatArray = np.asarray(pose, dtype=np.float64)
+    except (TypeError, ValueError) as error:
+        raise ValueError(f"pose must be numbers of shape (4, 4): {error}") from error
+    if matrix.shape != (4, 4):
+        raise ValueError(f"pose must be of shape (4, 4), got {matrix.shape}")
+    return matrix
+
+
 def pose_matrix(x: float, y: float, z: float, yaw: float) -> FloatArray:
     """The rigid transform ``world_from_sensor`` (4, 4) of a sensor at (x, y, z) metres, turned by yaw about z."""
     c, s = np.cos(yaw), np.sin(yaw)
@@ -33,6 +71,7 @@ def pose_matrix(x: float, y: float, z: float, yaw: float) -> FloatArray:
 
 def pose_fault(pose: FloatArray) -> str | None:
     """Why a matrix (4, 4) of finite numbers can be no sensor's pose; None if it can."""
+    pose = _as_pose(pose)
     rotation = pose[:3, :3]
     rigid = (np.abs(rotation) <= 1 + RIGID_TOLERANCE).all() and np.allclose(
         rotation @ rotation.T, np.eye(3), atol=RIGID_TOLERANCE
@@ -61,6 +100,7 @@ def from_world(boxes: FloatArray, pose: FloatArray) -> FloatArray:
     (n, 5+) ndarray
         Sensor frame, yaw wrapped to [-pi, pi).
     """
+    boxes, pose = as_boxes(boxes), _as_pose(pose)
     yaw = np.arctan2(pose[1, 0], pose[0, 0])
     c, s = np.cos(yaw), np.sin(yaw)
     dx, dy = boxes[:, 0] - pose[0, 3], boxes[:, 1] - pose[1, 3]
@@ -72,6 +112,7 @@ def from_world(boxes: FloatArray, pose: FloatArray) -> FloatArray:
 
 def to_world(boxes: FloatArray, pose: FloatArray) -> FloatArray:
     """Boxes (n, 5+) of a sensor's frame in the world frame; the inverse of `from_world`, of a tilted sensor too."""
+    boxes, pose = as_boxes(boxes), _as_pose(pose)
     yaw = np.arctan2(pose[1, 0], pose[0, 0])
     c, s = np.cos(yaw), np.sin(yaw)
     moved = np.array(boxes, dtype=np.float64)
@@ -83,7 +124,7 @@ def to_world(boxes: FloatArray, pose: FloatArray) -> FloatArray:
 
 def corners(boxes: FloatArray) -> FloatArray:
     """Corners (n, 4, 2) of boxes (n, 5+), counter-clockwise from front left."""
-    boxes = np.asarray(boxes, dtype=np.float64)
+    boxes = as_boxes(boxes)
     local = _UNIT_CORNERS[None] * boxes[:, None, 2:4]
     c, s = np.cos(boxes[:, 4:5]), np.sin(boxes[:, 4:5])
     x = c * local[..., 0] - s * local[..., 1] + boxes[:, 0:1]
@@ -109,7 +150,7 @@ def pairwise_iou(a: FloatArray, b: FloatArray) -> FloatArray:
     (n, m) float64 ndarray
         In [0, 1]; 0 where a box has no area.
     """
-    a, b = np.asarray(a, dtype=np.float64), np.asarray(b, dtype=np.float64)
+    a, b = as_boxes(a, "a"), as_boxes(b, "b")
     iou = np.zeros((len(a), len(b)))
     if not iou.size:
         return iou
@@ -179,7 +220,13 @@ def nms(boxes: FloatArray, scores: FloatArray, iou_threshold: float) -> IntArray
     (k,) int64 ndarray
         Indices of the kept boxes, best first.
     """
-    order = np.argsort(-np.asarray(scores), kind="stable")
+    boxes = as_boxes(boxes)
+    scores = np.asarray(scores, dtype=np.float64)
+    if scores.shape != (len(boxes),):
+        raise ValueError(f"scores must be one for each of {len(boxes)} boxes, got shape {scores.shape}")
+    if not 0 <= iou_threshold <= 1:
+        raise ValueError(f"iou_threshold must be in [0, 1], got {iou_threshold}")
+    order = np.argsort(-scores, kind="stable")
     kept: list[int] = []
     while len(order):
         block, order = order[:_NMS_BLOCK], order[_NMS_BLOCK:]
@@ -208,7 +255,7 @@ def in_units(boxes: FloatArray) -> IntArray:
     ValueError
         If one is no number.
     """
-    scaled = np.round(boxes * BOX_UNITS)
+    scaled = np.round(as_boxes(boxes, columns=len(BOX_UNITS)) * BOX_UNITS)
     if np.isnan(scaled).any():
         raise ValueError("boxes must be numbers")
     whole: IntArray = np.clip(scaled, -MOST_UNITS, MOST_UNITS).astype(np.int64)

@@ -13,11 +13,14 @@ hypergeometric. Both are here: `eq1_collaborators` and `eq2_budget` are the pape
 ``sampling_budget``       N, hypotheses                                               N >= 1
 ``confidence``            p, chance that one of the hypotheses has no attacker        0 < p < 1
 ========================  ==========================================================  =========================
+
+Counts are whole numbers: `DomainError` also for 7.5, or for a text.
 """
 
 from __future__ import annotations
 
 import math
+from numbers import Integral, Real
 
 DEFAULT_CONFIDENCE = 0.99
 _ENUMERABLE = 100_000
@@ -60,7 +63,7 @@ def eq2_budget(collaborators: int, attacker_ratio: float, confidence: float = DE
 def attackers_in_team(team_size: int, attacker_ratio: float) -> int:
     """Attackers that a ratio, here in [0, 1], means for a team: eta * S, rounded up."""
     _check_at_least_one("team_size", team_size)
-    if not 0.0 <= attacker_ratio <= 1.0:
+    if not isinstance(attacker_ratio, Real) or not 0.0 <= attacker_ratio <= 1.0:
         raise DomainError(f"attacker_ratio must be in [0, 1], got {attacker_ratio}")
     return math.ceil(attacker_ratio * team_size - _ROUNDING)
 
@@ -122,6 +125,7 @@ def exact_collaborators(
 ) -> int:
     """Most collaborators for which a budget suffices by `exact_budget`; 0 if it does not suffice for one."""
     _check_at_least_one("sampling_budget", sampling_budget)
+    _check_open_unit("confidence", confidence)
     _check_team(team_size, attackers, 1)
     for s in range(team_size - attackers, 0, -1):
         total, clean = _hypotheses(team_size, attackers, s)
@@ -150,18 +154,26 @@ def _trials(success: float, confidence: float) -> int:
         raise DomainError("the chance of an attacker-free hypothesis is too small for any budget") from error
 
 
+def _check_whole(name: str, value: int) -> None:
+    if not isinstance(value, Integral):
+        raise DomainError(f"{name} must be a whole number, got {value!r}")
+
+
 def _check_at_least_one(name: str, value: int) -> None:
+    _check_whole(name, value)
     if value < 1:
         raise DomainError(f"{name} must be at least 1, got {value}")
 
 
 def _check_open_unit(name: str, value: float) -> None:
-    if not 0.0 < value < 1.0:
-        raise DomainError(f"{name} must lie strictly between 0 and 1, got {value}")
+    if not isinstance(value, Real) or not 0.0 < value < 1.0:
+        raise DomainError(f"{name} must lie strictly between 0 and 1, got {value!r}")
 
 
 def _check_team(team_size: int, attackers: int, collaborators: int) -> None:
     _check_at_least_one("team_size", team_size)
+    _check_whole("attackers", attackers)
+    _check_whole("collaborators", collaborators)
     if not 0 <= attackers <= team_size:
         raise DomainError(f"attackers must be between 0 and the team size {team_size}, got {attackers}")
     if not 1 <= collaborators <= team_size:

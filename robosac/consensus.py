@@ -7,7 +7,7 @@ from dataclasses import dataclass
 import numpy as np
 
 from robosac.answers import Verdict
-from robosac.boxes import FloatArray, IntArray, pairwise_iou
+from robosac.boxes import FloatArray, IntArray, as_boxes, pairwise_iou
 
 MATCH_IOU = 0.5
 DEFAULT_THRESHOLD = 0.3
@@ -26,6 +26,7 @@ class Comparison:
 
 def at_least(boxes: FloatArray, score: float) -> FloatArray:
     """Boxes (n, 6) with this score or more: those that take part in the test."""
+    boxes = as_boxes(boxes, columns=6)
     return boxes[boxes[:, 5] >= score]
 
 
@@ -43,14 +44,15 @@ def match(reference: FloatArray, candidate: FloatArray, iou_threshold: float = M
     candidate : (m, 5+) ndarray
         Boxes in the same frame.
     iou_threshold : float
-        A pair counts from this IoU on.
+        A pair counts from this IoU on; in (0, 1].
 
     Returns
     -------
     rows, columns : (k,) int64 ndarray
         Indices of the matched pairs.
     """
-    iou = pairwise_iou(reference, candidate)
+    _check_unit("iou_threshold", iou_threshold)
+    iou = pairwise_iou(as_boxes(reference, "reference"), as_boxes(candidate, "candidate"))
     good = iou >= iou_threshold
     if (good.sum(axis=0) <= 1).all() and (good.sum(axis=1) <= 1).all():
         rows, columns = np.nonzero(good)
@@ -77,8 +79,15 @@ def compare(reference: FloatArray, candidate: FloatArray, threshold: float = DEF
     threshold : float
         In (0, 1].
     """
+    _check_unit("threshold", threshold)
+    reference, candidate = as_boxes(reference, "reference"), as_boxes(candidate, "candidate")
     if len(reference) == 0 and len(candidate) == 0:
         return Comparison(1.0, 0, Verdict.NO_EVIDENCE)
     matched = len(match(reference, candidate)[0])
     index = matched / (len(reference) + len(candidate) - matched)
     return Comparison(index, matched, Verdict.CONSENSUS if index >= threshold else Verdict.DISSENSUS)
+
+
+def _check_unit(name: str, value: float) -> None:
+    if not 0 < value <= 1:
+        raise ValueError(f"{name} must be in (0, 1], got {value}")

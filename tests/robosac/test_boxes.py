@@ -4,7 +4,7 @@ import shapely
 from hypothesis import given
 from hypothesis import strategies as st
 
-from robosac.boxes import corners, from_world, nms, pairwise_iou, pose_matrix, to_world
+from robosac.boxes import corners, from_world, in_units, nms, pairwise_iou, pose_fault, pose_matrix, to_world
 from tests.robosac.rectangles import from_corners
 
 coordinate = st.floats(-20, 20)
@@ -90,3 +90,46 @@ def test_to_world_is_the_inverse_of_from_world_whatever_the_tilt(tilt):
     pose = pose_matrix(10.0, -3.0, 1.7, 2.5) @ tilted
     boxes = np.array([[12.0, 5.0, 4.0, 2.0, 3.0, 0.9], [-7.0, 0.5, 4.0, 2.0, -1.0, 0.5]])
     np.testing.assert_allclose(from_world(to_world(boxes, pose), pose), boxes, atol=1e-12)
+
+
+BOX = [[1.0, 2.0, 4.0, 2.0, 0.5]]
+OF_BOXES = {
+    "corners": corners,
+    "pairwise_iou": lambda boxes: pairwise_iou(boxes, BOX),
+    "nms": lambda boxes: nms(boxes, np.ones(len(boxes)), 0.5),
+    "from_world": lambda boxes: from_world(boxes, np.eye(4)),
+    "to_world": lambda boxes: to_world(boxes, np.eye(4)),
+}
+
+
+@pytest.mark.parametrize("call", OF_BOXES.values(), ids=list(OF_BOXES))
+@pytest.mark.parametrize("wrong", [BOX[0], np.ones((2, 4)), [BOX], [["a"] * 5]], ids=["1d", "4 columns", "3d", "text"])
+def test_what_is_no_set_of_boxes_is_named(call, wrong):
+    with pytest.raises(ValueError, match=r"^(boxes|a) must be .*\(n, 5\+\)"):
+        call(wrong)
+
+
+@pytest.mark.parametrize("call", OF_BOXES.values(), ids=list(OF_BOXES))
+def test_lists_narrower_numbers_and_views_are_as_good_as_arrays(call):
+    wanted = call(np.array(BOX * 2))
+    spaced = np.zeros((4, 10))
+    spaced[::2, ::2] = BOX * 2
+    frozen = np.array(BOX * 2)
+    frozen.flags.writeable = False
+    for boxes in (BOX * 2, np.array(BOX * 2, dtype=np.float32), spaced[::2, ::2], frozen):
+        assert call(boxes).tolist() == wanted.tolist()
+    assert len(call([])) == len(call(np.zeros((0, 5)))) == 0
+
+
+def test_other_arguments_are_named_too():
+    with pytest.raises(ValueError, match=r"^scores must be one for each of 1 boxes"):
+        nms(BOX, [], 0.5)
+    with pytest.raises(ValueError, match=r"^iou_threshold"):
+        nms(BOX, [1.0], 2.0)
+    with pytest.raises(ValueError, match=r"^pose must be of shape"):
+        from_world(BOX, np.eye(3))
+    with pytest.raises(ValueError, match=r"^pose must be numbers"):
+        to_world(BOX, "north")
+    with pytest.raises(ValueError, match=r"^boxes must be of shape \(n, 6\+\)"):
+        in_units(BOX)
+    assert pose_fault(np.eye(4).tolist()) is None

@@ -160,3 +160,28 @@ def test_certainty_is_refused(p):
 def test_other_arguments_outside_the_domain_are_refused(call, message):
     with pytest.raises(DomainError, match=message):
         call()
+
+
+@pytest.mark.parametrize("count", [7.5, 7.0, float("nan"), "7", None])
+def test_a_count_is_a_whole_number(count):
+    calls = {
+        "sampling_budget": [lambda: eq1_collaborators(count, 0.2), lambda: exact_collaborators(5, 1, count)],
+        "collaborators": [lambda: eq2_budget(count, 0.2), lambda: exact_budget(5, 1, count)],
+        "attackers": [lambda: clean_probability(5, count, 1)],
+        "team_size": [lambda: attackers_in_team(count, 0.2), lambda: exact_budget(count, 1, 1)],
+    }
+    for name, of_name in calls.items():
+        for call in of_name:
+            with pytest.raises(DomainError, match=f"^{name} must be a whole number"):
+                call()
+    assert eq1_collaborators(np.int64(7), 0.2) == 3
+
+
+@pytest.mark.parametrize("confidence", [0, 1, 2.0, float("nan"), "0.9", None])
+def test_a_confidence_is_checked_wherever_it_is_asked_for(confidence):
+    for call in (eq1_collaborators, eq2_budget):
+        with pytest.raises(DomainError, match=r"^confidence"):
+            call(7, 0.2, confidence)
+    for call in (exact_budget, exact_collaborators):
+        with pytest.raises(DomainError, match=r"^confidence"):
+            call(5, 1, 3, confidence)

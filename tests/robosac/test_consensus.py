@@ -3,7 +3,7 @@ import pytest
 
 from robosac.answers import Verdict
 from robosac.boxes import pairwise_iou
-from robosac.consensus import compare, match
+from robosac.consensus import at_least, compare, match
 from tests.conftest import GOLDEN
 from tests.robosac.rectangles import from_corners
 
@@ -66,3 +66,34 @@ def test_a_pair_counts_from_the_threshold_on():
     half = ROW[:1] * [[1, 1, 0.5, 1, 1]]
     assert len(match(ROW[:1], half, 0.5)[0]) == 1
     assert len(match(ROW[:1], half, 0.51)[0]) == 0
+
+
+def test_a_wrong_argument_is_named():
+    box = [[0.0, 0.0, 4.0, 2.0, 0.0]]
+    for threshold in (0, -1, 1.5, float("nan")):
+        with pytest.raises(ValueError, match=r"^threshold must be in \(0, 1\]"):
+            compare(box, box, threshold)
+        with pytest.raises(ValueError, match=r"^iou_threshold must be in \(0, 1\]"):
+            match(box, box, threshold)
+    with pytest.raises(ValueError, match=r"^reference must be of shape"):
+        compare(box[0], box)
+    with pytest.raises(ValueError, match=r"^candidate must be of shape"):
+        match(box, box[0])
+    with pytest.raises(ValueError, match=r"^boxes must be of shape \(n, 6\+\)"):
+        at_least(box, 0.5)
+
+
+def test_lists_are_compared_like_arrays():
+    box = [[0.0, 0.0, 4.0, 2.0, 0.0]]
+    assert compare(box, box) == compare(np.array(box), np.array(box, dtype=np.float32))
+    assert compare([], box).verdict is Verdict.DISSENSUS
+    assert compare([], []).verdict is Verdict.NO_EVIDENCE
+
+
+def test_no_matching_of_the_golden_data_is_larger_than_the_largest():
+    with np.load(GOLDEN / "box_matching.npz") as data:
+        matched, largest, branch = data["n_matched"], data["max_cardinality"], data["branch"]
+    ours = np.array([len(match(reference, candidate)[0]) for reference, candidate, *_ in golden_cases()])
+    assert ours.tolist() == matched.tolist()
+    assert (ours <= largest).all()
+    assert set(branch[ours < largest]) == {3}
