@@ -53,7 +53,8 @@ def as_boxes(boxes: Any, name: str = "boxes", columns: int = 5) -> FloatArray:
     return array
 
 
-def _as_pose(pose: Any) -> FloatArray:
+def as_pose(pose: Any) -> FloatArray:
+    """A pose as a float64 array (4, 4); `ValueError` if it is none. What else a pose has to be, `pose_fault` says."""
     try:
         matrix: FloatArray = np.asarray(pose, dtype=np.float64)
     except (TypeError, ValueError) as error:
@@ -71,7 +72,7 @@ def pose_matrix(x: float, y: float, z: float, yaw: float) -> FloatArray:
 
 def pose_fault(pose: FloatArray) -> str | None:
     """Why a matrix (4, 4) of finite numbers can be no sensor's pose; None if it can."""
-    pose = _as_pose(pose)
+    pose = as_pose(pose)
     rotation = pose[:3, :3]
     rigid = (np.abs(rotation) <= 1 + RIGID_TOLERANCE).all() and np.allclose(
         rotation @ rotation.T, np.eye(3), atol=RIGID_TOLERANCE
@@ -100,7 +101,7 @@ def from_world(boxes: FloatArray, pose: FloatArray) -> FloatArray:
     (n, 5+) ndarray
         Sensor frame, yaw wrapped to [-pi, pi).
     """
-    boxes, pose = as_boxes(boxes), _as_pose(pose)
+    boxes, pose = as_boxes(boxes), as_pose(pose)
     yaw = np.arctan2(pose[1, 0], pose[0, 0])
     c, s = np.cos(yaw), np.sin(yaw)
     dx, dy = boxes[:, 0] - pose[0, 3], boxes[:, 1] - pose[1, 3]
@@ -112,7 +113,7 @@ def from_world(boxes: FloatArray, pose: FloatArray) -> FloatArray:
 
 def to_world(boxes: FloatArray, pose: FloatArray) -> FloatArray:
     """Boxes (n, 5+) of a sensor's frame in the world frame; the inverse of `from_world`, of a tilted sensor too."""
-    boxes, pose = as_boxes(boxes), _as_pose(pose)
+    boxes, pose = as_boxes(boxes), as_pose(pose)
     yaw = np.arctan2(pose[1, 0], pose[0, 0])
     c, s = np.cos(yaw), np.sin(yaw)
     moved = np.array(boxes, dtype=np.float64)

@@ -17,6 +17,7 @@ import rfc8785
 
 from robosac.ahead import Ahead
 from robosac.answers import Reason, Source, Verdict
+from robosac.arguments import check_defense, check_frame, check_rng
 from robosac.boxes import FloatArray
 from robosac.calibrated import witness_of
 from robosac.consensus import at_least, compare
@@ -37,7 +38,7 @@ from robosac.detectors import Message, PreparedFrame, Preparer
 from robosac.detectors.base import Testifying
 from robosac.faults import describe
 from robosac.previous import PreviousAnswer
-from robosac.provenance import best_first, unfounded
+from robosac.provenance import UnverifiedAnswer, best_first, unfounded
 from robosac.result import FusionResult
 from robosac.screening import Screened, Screening, joined, separated
 from robosac.steps import Steps, finished
@@ -50,12 +51,6 @@ logger = logging.getLogger(__name__)
 READING_SHARE = 0.5
 """Of the time that is left, for testimony: without it there is an answer, without time for a pass there is none."""
 T = TypeVar("T")
-
-
-class UnverifiedAnswer(Exception):
-    """A defence tried to answer with, or to trust, teammates that were not in consensus, or left one unexplained; or it
-    judged boxes that are not its to answer with.
-    """
 
 
 def fuse(  # all that a decision follows from, so that it can be made again
@@ -73,7 +68,8 @@ def fuse(  # all that a decision follows from, so that it can be made again
 ) -> FusionResult:
     """Answer one frame.
 
-    A fault in fusion or defence does not fail the frame: the ego's own boxes are answered, with ``fault`` set.
+    A fault in fusion or defence does not fail the frame: the ego's own boxes are answered, with ``fault`` set. What
+    is no frame of the detector does: `TypeError` or `ValueError`.
 
     Parameters
     ----------
@@ -82,7 +78,7 @@ def fuse(  # all that a decision follows from, so that it can be made again
     defense : Defense
     ego : Message
     teammates : mapping of teammate id to Message
-        Those present in this frame, checked against the detector's layout.
+        Those present in this frame; their numbers finite, their poses such as can be (`robosac.wire.check_message`).
     rng : numpy.random.Generator
         All randomness of the defence.
     state : mapping, optional
@@ -103,6 +99,9 @@ def fuse(  # all that a decision follows from, so that it can be made again
     -------
     FusionResult
     """
+    check_defense(defense)
+    check_rng(rng)
+    check_frame(detector.info, ego, teammates)
     run = FrameRun(detector, defense, ego, frame, previous, deadline or Deadline(), screening)
     return finished(run.answer(teammates, rng, state))
 

@@ -17,6 +17,12 @@ Judged = tuple[JudgedBox, ...]
 S = TypeVar("S", bound=Support)
 
 
+class UnverifiedAnswer(Exception):
+    """A defence tried to answer with, or to trust, teammates that were not in consensus, or left one unexplained; or it
+    judged boxes that are not its to answer with.
+    """
+
+
 def unfounded(decision: Decision, team: Sequence[str], decoded: Decoded) -> Iterator[str]:
     """Why judged boxes cannot be answered with; nothing if all of them can.
 

@@ -2,16 +2,16 @@
 
 from __future__ import annotations
 
-from collections.abc import Iterable, Mapping, Sequence
+from collections.abc import Mapping, Sequence
 from typing import Any, Literal
 
 import numpy as np
 
 from robosac.ahead import Ahead
-from robosac.budget import DomainError
+from robosac.arguments import check_frame, check_ids, check_rng, check_session
 from robosac.calibrated import calibration_of, screening_for
 from robosac.deadline import Deadline
-from robosac.defenses import EGO, Defense, DefenseSettings, SampleConsensus, State, build
+from robosac.defenses import Defense, DefenseSettings, SampleConsensus, State, build
 from robosac.defenses.group_testing import GroupTestingSettings
 from robosac.detectors import Detector, DetectorInfo, Message, Preparer
 from robosac.fusion import FrameRun, FusionResult
@@ -44,7 +44,7 @@ def changed_team(defense: Defense, state: State, team: Sequence[str]) -> State:
     robosac.budget.DomainError
         If the defence's settings make no sense for it, or an id cannot be one.
     """
-    _check_ids("team", team)
+    check_ids("team", team)
     alone, memory = separated(state)
     return joined(defense.change_team(alone, list(team)), memory)
 
@@ -67,6 +67,11 @@ class Session:
     screening : Screening, optional
         Tests of messages before any of them is fused; by default those that the detector is calibrated for. None for
         no such tests.
+
+    Raises
+    ------
+    TypeError, ValueError
+        If an argument is none of these, or a teammate is named twice.
 
     Attributes
     ----------
@@ -103,7 +108,7 @@ class Session:
         rng: np.random.Generator | None = None,
         screening: Screening | Literal["calibrated"] | None = "calibrated",
     ) -> None:
-        _check_ids("team", team)
+        check_session(team, defense, rng, screening)
         self.detector = detector
         self.screening = screening_for(detector.info) if screening == "calibrated" else screening
         self.defense = defense or _default(detector)
@@ -128,13 +133,17 @@ class Session:
             Its number; frames of successive numbers are one frame period apart.
         ego : Message
         teammates : mapping of teammate id to Message
-            Those present in this frame, checked against the detector's layout. Who is not in the team joins it, and is
-            remembered until `change_team`.
+            As `robosac.fuse` takes them. Who is not in the team joins it, and is remembered until `change_team`.
         deadline : Deadline, optional
             By default there is time for all.
         detector : Preparer, optional
             What decodes this frame in the place of the session's detector, such as a recording, or a
             `robosac.ahead.Ahead` in which the frame was begun.
+
+        Raises
+        ------
+        TypeError, ValueError
+            If a message is none, or not of the detector's layout.
         """
         result = self.decide(frame, ego, teammates, self._rng, deadline, detector)
         self.remember(result)
@@ -165,7 +174,8 @@ class Session:
         detector: Preparer | None = None,
     ) -> Steps[FusionResult]:
         """Decide as `decide` does, but pause before each pass, so that the work of others can take turns with it."""
-        _check_ids("teammates", teammates)
+        check_rng(rng)
+        check_frame((detector or self.detector).info, ego, teammates)
         deadline = deadline or Deadline()
         if isinstance(detector, Ahead):
             deadline.expect(detector.pass_s)
@@ -192,24 +202,6 @@ class Session:
         The generator of the draws is not part of it: whoever knew it could foresee them.
         """
         return {"state": dict(self.state), "previous": None if self.previous is None else self.previous.as_json()}
-
-
-def _check_ids(field: str, names: Iterable[object]) -> None:
-    """Say which id cannot be one: in the middle of a frame it would cost all answers."""
-    known = set()
-    for index, name in enumerate(names):
-        if not isinstance(name, str):
-            fault = f"is no text: {name!r}"
-        elif name == EGO:
-            fault = "is empty, which stands for the ego"
-        elif not name.isascii() and name != name.encode(errors="ignore").decode():
-            fault = f"cannot be written as UTF-8: {name!r}"
-        elif name in known:
-            fault = f"is there twice: {name!r}"
-        else:
-            known.add(name)
-            continue
-        raise DomainError(f"{field}: id {index} {fault}")
 
 
 def _default(detector: Preparer) -> Defense:

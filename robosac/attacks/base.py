@@ -6,9 +6,11 @@ Several attackers are optimised jointly. The attack acts on the message as it is
 
 from __future__ import annotations
 
+import math
 from abc import ABC, abstractmethod
 from collections.abc import Callable, Collection, Mapping, Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, fields
+from numbers import Integral, Real
 from typing import ClassVar
 
 import numpy as np
@@ -45,7 +47,7 @@ class Attack(ABC):
     Raises
     ------
     ValueError
-        If a parameter is not positive.
+        If a parameter that is a number is none, not positive or infinite, or one that counts is not whole.
     """
 
     name: ClassVar[str]
@@ -62,9 +64,15 @@ class Attack(ABC):
     """L-infinity bound on the perturbation, in units of the message."""
 
     def __post_init__(self) -> None:
-        for parameter, value in vars(self).items():
-            if isinstance(value, int | float) and not value > 0:
-                raise ValueError(f"{parameter} must be positive, got {value}")
+        for parameter in fields(self):
+            name, value = parameter.name, getattr(self, parameter.name)
+            kind = getattr(parameter.type, "__name__", parameter.type)  # a text where annotations are not evaluated
+            if kind == "int" and not isinstance(value, Integral):
+                raise ValueError(f"{name} must be a whole number, got {value!r}")
+            if kind == "float" and not isinstance(value, Real):
+                raise ValueError(f"{name} must be a number, got {value!r}")
+            if isinstance(value, Real) and not 0 < float(value) < math.inf:
+                raise ValueError(f"{name} must be positive and finite, got {value}")
 
     @abstractmethod
     def run(

@@ -49,9 +49,16 @@ def verify(lines: Iterable[bytes], head: str | None = None, receipts: Receipts |
     -------
     list of Finding
         In the order of the lines; empty if nothing is wrong.
+
+    Raises
+    ------
+    TypeError
+        If a line is text: it would have to be encoded first, and only bytes have a digest.
     """
     run = _Verification(head, receipts)
     for line in lines:
+        if not isinstance(line, bytes):
+            raise TypeError(f"lines must be an iterable of bytes, one a line; got {type(line).__name__}")
         run.take(line.removesuffix(b"\n"))
     run.finish()
     return run.findings

@@ -83,6 +83,8 @@ def read_settings(settings: Mapping[str, Any], kinds: Kinds | None = None) -> De
     DomainError
         If there is no such kind, or it does not take these settings.
     """
+    if not isinstance(settings, Mapping):
+        raise DomainError(f"settings must be a mapping with a kind, got {settings!r}")
     kind = settings.get("kind")
     model = _find(kind, kinds) if isinstance(kind, str) else None
     if model is None:

@@ -11,7 +11,7 @@ from typing import Any, ClassVar, Self
 import numpy as np
 import torch
 
-from robosac.boxes import FloatArray
+from robosac.boxes import FloatArray, as_pose
 from robosac.detectors.base import (
     DetectorInfo,
     Message,
@@ -106,10 +106,11 @@ class EmbeddedDetector(MapFusionDetector):
 
     def encode(self, points: FloatArray, pose: FloatArray) -> Message:
         """As `robosac.detectors.base.Encoder.encode`; the z of the pose is the sensor's height above ground, metres."""
+        pose = as_pose(pose)
         grid = torch.from_numpy(occupancy(points, float(pose[2, 3]))).float()
         with torch.inference_mode():
             features = (self._network.encode(grid[None])[0] * self._gain).contiguous()
-        return Message(np.asarray(pose, dtype=np.float64), {FEATURES: features.numpy().astype(np.float16)})
+        return Message(pose, {FEATURES: features.numpy().astype(np.float16)})
 
     def unscaled(self, sent: torch.Tensor) -> torch.Tensor:
         """Maps without the gain."""

@@ -23,7 +23,7 @@ def available() -> tuple[str, ...]:
     return tuple(DETECTORS.shipped)
 
 
-def load(detector: str = DEFAULT_DETECTOR) -> Detector:
+def load(detector: str | os.PathLike[str] = DEFAULT_DETECTOR) -> Detector:
     """Load a detector.
 
     It is checked for what a gateway needs of it, `Preparer`. Whoever encodes scans or attacks asks
@@ -31,7 +31,7 @@ def load(detector: str = DEFAULT_DETECTOR) -> Detector:
 
     Parameters
     ----------
-    detector : str
+    detector : str or path
         A name of `available`, the path of a weights file, an entry point of the group ``robosac.detectors``, or
         ``module:callable``, where the callable takes no arguments and returns a detector. After it ``@bfloat16`` may
         stand, or another precision in which the detector can decode.
@@ -43,6 +43,7 @@ def load(detector: str = DEFAULT_DETECTOR) -> Detector:
     ValueError
         If there is no such detector, it lacks what a gateway needs, or it cannot decode in that precision.
     """
+    detector = os.fspath(detector)
     plain, precision = split_precision(detector)
     there = os.path.exists(detector)  # noqa: PTH110 (Path raises for a long name)
     if plain != detector and not there:

@@ -20,8 +20,8 @@ def occupancy(points: FloatArray, sensor_height: float) -> np.ndarray[Any, np.dt
 
     Parameters
     ----------
-    points : (P, 3) ndarray
-        Returns in the sensor's frame, metres.
+    points : (P, 3+) ndarray
+        Returns in the sensor's frame, metres. Those that are not finite are no returns.
     sensor_height : float
         Above ground, metres. Layers are heights above ground; the lowest (below 0.25 m) holds the ground itself.
 
@@ -29,11 +29,27 @@ def occupancy(points: FloatArray, sensor_height: float) -> np.ndarray[Any, np.dt
     -------
     (6, 128, 128) uint8 ndarray
         0 or 1; layer, row (+y), column (+x); +-32 m in cells of 0.5 m.
+
+    Raises
+    ------
+    ValueError
+        If the points are not numbers of that shape.
     """
-    column = np.floor((points[:, 0] + AREA_M) / CELL_M).astype(np.int64)
-    row = np.floor((points[:, 1] + AREA_M) / CELL_M).astype(np.int64)
-    layer = np.digitize(points[:, 2] + sensor_height, HEIGHT_EDGES_M)
-    inside = (column >= 0) & (column < GRID) & (row >= 0) & (row < GRID)
+    x, y, z = as_points(points).T[:3]
+    column, row = np.floor((x + AREA_M) / CELL_M), np.floor((y + AREA_M) / CELL_M)
+    inside = (column >= 0) & (column < GRID) & (row >= 0) & (row < GRID) & np.isfinite(z)
+    column, row = column[inside].astype(np.int64), row[inside].astype(np.int64)
+    layer = np.digitize(z[inside] + sensor_height, HEIGHT_EDGES_M)
     grid = np.zeros((LAYERS, GRID, GRID), dtype=np.uint8)
-    grid[layer[inside], row[inside], column[inside]] = 1
+    grid[layer, row, column] = 1
     return grid
+
+
+def as_points(points: Any) -> FloatArray:
+    """Points as an array (P, 3+); an empty list is no point. `ValueError` if they are not numbers of that shape."""
+    array = np.asarray(points)
+    if array.shape == (0,):
+        return np.empty((0, 3))
+    if array.ndim != 2 or array.shape[1] < 3 or array.dtype.kind not in "iuf":
+        raise ValueError(f"points must be numbers of shape (P, 3+), got {array.dtype} of {array.shape}")
+    return array

@@ -6,6 +6,7 @@ from abc import ABC, abstractmethod
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, field
 from functools import cached_property
+from numbers import Integral
 
 import numpy as np
 
@@ -89,8 +90,13 @@ class GeneratedScene(ABC):
         Raises
         ------
         ValueError
-            If no car shall carry a sensor, or more than there ever are near each other.
+            If the seed is no non-negative integer, no car shall carry a sensor, or more than there ever are near each
+            other.
         """
+        if not isinstance(self.seed, Integral) or self.seed < 0:
+            raise ValueError(f"seed must be a non-negative integer, got {self.seed!r}")
+        if not isinstance(self.car_agents, Integral):
+            raise ValueError(f"car_agents must be a whole number, got {self.car_agents!r}")
         if self.car_agents < 1:
             raise ValueError(f"car_agents must be at least 1, got {self.car_agents}")
         rng = np.random.default_rng([self.seed, 0])
@@ -125,8 +131,10 @@ class GeneratedScene(ABC):
         Raises
         ------
         ValueError
-            If the index is negative.
+            If the index is negative, or no integer.
         """
+        if not isinstance(index, Integral):
+            raise ValueError(f"frame index must be an integer, got {index!r}")
         if index < 0:
             raise ValueError(f"frame index must not be negative, got {index}")
         traffic = self.traffic

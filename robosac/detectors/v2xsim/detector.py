@@ -16,7 +16,7 @@ from typing import Any, ClassVar, Self
 import numpy as np
 import torch
 
-from robosac.boxes import BoolArray, FloatArray
+from robosac.boxes import BoolArray, FloatArray, as_pose
 from robosac.detectors.base import (
     DetectorInfo,
     Message,
@@ -140,7 +140,7 @@ class V2XSimDetector(MapFusionDetector):
         """The message for an occupancy grid (256, 256, 13); see `robosac.detectors.v2xsim.voxels`."""
         with torch.inference_mode():
             features = self._network.levels(_as_maps(grid))[-1][0].contiguous()
-        return Message(np.asarray(pose, dtype=np.float64), {FEATURES: features.numpy(), _GRID: pack(grid)})
+        return Message(as_pose(pose), {FEATURES: features.numpy(), _GRID: pack(grid)})
 
     def decoder(self, ego: Message, own: torch.Tensor) -> Decode:
         """Logits (393216,) and codes (393216, 6) of all anchors; the decoder's part that is the ego's own, once."""

@@ -13,6 +13,7 @@ import numpy as np
 
 from robosac.boxes import BoolArray, FloatArray
 from robosac.detectors.v2xsim.network import GRID, LAYERS
+from robosac.detectors.voxels import as_points
 
 AREA_M = 32.0
 CELL_M = 0.25
@@ -40,9 +41,14 @@ def occupancy(points: FloatArray, bottom_m: float = BOTTOM_M) -> BoolArray:
     Returns
     -------
     (256, 256, 13) bool ndarray
+
+    Raises
+    ------
+    ValueError
+        If the points are not numbers of that shape.
     """
     low, high = _ends(bottom_m)
-    xyz = np.asarray(points, dtype=np.float64)[:, :3]
+    xyz = as_points(points)[:, :3].astype(np.float64)
     xyz = xyz[np.all((xyz > low) & (xyz < high), axis=1)]
     return from_indices((np.floor(xyz / _CELL_M) - np.floor(low / _CELL_M)).astype(np.int64))
 

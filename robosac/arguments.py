@@ -1,0 +1,92 @@
+"""What a caller of the library may have got wrong, found before anything is computed and told by its name.
+
+A fault inside does not fail a frame, so a caller's mistake would be answered as one.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Collection, Iterable, Mapping
+
+import numpy as np
+
+from robosac.budget import DomainError
+from robosac.defenses import EGO, Defense
+from robosac.detectors import DetectorInfo, Message
+from robosac.detectors.base import Role
+from robosac.plugins import lacks
+from robosac.screening import Screening
+
+
+def check_session(team: object, defense: object, rng: object, screening: object) -> None:
+    """Refuse what `robosac.Session` cannot be made of.
+
+    Raises
+    ------
+    TypeError, ValueError
+    """
+    if not isinstance(team, Collection):
+        raise TypeError(f"team must be a sequence of ids, got {team!r}")
+    check_ids("team", team)
+    if defense is not None:
+        check_defense(defense)
+    if rng is not None:
+        check_rng(rng)
+    if not isinstance(screening, Screening | None) and screening != "calibrated":
+        raise TypeError(f'screening must be a Screening, None or "calibrated", got {screening!r}')
+
+
+def check_ids(field: str, names: Iterable[object]) -> None:
+    """`DomainError` for an id that cannot be one: in the middle of a frame it would cost all answers."""
+    known = set()
+    for index, name in enumerate(names):
+        if not isinstance(name, str):
+            fault = f"is no text: {name!r}"
+        elif name == EGO:
+            fault = "is empty, which stands for the ego"
+        elif not name.isascii() and name != name.encode(errors="ignore").decode():
+            fault = f"cannot be written as UTF-8: {name!r}"
+        elif name in known:
+            fault = f"is there twice: {name!r}"
+        else:
+            known.add(name)
+            continue
+        raise DomainError(f"{field}: id {index} {fault}")
+
+
+def check_defense(defense: object) -> None:
+    """`TypeError` for what is no defence."""
+    if lacking := lacks(defense, Defense):
+        raise TypeError(f"defense must be a defence, and {type(defense).__name__} {lacking}")
+
+
+def check_rng(rng: object) -> None:
+    """`TypeError` for what is no generator of random numbers."""
+    if not isinstance(rng, np.random.Generator):
+        raise TypeError(f"rng must be a numpy.random.Generator, got {rng!r}")
+
+
+def check_frame(info: DetectorInfo, ego: Message, teammates: Mapping[str, Message]) -> None:
+    """Refuse messages that are not of a detector's layout; what their numbers are is not looked at.
+
+    Raises
+    ------
+    TypeError, ValueError
+    """
+    if not isinstance(teammates, Mapping):
+        raise TypeError("teammates must be a mapping of ids to messages")
+    check_ids("teammates", teammates)
+    _check_message(info, "ego", ego, "ego")
+    for name, message in teammates.items():
+        _check_message(info, "teammate", message, f"teammates[{name!r}]")
+
+
+def _check_message(info: DetectorInfo, role: Role, message: object, name: str) -> None:
+    if not isinstance(message, Message):
+        raise TypeError(f"{name} must be a Message, got {type(message).__name__}")
+    if np.shape(message.pose) != (4, 4):
+        raise ValueError(f"{name}: the pose must be of shape (4, 4), got {np.shape(message.pose)}")
+    for tensor, spec in info.tensors[role].items():
+        if tensor not in message.tensors:
+            raise ValueError(f"{name}: the tensor {tensor!r} is missing")
+        if (shape := np.shape(message.tensors[tensor])) != spec.shape:
+            raise ValueError(f"{name}: the tensor {tensor!r} must be of shape {spec.shape}, got {shape}")

@@ -1,0 +1,149 @@
+"""Mistakes of a caller are told by the argument's name, and not answered as faults."""
+
+from dataclasses import replace
+
+import numpy as np
+import pytest
+
+import robosac
+from robosac.audit import verify
+from robosac.budget import DomainError
+from robosac.defenses import SampleConsensus, build
+from robosac.detectors import Message
+from robosac.detectors.v2xsim.voxels import occupancy as v2xsim_occupancy
+from robosac.detectors.voxels import occupancy
+from tests.robosac.fusing import EGO, TEAM, FakeDetector
+
+
+def fused(rng, detector=None, defense=None, ego=EGO, teammates=TEAM):
+    return robosac.fuse(detector or FakeDetector(), defense or SampleConsensus(), ego, teammates, rng=rng)
+
+
+def test_fuse_names_what_is_no_argument_of_its(rng):
+    for wrong, told in (
+        ({"teammates": [EGO]}, "teammates must be a mapping of ids to messages"),
+        ({"teammates": None}, "teammates must be a mapping"),
+        ({"teammates": {"a": None}}, r"teammates\['a'\] must be a Message, got NoneType"),
+        ({"ego": None}, "ego must be a Message, got NoneType"),
+        ({"defense": {"kind": "none"}}, "defense must be a defence, and dict lacks"),
+    ):
+        with pytest.raises(TypeError, match=told):
+            fused(rng, **wrong)
+    for no_rng in (None, 0):
+        with pytest.raises(TypeError, match=r"rng must be a numpy.random.Generator"):
+            fused(no_rng)
+
+
+def test_fuse_names_the_message_and_the_tensor_that_is_not_of_the_layout(detector, ego_message, benign, rng):
+    features = ego_message.tensors["features"]
+    for tensors, told in (
+        ({}, "the tensor 'features' is missing"),
+        ({"features": features[:, :16, :16]}, r"the tensor 'features' must be of shape \(64, 32, 32\), got"),
+        ({"features": features.transpose(2, 1, 0)}, "the tensor 'features' must be of shape"),
+    ):
+        wrong = replace(ego_message, tensors=tensors)
+        with pytest.raises(ValueError, match=f"^ego: {told}"):
+            fused(rng, detector, None, wrong, benign)
+        with pytest.raises(ValueError, match=rf"^teammates\['rsu'\]: {told}"):
+            fused(rng, detector, None, ego_message, {**benign, "rsu": wrong})
+    for pose in (np.eye(3), np.eye(4).ravel()):
+        with pytest.raises(ValueError, match=r"^ego: the pose must be of shape \(4, 4\)"):
+            fused(rng, detector, None, Message(pose, ego_message.tensors), benign)
+
+
+def test_a_message_may_be_frozen_spaced_or_of_wider_numbers(detector, ego_message, benign):
+    features = benign["rsu"].tensors["features"]
+    frozen = features.copy()
+    frozen.flags.writeable = False
+    wanted = fused(np.random.default_rng(0), detector, None, ego_message, benign)
+    for array in (frozen, features.astype(">f2"), features.astype(np.float32), np.asfortranarray(features)):
+        said = {**benign, "rsu": replace(benign["rsu"], tensors={"features": array})}
+        result = fused(np.random.default_rng(0), detector, None, ego_message, said)
+        assert (result.accepted, result.boxes.tolist()) == (wanted.accepted, wanted.boxes.tolist())
+
+
+def test_a_session_names_what_it_cannot_be_made_of():
+    for wrong, kind, told in (
+        ({"team": None}, TypeError, "team must be a sequence of ids"),
+        ({"team": ["a", "b", "a"]}, ValueError, "team: id 2 is there twice"),
+        ({"defense": "none"}, TypeError, "defense must be a defence, and str lacks"),
+        ({"rng": 7}, TypeError, r"rng must be a numpy.random.Generator"),
+        ({"screening": "none"}, TypeError, "screening must be a Screening"),
+    ):
+        with pytest.raises(kind, match=told):
+            robosac.Session(FakeDetector(), **{"team": ["a", "b"], "defense": SampleConsensus()} | wrong)
+
+
+def test_a_session_refuses_what_is_no_message_and_goes_on():
+    session = robosac.Session(FakeDetector(), list(TEAM), SampleConsensus())
+    with pytest.raises(TypeError, match="ego must be a Message"):
+        session.answer(0, None, TEAM)
+    assert session.answer(0, EGO, TEAM).fault is None
+
+
+@pytest.mark.parametrize("grid_of", [lambda points: occupancy(points, 1.8), v2xsim_occupancy], ids=["small", "v2xsim"])
+def test_points_are_numbers_of_three_columns_and_those_that_are_not_finite_are_none(grid_of):
+    points = np.array([[3.0, 4.0, 0.0], [-3.0, 4.0, 0.5]])
+    wanted = grid_of(points)
+    assert wanted.sum() == 2
+    holes = [[np.nan, 1.0, 0.0], [1.0, np.inf, 0.0], [1.0, 1.0, np.nan], [1.0, 1.0, np.inf]]
+    for same in (points.tolist(), points.astype(np.float32), np.vstack([points, holes]), np.c_[points, [7.0, 7.0]]):
+        assert (grid_of(same) == wanted).all()
+    assert grid_of([]).sum() == grid_of(np.zeros((0, 3))).sum() == 0
+    for wrong in (points[:, :2], points[0], [["a"] * 3], None):
+        with pytest.raises(ValueError, match=r"^points must be numbers of shape \(P, 3\+\)"):
+            grid_of(wrong)
+
+
+def test_a_scan_is_encoded_with_a_pose_of_four_by_four(detector):
+    assert detector.encode([], np.eye(4).tolist()).pose.tolist() == np.eye(4).tolist()
+    for wrong in (np.eye(3), np.eye(4).ravel(), None):
+        with pytest.raises(ValueError, match=r"^pose must be "):
+            detector.encode([], wrong)
+
+
+def test_weights_are_opened_by_a_path_too(detector):
+    from robosac.detectors.embedded import SHIPPED_WEIGHTS
+
+    assert robosac.load_detector(SHIPPED_WEIGHTS).info.weights_digest == detector.info.weights_digest
+
+
+def test_an_attack_names_the_parameter_that_cannot_be():
+    for wrong, told in (
+        ({"epsilon": "x"}, "epsilon must be a number, got 'x'"),
+        ({"epsilon": None}, "epsilon must be a number"),
+        ({"epsilon": float("inf")}, "epsilon must be positive and finite"),
+        ({"epsilon": float("nan")}, "epsilon must be positive and finite"),
+        ({"steps": 1.5}, r"steps must be a whole number, got 1\.5"),
+        ({"steps": 0}, "steps must be positive and finite"),
+        ({"step_size": -1}, "step_size must be positive and finite"),
+    ):
+        with pytest.raises(ValueError, match=f"^{told}"):
+            robosac.PGD(**wrong)
+    assert robosac.PGD(epsilon=1, steps=np.int64(3)).steps == 3
+
+
+def test_a_scene_names_the_number_that_cannot_be():
+    for wrong, told in (
+        ({"seed": -1}, "seed must be a non-negative integer, got -1"),
+        ({"seed": 1.5}, "seed must be a non-negative integer"),
+        ({"seed": "8"}, "seed must be a non-negative integer"),
+        ({"seed": 8, "car_agents": 2.5}, "car_agents must be a whole number"),
+    ):
+        with pytest.raises(ValueError, match=f"^{told}"):
+            robosac.IntersectionScene(**wrong).frame(0)
+    for index in (1.5, "0"):
+        with pytest.raises(ValueError, match=r"^frame index must be an integer"):
+            robosac.IntersectionScene(seed=8).frame(index)
+
+
+def test_a_log_is_read_as_bytes():
+    for text in ("{}", ["{}"], b"{}"):
+        with pytest.raises(TypeError, match=r"^lines must be an iterable of bytes"):
+            verify(text)
+
+
+def test_settings_of_a_defence_are_a_mapping():
+    for wrong in ("none", None, ["kind"]):
+        with pytest.raises(DomainError, match=r"^settings must be a mapping with a kind"):
+            build(wrong)
