@@ -8,7 +8,7 @@ import pytest
 from matplotlib.image import imread
 from rich.console import Console
 
-from clients.fleet import _Screen
+from clients.screen import Screen
 from clients.simulation import Fleet
 from clients.standing import Standings, shown
 from clients.summary import FleetSummary
@@ -108,7 +108,7 @@ def test_the_report_of_a_fleet_has_it_where_it_is_known(defense, detector, tmp_p
         assert sum(boxes["answered"].values()) == len(answer.boxes)
         assert boxes["contradicted_left_out"] == len(answer.contradicted) > 0
         assert "Boxes answered" in console.file.getvalue()
-    screen = _Screen(console, 1)
+    screen = Screen(console, 1)
     screen.add(3, frame, answer, 10.0)
     console.print(screen.live.get_renderable())
     assert (f"-{len(answer.contradicted or ())} " in console.file.getvalue()) == (defense is not None)

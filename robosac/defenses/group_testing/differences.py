@@ -6,6 +6,7 @@ What is wrong with an object in a fusion is blamed on a teammate only if it is n
 from __future__ import annotations
 
 from collections.abc import Collection, Mapping, Sequence
+from itertools import compress
 
 import numpy as np
 
@@ -32,6 +33,8 @@ SAME_LIE_M = 3.0
 """Lies so near each other are about one object."""
 SHOWN_IOU = 0.3
 """A box shows a vehicle from this IoU on. A vehicle half of its length ahead of itself is lost where it is."""
+CARRIED_M = (1.0, 4.0)
+"""A vehicle is carried off by so much."""
 CRISP_SCORE = 0.5
 
 
@@ -42,7 +45,7 @@ def effects(joined: Shown, without: Shown, suspects: Sequence[str]) -> list[Lie]
       deny it, or nobody supports it;
     - ``gone``: a box without them where the others support a vehicle, and nothing is shown with them;
     - ``moved``: a box that is out of place, and without them less so. If it is so along itself only, it may be late. So
-      it may if many boxes together are `misplaced`, each a little.
+      it may if many boxes together are `misplaced`, each a little. Or a box that they have `carried` off.
     """
     contradicted = joined.claims.contradicted_by_others(suspects)
     ghosts = (contradicted | joined.on_nobodys_word) & (joined.boxes[:, 5] >= CRISP_SCORE)
@@ -57,11 +60,18 @@ def effects(joined: Shown, without: Shown, suspects: Sequence[str]) -> list[Lie]
     found += [Lie("gone", lost[i, :2], bool(own[i] >= SUPPORTS), said=bool(own[i] <= DENIES)) for i in taken]
     found += [Lie("gone", without.boxes[i, :2], alone=True) for i in gone_alone(joined, without, suspects)]
     away, aside, other = joined.away(suspects), joined.away(suspects, across=True), without.away(suspects)
+    farther: dict[int, int] = dict(_farther(joined, without).T.tolist())
     for index in np.flatnonzero((away >= AWAY) & (joined.boxes[:, 5] >= PLACED_SCORE) & ~ghosts).tolist():
         same = _at(without, joined.boxes[index])
+        same = farther.get(index) if same is None else same
         if same is not None and 0.0 < other[same] <= away[index] - AWAY_EFFECT:
             by, along = joined.accusers(index, suspects), bool(aside[index] < AWAY)
             found.append(Lie("moved", joined.boxes[index, :2], along=along, by=by))
+    for index, at in carried(joined, without, suspects).T.tolist():
+        both = joined.boxes[index, :2], without.boxes[at, :2]
+        if all(np.hypot(*(lie.place - place)) > SAME_LIE_M for lie in found for place in both):
+            by = _speaking_for(joined, index, without, at, suspects)
+            found.append(Lie("moved", joined.boxes[index, :2], by=by))
     if all(lie.kind != "moved" for lie in found) and misplaced(joined, without, suspects) >= ADRIFT:
         places, grown = _grown(joined, without, suspects)
         found.append(Lie("moved", places[grown.argmax()], along=True))
@@ -112,6 +122,42 @@ def _grown(joined: Shown, without: Shown, joining: Collection[str]) -> tuple[Flo
     most = 2 * MOST_AWAY
     grown = np.minimum(now[placed], most) - np.minimum(before[known][same], most)
     return here[near], np.clip(grown[near], -MOST_AWAY, MOST_AWAY)
+
+
+def carried(joined: Shown, without: Shown, suspects: Collection[str]) -> IntArray:
+    """Boxes of two fusions, by their places in each (2, k), that show one vehicle 1 to 4 m apart, and others than the
+    suspects say that it stands where the second one has it.
+
+    The ego or two others support the second; the sum of their L is greater by 6 there. A witness that is asked of a
+    place beside a vehicle sees it nearer to that place than it is, so `Shown.away` does not always tell.
+    """
+    found = _farther(joined, without)
+    others = np.array([name not in suspects for name in joined.claims.witnesses])
+    there, here = (shown.claims.likelihood[others][:, at] for shown, at in zip((joined, without), found, strict=True))
+    return found[:, two_witnesses(here >= SUPPORTS) & (here.sum(axis=0) - there.sum(axis=0) >= WEIGHTY)]
+
+
+def _farther(joined: Shown, without: Shown) -> IntArray:
+    """Boxes of two fusions, by their places in each (2, k), score >= .4, of which each is the nearest one to the other,
+    1 to 4 m away.
+    """
+    now = np.flatnonzero(joined.boxes[:, 5] >= PLACED_SCORE)
+    before = np.flatnonzero(without.boxes[:, 5] >= PLACED_SCORE)
+    if not len(now) or not len(before):
+        return np.zeros((2, 0), dtype=np.int64)
+    x, y = (without.boxes[before, None, axis] - joined.boxes[now, axis] for axis in (0, 1))
+    apart = np.hypot(x, y)
+    nearest, far = apart.argmin(axis=1), apart.min(axis=1)
+    same = (apart.argmin(axis=0)[nearest] == np.arange(len(before))) & (far >= CARRIED_M[0]) & (far <= CARRIED_M[1])
+    farther: IntArray = np.stack([now[nearest[same]], before[same]])
+    return farther
+
+
+def _speaking_for(joined: Shown, index: int, without: Shown, at: int, suspects: Collection[str]) -> tuple[str, ...]:
+    """Who but the suspects supports a box of the second fusion, and not one of the first."""
+    here, there = without.claims.supporting[:, at], joined.claims.supporting[:, index]
+    names = compress(joined.claims.witnesses, here & ~there)
+    return tuple(name for name in names if name not in suspects)
 
 
 def gone(joined: Shown, without: Shown, suspects: Collection[str] = ()) -> IntArray:

@@ -10,7 +10,7 @@ import numpy as np
 from robosac.answers import Standing, Support
 from robosac.boxes import BoolArray, FloatArray, pairwise_iou
 from robosac.defenses.group_testing.claims import DENIES, LEANS, NEARLY_SUPPORTS, SUPPORTS, two_witnesses
-from robosac.defenses.group_testing.differences import AWAY_EFFECT, gone, gone_alone
+from robosac.defenses.group_testing.differences import AWAY_EFFECT, carried, gone, gone_alone
 from robosac.defenses.group_testing.objects import SHOWN_SCORE, Shown
 from robosac.defenses.protocol import JudgedBox
 
@@ -30,7 +30,8 @@ def judge(answer: Shown, decoded: Sequence[Shown]) -> Judged:
     """Judge the boxes of an answer.
 
     1. A contradicted box is left out.
-    2. A box that is out of place is taken from the part of the answer that has it nearest to its place.
+    2. A box that is out of place is taken from the part of the answer that has it nearest to its place; one that was
+       carried off (`differences.carried`), from the part that has it where others say.
     3. A vehicle that a part of the answer shows, and the answer has lost although it stands by testimony, is taken from
        there. Of the answer without one teammate the word of one witness is enough, if nobody else denies it. No vehicle
        is there twice by it.
@@ -59,6 +60,10 @@ def judge(answer: Shown, decoded: Sequence[Shown]) -> Judged:
         for at in (*gone(answer, part).tolist(), *alone):
             place = part.boxes[at, :2]
             if all(np.hypot(*(place - other.boxes[i, :2])) > SAME_M for other, i in repairs):
+                repairs.append((part, at))
+        for index, at in carried(answer, part, left).T.tolist():
+            if kept[index]:
+                kept[index] = False
                 repairs.append((part, at))
     repairs, kept = _each_once(repairs, answer, kept)
     objects = [_judged(answer, index, None) for index in np.flatnonzero(kept).tolist()]

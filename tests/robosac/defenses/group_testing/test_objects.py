@@ -5,7 +5,7 @@ from dataclasses import replace
 import numpy as np
 import pytest
 
-from robosac.defenses.group_testing.differences import effects, gone, misplaced
+from robosac.defenses.group_testing.differences import carried, effects, gone, misplaced
 from robosac.defenses.group_testing.objects import Hearing, Shown
 from tests.robosac.testifying import saying
 
@@ -121,6 +121,41 @@ def test_a_vehicle_gone_is_blamed_on_whoever_takes_it_away():
 )
 def test_a_vehicle_that_two_others_see_is_missed(said, kinds):
     assert found(hearing(**said), NOTHING, car()) == kinds
+
+
+@pytest.mark.parametrize(
+    ("said", "off", "off_without", "some"),
+    [
+        (SEEN, (0.0, 3.8), (0.0, 0.1), True),
+        ({"ego": YES, "b": 1.0}, (-3.9, 0.0), (0.0, 0.0), True),
+        (SEEN, (0.0, 0.9), (0.0, 0.0), False),
+        (SEEN, (4.1, 0.0), (0.0, 0.0), False),
+        (SEEN, (0.0, 0.0), (0.0, 2.1), False),  # put right
+        ({"b": YES}, (0.0, 3.8), (0.0, 0.0), False),
+        ({"b": YES, "d": YES}, (0.0, 3.8), (0.0, 0.0), False),  # its own word
+        ({"b": 3.2, "c": 3.2, "a": -1.0}, (0.0, 3.8), (0.0, 0.0), False),
+    ],
+)
+def test_a_vehicle_is_carried_off_from_where_others_see_it(said, off, off_without, some):
+    heard = hearing(**said)
+    joined = Shown(TEAM, np.vstack([REST, car(off=off)]), heard)
+    without = Shown(("a", "b", "c"), np.vstack([car(off=off_without), REST]), heard)
+    assert carried(joined, without, ["d"]).tolist() == ([[1], [0]] if some else [[], []])
+    both = Shown(TEAM, np.vstack([REST, car(off=off), car(off=off_without)]), heard)
+    assert carried(both, without, ["d"]).size == 0  # it is where it was, and what is beside it is another one
+    for empty in (Shown(TEAM, NOTHING, heard), Shown(TEAM, car(score=0.3), heard)):
+        assert carried(empty, without, ["d"]).size == carried(joined, empty, ["d"]).size == 0
+
+
+def test_a_vehicle_is_carried_off_by_the_word_of_those_who_see_it_elsewhere():
+    """So near that the place is not empty, and out of place by nobody's word: none of them supports the box."""
+    words = {name: [(*PLACE, YES), (*(PLACE + [0.0, 3.5]), -1.0)] for name in ("", "b", "c")} | {"a": [], "d": []}
+    heard = Hearing(saying(words), ())
+    joined, without = Shown(TEAM, car(off=(0.0, 2.1)), heard), Shown(("a", "b", "c"), car(), heard)
+    assert joined.away(["d"]).tolist() == [0.0]
+    assert gone(joined, without, ["d"]).size == 0
+    (lie,) = effects(joined, without, ["d"])
+    assert (lie.kind, lie.counts_as, set(lie.by)) == ("moved", "moved", {"", "b", "c"})
 
 
 @pytest.mark.parametrize(

@@ -57,10 +57,12 @@ def test_what_a_liar_removes_or_moves_is_answered_where_it_is(world):
 
 
 @pytest.mark.parametrize(
-    "instead", [[0, 0, 0, 0, 0, -0.65], [3.3, 0, 0, 0, 0, 0], [-2.6, 0, 0, 0, 0, 0]], ids=["dimmed", "ahead", "behind"]
+    "instead",
+    [[0, 0, 0, 0, 0, -0.65], [3.3, 0, 0, 0, 0, 0], [-2.6, 0, 0, 0, 0, 0], [0, 2.1, 0, 0, 0, 0]],
+    ids=["dimmed", "ahead", "behind", "aside"],
 )
 @pytest.mark.parametrize("own", [NO, YES], ids=["its message says so", "its message tells the truth"])
-def test_what_a_liar_dims_or_shows_half_a_length_off_is_answered_where_it_is(instead, own):
+def test_what_a_liar_dims_or_carries_off_is_answered_where_it_is(instead, own):
     said = {EGO: YES, "car-2": YES, "car-3": YES, LIAR: own, "rsu": 0.0}
     world = World(said, lambda subset: CAR + instead if LIAR in subset else CAR)
     for decision, tested in world.play(4, quiet=6)[1:]:  # passes may be over before it is found out
