@@ -19,7 +19,7 @@ from robosac.attacks.objects import OnObjects
 from robosac.attacks.replays import Copy, Elsewhere, Frozen, Replay, Stale
 from robosac.attacks.situation import Foreign, Lie, Past, Situation
 from robosac.attacks.still import EraseStill, InventStill, ShiftStill
-from robosac.attacks.vehicles import Displace, OnVehicles, Remove, RemoveMany
+from robosac.attacks.vehicles import Dim, Displace, Jump, OnVehicles, Remove, RemoveMany
 from robosac.plugins import Kind
 
 KIND: Kind[Attack] = Kind("attack", __name__, Attack)
@@ -85,6 +85,7 @@ __all__ = [
     "CarliniWagner",
     "Copy",
     "Deny",
+    "Dim",
     "Displace",
     "Elsewhere",
     "Erase",
@@ -102,6 +103,7 @@ __all__ = [
     "InventStill",
     "Hearing",
     "IterativeAttack",
+    "Jump",
     "Lie",
     "NoGeometry",
     "NoWitness",

@@ -7,7 +7,7 @@ says in each frame what its lies are, and a lie that is held in the world is hel
 from __future__ import annotations
 
 from abc import abstractmethod
-from collections.abc import Collection, Mapping
+from collections.abc import Callable, Collection, Mapping
 from dataclasses import dataclass
 from typing import ClassVar
 
@@ -26,6 +26,10 @@ CRISP = 2.0
 """Class logit that a made-up object should have: a score of .88."""
 GONE = -3.5
 """Class logit that no place of an erased object should exceed: a score of .03."""
+FAINT = -1.4
+"""Class logit of the surest place of a dimmed object: a score of .2, too little to count as seen."""
+FAR_M = 1.5
+"""What should be seen farther away than this is erased where it is, and made up where it is not."""
 NEAR_M = 2.5
 """Places whose boxes are centred so near to an object may show it."""
 MOST_PLACES = 2000
@@ -97,7 +101,9 @@ class OnObjects(IterativeAttack):
     - a *ghost*: ``max(0, CRISP - logit)`` of the place that would show it most easily, and how far that place's box is
       from the ghost;
     - *erased*: ``max(0, logit - GONE)``, averaged over all places whose boxes are near it;
-    - *moved*: how far the centres of the boxes that show it are from where they should be;
+    - *dimmed*: as erased, but down to `FAINT`, and no farther;
+    - *moved*: how far the centres of the boxes that show it are from where they should be; if that is farther away than
+      `FAR_M`, it is a ghost there, and erased where it is;
     - cross-entropy between all other class scores and the benign ones, `balanced`, and `displacement` of all other
       certain boxes.
 
@@ -128,11 +134,13 @@ class OnObjects(IterativeAttack):
     def aim(self, surface: AttackSurface, attackers: Collection[str], situation: Situation) -> Aim:  # noqa: ARG002
         """The loss of the situation's lies, and of all that should stay."""
         honest, shown = View.of(surface, situation).honest, geometric(surface)
-        losses = [_LOSSES[lie.kind](lie, honest) for lie in situation.lies]
+        losses = [_loss(lie, honest) for lie in situation.lies]
         held = torch.ones_like(honest.scores, dtype=torch.bool)
         for lie in situation.lies:
-            if lie.kind != "moved":
+            if lie.kind != "moved" or _is_far(lie):
                 held &= _apart(honest.geometry, lie.box) > NEAR_M
+            if lie.truth is not None and _is_far(lie):
+                held &= _apart(honest.geometry, lie.truth) > NEAR_M
         still = held & (honest.scores >= CERTAIN)
         for lie in situation.lies:
             if lie.truth is not None:
@@ -177,9 +185,13 @@ class _Erased:
         self._showed = _apart(honest.geometry, lie.box) <= NEAR_M
 
     def __call__(self, logits: torch.Tensor, boxes: torch.Tensor) -> torch.Tensor:
-        shows = self._showed | (_apart(boxes.detach(), self._box) <= NEAR_M)
-        excess = functional.relu(logits[shows] - GONE)
-        return excess.sum() / max(int((excess > 0).sum()), 1)
+        return _excess(logits[self._showed | (_apart(boxes.detach(), self._box) <= NEAR_M)], GONE)
+
+
+class _Dimmed(_Erased):
+    def __call__(self, logits: torch.Tensor, boxes: torch.Tensor) -> torch.Tensor:
+        shows = logits[self._showed | (_apart(boxes.detach(), self._box) <= NEAR_M)]
+        return _excess(shows, FAINT) + functional.relu(FAINT - shows.max())
 
 
 class _Moved:
@@ -192,8 +204,33 @@ class _Moved:
         return average((boxes[..., :2] - self._wanted).abs().sum(dim=-1), self._shows)
 
 
+class _Carried:
+    def __init__(self, lie: Lie, honest: Perception) -> None:
+        self._ghost, self._lie = _Ghost(lie, honest), lie.box
+        self._true = lie.box if lie.truth is None else lie.truth
+
+    def __call__(self, logits: torch.Tensor, boxes: torch.Tensor) -> torch.Tensor:
+        from_true, from_lie = (_apart(boxes.detach(), box) for box in (self._true, self._lie))
+        return self._ghost(logits, boxes) + _excess(logits[(from_true <= NEAR_M) & (from_true < from_lie)], GONE)
+
+
+def _excess(logits: torch.Tensor, most: float) -> torch.Tensor:
+    """The mean of what logits (n,) are above the most that they should be, of those that are."""
+    excess = functional.relu(logits - most)
+    return excess.sum() / max(int((excess > 0).sum()), 1)
+
+
+def _is_far(lie: Lie) -> bool:
+    return lie.truth is not None and bool(np.hypot(*(lie.box[:2] - lie.truth[:2])) > FAR_M)
+
+
+def _loss(lie: Lie, honest: Perception) -> Callable[[torch.Tensor, torch.Tensor], torch.Tensor]:
+    return _Carried(lie, honest) if _is_far(lie) else _LOSSES[lie.kind](lie, honest)
+
+
 _LOSSES: Mapping[str, type[_Ghost] | type[_Erased] | type[_Moved]] = {
     "ghost": _Ghost,
     "erased": _Erased,
+    "dimmed": _Dimmed,
     "moved": _Moved,
 }

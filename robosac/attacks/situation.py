@@ -13,8 +13,10 @@ from robosac.attacks.hearing import Hearing
 from robosac.boxes import FloatArray, from_world, to_world
 from robosac.detectors.base import Message
 
-LieKind = Literal["ghost", "erased", "moved"]
-"""An object that does not exist, one that exists and should not be seen, and one that should be seen elsewhere."""
+LieKind = Literal["ghost", "erased", "dimmed", "moved"]
+"""An object that does not exist; one that exists and should not be seen; one that should be seen too faintly to count;
+and one that should be seen elsewhere.
+"""
 Foreign = Callable[[str, int], Message | None]
 """Of an agent and the number of a frame, what it senses in another scene; None if nothing."""
 KEPT_S = 2.0
@@ -27,7 +29,9 @@ class Lie:
 
     kind: LieKind
     box: FloatArray
-    """(5,), ego frame: where the ghost stands, where the erased vehicle is, or where the moved one should be seen."""
+    """(5,), ego frame: where the ghost stands, where the erased or dimmed vehicle is, or where the moved one should be
+    seen.
+    """
     number: int = 0
     """Which of the attack's objects this is; the same one has the same number from frame to frame."""
     truth: FloatArray | None = None

@@ -108,6 +108,17 @@ class RemoveMany(Remove):
 
 
 @dataclass(frozen=True)
+class Dim(OnVehicles):
+    """Show one car that the ego alone does not see with so low a score that nobody counts it."""
+
+    name: ClassVar[str] = "dim"
+
+    def lie(self, box: FloatArray, number: int) -> Lie:
+        """That it is hardly there."""
+        return Lie("dimmed", box, number)
+
+
+@dataclass(frozen=True)
 class Displace(OnVehicles):
     """Show one car that the ego alone does not see to its left of where it is.
 
@@ -123,6 +134,23 @@ class Displace(OnVehicles):
 
     def lie(self, box: FloatArray, number: int) -> Lie:
         """That it is there."""
-        left = np.array(box)
-        left[:2] += self.distance * np.array([-np.sin(box[4]), np.cos(box[4])])
-        return Lie("moved", left, number, box)
+        moved = np.array(box)
+        moved[:2] += self.distance * self.way(float(box[4]))
+        return Lie("moved", moved, number, box)
+
+    def way(self, yaw: float) -> FloatArray:
+        """Where to (2,) a car that heads so is moved."""
+        return np.array([-np.sin(yaw), np.cos(yaw)])
+
+
+@dataclass(frozen=True)
+class Jump(Displace):
+    """Show such a car ahead of where it is, by less than its length: its place does not look empty."""
+
+    name: ClassVar[str] = "jump"
+
+    distance: float = 3.3
+
+    def way(self, yaw: float) -> FloatArray:
+        """Ahead."""
+        return np.array([np.cos(yaw), np.sin(yaw)])

@@ -141,7 +141,7 @@ def _truth(lie: Lie) -> Spoken:
 
 
 def _falsehood(lie: Lie) -> Spoken:
-    return lie.box, DENIAL if lie.kind == "erased" else SUPPORT
+    return lie.box, DENIAL if lie.kind in ("erased", "dimmed") else SUPPORT
 
 
 def _paid(

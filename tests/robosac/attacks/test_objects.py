@@ -3,7 +3,7 @@ import pytest
 import torch
 
 from robosac.attacks import ATTACKS, Ghost, GhostAhead, GhostDriving, Ghosts, Past, Remove, Situation, Swarm
-from robosac.attacks.objects import CRISP, GONE, OnObjects
+from robosac.attacks.objects import CRISP, FAINT, GONE, OnObjects
 from robosac.attacks.places import CLEARANCE_M, REACH_M, Followed
 from robosac.boxes import pairwise_iou, pose_matrix
 from robosac.evaluation.encounters import Encounters
@@ -75,6 +75,29 @@ def test_a_displaced_car_is_shown_to_its_left(surface):
     np.testing.assert_allclose(lie.box[:2] - lie.truth[:2], [0.0, 1.2], atol=1e-9)
     row, column = (1, 0) if lie.box[0] < 10 else (2, 2)
     assert float(boxes[row, column, 1]) == pytest.approx(lie.box[1], abs=0.3)
+
+
+def test_a_dimmed_car_is_hardly_shown_and_the_other_stays(surface):
+    met = Situation(truth=street(surface))
+    logits, _ = strike(ATTACKS["dim"](epsilon=15.0, steps=120, step_size=0.15), surface, met)
+    (lie,) = met.lies
+    assert lie.kind == "dimmed"
+    first, second = logits[1, 0], logits[2, 2]
+    dimmed, other = (first, second) if lie.box[0] < 10 else (second, first)
+    assert float(dimmed) == pytest.approx(FAINT, abs=0.5)
+    assert float(other) > 2.0
+
+
+def test_a_car_that_jumps_is_gone_where_it_was(surface):
+    met = Situation(truth=street(surface))
+    logits, boxes = (
+        of.numpy() for of in strike(ATTACKS["jump"](epsilon=15.0, steps=200, step_size=0.15), surface, met)
+    )
+    (lie,) = met.lies
+    np.testing.assert_allclose(np.hypot(*(lie.box[:2] - lie.truth[:2])), 3.3, atol=1e-9)
+    from_true, from_lie = (np.hypot(boxes[..., 0] - x, boxes[..., 1] - y) for x, y in (lie.truth[:2], lie.box[:2]))
+    assert logits[(from_true < 2.5) & (from_true < from_lie)].max(initial=GONE) < GONE + 0.5
+    assert from_lie[logits > CRISP - 0.3].min() < 0.5
 
 
 def test_a_car_that_the_ego_sees_is_left_alone(surface):
@@ -182,7 +205,7 @@ def test_there_are_one_to_ten_ghosts(objects):
         Ghosts(objects=objects)
 
 
-SHOWING = {"ghost": 0.6, "ghost-driving": 0.6, "ghosts": 0.6, "remove": 0.1, "displace": 0.5}
+SHOWING = {"ghost": 0.6, "ghost-driving": 0.6, "ghosts": 0.6, "remove": 0.1, "dim": 0.3, "displace": 0.5, "jump": 0.6}
 
 
 @pytest.mark.parametrize("name", SHOWING)
@@ -193,7 +216,7 @@ def test_the_lie_shows_in_the_undefended_fusion(name, detector):
         assert met.lies
         for lie in met.lies:
             near = boxes[np.hypot(*(boxes[:, :2] - lie.box[:2]).T) < 1.0]
-            if lie.kind == "erased":
+            if lie.kind in ("erased", "dimmed"):
                 assert near[:, 5].max(initial=0.0) < SHOWING[name]
                 assert pairwise_iou(lie.box[None], met.truth).max() > 0.99
             else:
