@@ -2,7 +2,7 @@ import numpy as np
 import pytest
 import torch
 
-from robosac.attacks import ATTACKS, Ghost, GhostAhead, GhostDriving, Ghosts, Past, Remove, Situation, Swarm
+from robosac.attacks import ATTACKS, Displace, Ghost, GhostAhead, GhostDriving, Ghosts, Past, Remove, Situation, Swarm
 from robosac.attacks.objects import CRISP, FAINT, GONE, OnObjects
 from robosac.attacks.places import CLEARANCE_M, REACH_M, Followed
 from robosac.boxes import pairwise_iou, pose_matrix
@@ -88,16 +88,27 @@ def test_a_dimmed_car_is_hardly_shown_and_the_other_stays(surface):
     assert float(other) > 2.0
 
 
-def test_a_car_that_jumps_is_gone_where_it_was(surface):
+def test_a_car_jumps_ahead(surface):
     met = Situation(truth=street(surface))
-    logits, boxes = (
-        of.numpy() for of in strike(ATTACKS["jump"](epsilon=15.0, steps=200, step_size=0.15), surface, met)
-    )
+    strike(ATTACKS["jump"](steps=1), surface, met)
     (lie,) = met.lies
-    np.testing.assert_allclose(np.hypot(*(lie.box[:2] - lie.truth[:2])), 3.3, atol=1e-9)
-    from_true, from_lie = (np.hypot(boxes[..., 0] - x, boxes[..., 1] - y) for x, y in (lie.truth[:2], lie.box[:2]))
-    assert logits[(from_true < 2.5) & (from_true < from_lie)].max(initial=GONE) < GONE + 0.5
-    assert from_lie[logits > CRISP - 0.3].min() < 0.5
+    yaw = lie.truth[4]
+    np.testing.assert_allclose(lie.box, lie.truth + [3.3 * np.cos(yaw), 3.3 * np.sin(yaw), 0, 0, 0], atol=1e-9)
+
+
+def far_aside():
+    """An attack by its place."""
+    return Displace(distance=2.1)
+
+
+@pytest.mark.parametrize("attack", ["jump", f"{__name__}:{far_aside.__name__}"], ids=["ahead", "aside"])
+def test_a_car_that_is_moved_far_is_gone_where_it_is(attack, detector):
+    met = Encounters(detector, IntersectionScene(2)).sequence(3, attack, ["car-3", "rsu"])[-1]
+    (lie,) = met.lies
+    boxes = met.prepare(met.ego, met.teammates).detect(met.team)
+    from_true, from_lie = (np.hypot(*(boxes[:, :2] - box[:2]).T) for box in (lie.truth, lie.box))
+    assert boxes[from_true < 1.0, 5].max(initial=0.0) < 0.3
+    assert boxes[from_lie < 1.0, 5].max(initial=0.0) > 0.5
 
 
 def test_a_car_that_the_ego_sees_is_left_alone(surface):
