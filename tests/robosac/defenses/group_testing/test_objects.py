@@ -131,7 +131,7 @@ def test_a_vehicle_that_two_others_see_is_missed(said, kinds):
         (SEEN, (0.0, 0.9), (0.0, 0.0), False),
         (SEEN, (4.1, 0.0), (0.0, 0.0), False),
         (SEEN, (0.0, 0.0), (0.0, 2.1), False),  # put right
-        ({"b": YES}, (0.0, 3.8), (0.0, 0.0), False),
+        ({"b": 7.5}, (0.0, 3.8), (0.0, 0.0), False),  # one alone, however sure
         ({"b": YES, "d": YES}, (0.0, 3.8), (0.0, 0.0), False),  # its own word
         ({"b": 3.2, "c": 3.2, "a": -1.0}, (0.0, 3.8), (0.0, 0.0), False),
     ],
@@ -143,6 +143,8 @@ def test_a_vehicle_is_carried_off_from_where_others_see_it(said, off, off_withou
     assert carried(joined, without, ["d"]).tolist() == ([[1], [0]] if some else [[], []])
     both = Shown(TEAM, np.vstack([REST, car(off=off), car(off=off_without)]), heard)
     assert carried(both, without, ["d"]).size == 0  # it is where it was, and what is beside it is another one
+    beside = np.vstack([without.boxes, car(off=(off[0] * 1.4, off[1] * 1.4))])
+    assert carried(joined, Shown(("a", "b", "c"), beside, heard), ["d"]).size == 0  # another one is nearer
     for empty in (Shown(TEAM, NOTHING, heard), Shown(TEAM, car(score=0.3), heard)):
         assert carried(empty, without, ["d"]).size == carried(joined, empty, ["d"]).size == 0
 
@@ -209,6 +211,13 @@ def test_a_hole_is_where_vehicles_stand_and_nothing_is_shown():
     assert Shown(TEAM, np.vstack([REST, car(score=0.3, off=(1.0, 0.5))]), heard).lies == []
     assert len(Shown(TEAM, np.vstack([REST, car(score=0.29, off=(1.0, 0.5))]), heard).holes) == 1
     assert [lie.kind for lie in Shown(TEAM, car(), heard).lies] == ["gone"]  # the other one
+
+
+def test_a_box_beside_a_vehicle_covers_it_if_others_support_the_box():
+    for said, holes in (([], 1), ([(*(PLACE + [3.4, 0.0]), YES)], 0)):
+        known = {name: [(*PLACE, YES), (*ELSEWHERE, YES), *said] for name in ("b", "c")}
+        heard = Hearing(saying({"": [], "a": [], **known, "d": [(*(PLACE + [3.4, 0.0]), YES)]}), ())
+        assert len(Shown(TEAM, np.vstack([REST, car(off=(3.4, 0.0))]), heard).holes) == holes
 
 
 @pytest.mark.parametrize(

@@ -19,6 +19,7 @@ from tests.robosac.defenses.group_testing.one_place import (
     MOVED,
     NEAR,
     NO,
+    PLACE,
     SEEN,
     SURE,
     YES,
@@ -27,6 +28,7 @@ from tests.robosac.defenses.group_testing.one_place import (
     seen_by,
     there,
 )
+from tests.robosac.testifying import saying
 
 
 def test_a_ghost_is_in_no_answer():
@@ -144,6 +146,27 @@ def test_a_vehicle_that_is_repaired_is_there_once(score):
     repaired = score < 0.3
     assert (place.subset, place.index) == ((part.teammates, 8) if repaired else (answer.teammates, 9))
     assert (place.support.status is Standing.REPAIRED) == repaired
+
+
+@pytest.mark.parametrize(("off", "score"), [((3.3, 0.0), 0.85), ((3.3, 0.0), 0.35), ((0.0, 2.1), 0.85)])
+@pytest.mark.parametrize("accomplices", [(), ("car-2",)])
+def test_where_a_vehicle_is_taken_back_nothing_stays_of_what_it_was_moved_to(off, score, accomplices):
+    there = PLACE + off
+    words = {name: [(*place, YES) for place in SEEN[:, :2]] for name in (EGO, *TEAM)}
+    for name in (EGO, "car-3", "rsu"):
+        words[name] += [(*PLACE, YES), (*(PLACE + 2.0 * np.sign(off) + off), -1.0)]
+    for name in (LIAR, *accomplices):
+        words[name].append((*there, YES))
+    hearing = Hearing(saying(words), ())
+    moved = CAR + [*off, 0, 0, 0, score - CAR[0, 5]]
+    answer = Shown(("car-2", "car-3", LIAR, "rsu"), np.vstack([SEEN, moved]), hearing)
+    part = Shown(("car-2", "car-3", "rsu"), np.vstack([SEEN, CAR]), hearing)
+    objects, contradicted = judge(answer, [answer, part])
+    assert contradicted == ()
+    assert {(judged.subset, judged.index) for judged in objects} == {
+        *((answer.teammates, index) for index in range(len(SEEN))),
+        (part.teammates, len(SEEN)),
+    }
 
 
 def test_two_boxes_out_of_place_that_stand_for_one_vehicle_are_repaired_as_one():
