@@ -154,7 +154,7 @@ def test_where_a_vehicle_is_taken_back_nothing_stays_of_what_it_was_moved_to(off
     there = PLACE + off
     words = {name: [(*place, YES) for place in SEEN[:, :2]] for name in (EGO, *TEAM)}
     for name in (EGO, "car-3", "rsu"):
-        words[name] += [(*PLACE, YES), (*(PLACE + 2.0 * np.sign(off) + off), -1.0)]
+        words[name] += [(*PLACE, YES), (*(PLACE + 1.4 * np.sign(off) + off), -1.0)]
     for name in (LIAR, *accomplices):
         words[name].append((*there, YES))
     hearing = Hearing(saying(words), ())
