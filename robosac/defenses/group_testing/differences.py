@@ -43,7 +43,7 @@ def effects(joined: Shown, without: Shown, suspects: Sequence[str]) -> list[Lie]
 
     - ``ghost``: a contradicted box whose odds without them are less by a factor of e; veiled, if their own messages
       deny it, or nobody supports it;
-    - ``gone``: a box without them where the others support a vehicle, and nothing is shown with them;
+    - ``gone``: a box without them where the others support a vehicle, and with them no box shows it (`gone`);
     - ``moved``: a box that is out of place, and without them less so. If it is so along itself only, it may be late. So
       it may if many boxes together are `misplaced`, each a little. Or a box that they have `carried` off.
     """
