@@ -80,8 +80,12 @@ class Scope:
     def room(self) -> Room:
         """What leaves no room for made-up objects."""
         shown = [self.view.shown(perception, SEEN) for perception in (self.view.ego, self.view.honest)]
-        agents = np.vstack([np.zeros((1, 2)), self._centres(self.situation.poses)])
-        return Room(self.situation.truth, agents, np.vstack(shown), self.liars)
+        return Room(self.situation.truth, self.agents, np.vstack(shown), self.liars)
+
+    @property
+    def agents(self) -> FloatArray:
+        """(n, 2): where all are who sense, the ego first; ego frame."""
+        return np.vstack([np.zeros((1, 2)), self._centres(self.situation.poses)])
 
     def _centres(self, names: Collection[str]) -> FloatArray:
         poses = [self.situation.poses.get(name, self.situation.ego_pose) for name in names]

@@ -1,4 +1,4 @@
-"""Attacks on cars that exist: erased, or shown elsewhere."""
+"""Attacks on cars that exist: erased, shown elsewhere, or shown twice."""
 
 from __future__ import annotations
 
@@ -13,12 +13,14 @@ from robosac.attacks.geometric import CERTAIN
 from robosac.attacks.objects import NEAR_M, OnObjects, Scope
 from robosac.attacks.places import Followed, heard
 from robosac.attacks.situation import Lie
-from robosac.boxes import FloatArray
+from robosac.boxes import BoolArray, FloatArray
 
 AREA_M = 30.0
 """A car that is farther than this from the ego along an axis is given up, and another one is chosen."""
 SHOWN_M = 1.5
 """A box centred so near to a car shows it."""
+ROOM_M, CROWDED_M = 4.0, 3.0
+"""From a ghost beside a car to all others: at least, when it appears, and afterwards."""
 _FOLLOWED, _FRAME = "followed", "frame"
 
 
@@ -47,7 +49,7 @@ class OnVehicles(OnObjects):
         followed: dict[int, Followed] = {}
         for number, car in memory.get(_FOLLOWED, {}).items():
             now = car.among(world, elapsed_s) if elapsed_s > 0 else car
-            if now is not None and np.abs(situation.around_ego(now.box[None])[0, :2]).max() <= AREA_M:
+            if now is not None and self._lasts(scope, situation.around_ego(now.box[None])):
                 followed[number] = now
         self._choose(scope, followed, rng)
         memory[_FOLLOWED], memory[_FRAME] = followed, situation.frame
@@ -61,12 +63,20 @@ class OnVehicles(OnObjects):
             return
         truth, view = scope.situation.truth, scope.view
         taken = scope.situation.around_ego(np.array([car.box for car in followed.values()]).reshape(-1, 5))
-        fits = _distance(truth, view.shown(view.ego, SEEN)) > NEAR_M
-        fits &= _distance(truth, view.shown(view.honest, CERTAIN)) <= SHOWN_M
+        fits = self.fits(scope, truth) & (_distance(truth, view.shown(view.honest, CERTAIN)) <= SHOWN_M)
         fits &= _distance(truth, taken[:, :2]) > NEAR_M
         fits &= heard(truth, scope.liars) & (np.abs(truth[:, :2]).max(axis=1, initial=0.0) <= AREA_M)
         for number, index in zip(missing, rng.permutation(np.flatnonzero(fits)), strict=False):
             followed[number] = Followed(scope.situation.in_world(truth[index][None])[0])
+
+    def fits(self, scope: Scope, cars: FloatArray) -> BoolArray:
+        """Which cars (n, 5), ego frame, may be lied about, of those that the honest fusion shows."""
+        unseen: BoolArray = _distance(cars, scope.view.shown(scope.view.ego, SEEN)) > NEAR_M
+        return unseen
+
+    def _lasts(self, scope: Scope, car: FloatArray) -> bool:  # noqa: ARG002
+        """Whether a car (1, 5), ego frame, that was lied about is lied about further."""
+        return bool(np.abs(car[0, :2]).max() <= AREA_M)
 
 
 def _distance(boxes: FloatArray, points: FloatArray) -> FloatArray:
@@ -154,3 +164,41 @@ class Jump(Displace):
     def way(self, yaw: float) -> FloatArray:
         """Ahead."""
         return np.array([np.cos(yaw), np.sin(yaw)])
+
+
+@dataclass(frozen=True)
+class GhostBeside(Displace):
+    """One car that does not exist, to the left of a true one, headed and driving as it does.
+
+    Who sees the true car sees a vehicle almost there. The ghost is at least 4 m from every other vehicle and every
+    agent when it appears. Once it is nearer than 3 m to one, it is given up for another.
+
+    Parameters
+    ----------
+    distance : float
+        Metres between the centres.
+    """
+
+    name: ClassVar[str] = "ghost-beside"
+
+    distance: float = 3.0
+
+    def lie(self, box: FloatArray, number: int) -> Lie:
+        """That there is one."""
+        return Lie("ghost", super().lie(box, number).box, number)
+
+    def fits(self, scope: Scope, cars: FloatArray) -> BoolArray:
+        """Those with room beside them."""
+        fits: BoolArray = self._room_m(scope, cars) >= ROOM_M
+        return fits
+
+    def _lasts(self, scope: Scope, car: FloatArray) -> bool:
+        return super()._lasts(scope, car) and bool(self._room_m(scope, car)[0] >= CROWDED_M)
+
+    def _room_m(self, scope: Scope, cars: FloatArray) -> FloatArray:
+        """How far (n,) the ghosts beside cars (n, 5) are from all other vehicles and agents, metres."""
+        ghosts = np.array([self.lie(car, 0).box for car in cars]).reshape(-1, 5)
+        others = np.linalg.norm(cars[:, None, :2] - scope.situation.truth[None, :, :2], axis=2) > SHOWN_M
+        apart = np.linalg.norm(ghosts[:, None, :2] - scope.situation.truth[None, :, :2], axis=2)
+        nearest: FloatArray = np.where(others, apart, np.inf).min(axis=1, initial=np.inf)
+        return np.minimum(nearest, _distance(ghosts, scope.agents))

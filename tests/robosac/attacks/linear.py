@@ -8,7 +8,7 @@ from robosac.boxes import pose_matrix
 from robosac.detectors import Message
 from robosac.testimony import ACROSS, ALONG, LAYERS, LIKELIHOOD
 
-VEHICLES = np.array([[x, y, 4.0, 2.0, yaw] for x in (3.0, 13.0, 23.0) for y in (-5.0, 5.0) for yaw in (0.0, 1.6)])
+VEHICLES = np.array([[x, y, 4.0, 2.0, yaw] for x in (3.0, 13.0, 23.4) for y in (-5.0, 5.0) for yaw in (0.0, 1.6)])
 """True boxes with gaps between them, none of them where `Linear` has a place."""
 
 

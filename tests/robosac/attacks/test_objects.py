@@ -2,7 +2,19 @@ import numpy as np
 import pytest
 import torch
 
-from robosac.attacks import ATTACKS, Displace, Ghost, GhostAhead, GhostDriving, Ghosts, Past, Remove, Situation, Swarm
+from robosac.attacks import (
+    ATTACKS,
+    Displace,
+    Ghost,
+    GhostAhead,
+    GhostBeside,
+    GhostDriving,
+    Ghosts,
+    Past,
+    Remove,
+    Situation,
+    Swarm,
+)
 from robosac.attacks.objects import CRISP, FAINT, GONE, OnObjects
 from robosac.attacks.places import CLEARANCE_M, REACH_M, Followed
 from robosac.boxes import pairwise_iou, pose_matrix
@@ -96,6 +108,26 @@ def test_a_car_jumps_ahead(surface):
     np.testing.assert_allclose(lie.box, lie.truth + [3.3 * np.cos(yaw), 3.3 * np.sin(yaw), 0, 0, 0], atol=1e-9)
 
 
+def test_a_ghost_beside_a_car_drives_with_it_and_keeps_off_the_others(surface):
+    """Beside the second of two cars that are shown another one stands."""
+    (first, second), speed = street(surface), np.array([1.5, 0, 0, 0, 0])
+    truths = [np.array([first + n * speed, second, second + [0, 3.5, 0, 0, 0]]) for n in range(4)]
+    told = frames(GhostBeside(steps=1), surface, truths, [np.eye(4)] * 4)
+    np.testing.assert_allclose(told, [[truth[0] + [0, 3, 0, 0, 0]] for truth in truths], atol=1e-9)
+
+
+def test_a_ghost_beside_a_car_is_given_up_where_it_gets_too_close(surface):
+    """Something drives up to the ghost. It stays from 3 m on; nearer, there is one beside the other car."""
+    first, second = street(surface)
+    for passing, left_m in ((3.1, True), (2.9, False)):
+        truths = [np.array([first, second, first + [0, 3 + away, 0, 0, 0]]) for away in (20.0, passing)]
+        told = frames(GhostBeside(steps=1), surface, [truth[[0, 2]] for truth in truths], [np.eye(4)] * 2)
+        assert len(told[0]) == 1
+        assert len(told[1]) == left_m
+        (again,) = frames(GhostBeside(steps=1), surface, truths[1:], [np.eye(4)])[0]
+        np.testing.assert_allclose(again, second + [0, 3, 0, 0, 0], atol=1e-9)
+
+
 def far_aside():
     """An attack by its place."""
     return Displace(distance=2.1)
@@ -126,9 +158,12 @@ def test_a_lie_keeps_its_distance_or_is_about_a_car(attack, surface):
     attack(steps=1).run(surface, ["a"], np.random.default_rng(1), met)
     agents = np.array([[0.0, 0.0], *(pose[:2, 3] for pose in poses.values())])
     ghosts = [lie.box[:2] for lie in met.lies if lie.kind == "ghost"]
+    beside = attack is GhostBeside
     for number, ghost in enumerate(ghosts):
         others = np.vstack([truth[:, :2], agents, *(g[None] for n, g in enumerate(ghosts) if n != number)])
-        assert np.hypot(*(others - ghost).T).min() >= CLEARANCE_M
+        apart = np.sort(np.hypot(*(others - ghost).T))
+        assert apart[0] == pytest.approx(3.0) if beside else apart[0] >= CLEARANCE_M
+        assert apart[1] >= 4.0
         assert np.hypot(*ghost) <= REACH_M
     for lie in met.lies:
         if lie.kind != "ghost":
