@@ -19,7 +19,7 @@ LIKELIHOOD, X, Y, ALONG, ACROSS = range(5)
 may be off along and across the vehicle (metres).
 """
 LAYERS = 5
-MOST = 6.0
+MOST = 7.0
 """L is clipped to +- this: beyond it the network has seen too little to know."""
 
 

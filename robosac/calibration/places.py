@@ -7,20 +7,26 @@ from dataclasses import dataclass
 import numpy as np
 
 from robosac.boxes import FloatArray, pairwise_iou
-from robosac.scenes import Frame, View
+from robosac.scenes import View
 
 STANDARD = (4.5, 1.9, 1.55)
 """Length, width and height of the car that might stand in a place, metres."""
 OBSERVED_HITS = 6
 """A place is observed if so many returns would have come from a car that stood there."""
 FREE_PLACES = 48
-"""Free places drawn of a scan."""
+"""Free places drawn of a scan, but for those near vehicles."""
 LANE_SHARE = 0.7
 """Share of them on the line along which some vehicle heads; the others are anywhere."""
 LANE_REACH_M = 24.0
 LANE_JITTER_M = 0.5
 CLEARANCE_M = 0.5
-"""Free places keep this far from all vehicles."""
+"""These keep so far from all vehicles."""
+NEAR_PLACES = 16
+"""Further free places drawn of a scan, near vehicles: there a witness has to tell the vehicle from a second one."""
+NEAR_REACH_M = (6.5, 4.5)
+"""They are centred at most so far along and across from a vehicle."""
+NEAR_CLEARANCE_M = 0.2
+"""And keep so far from all."""
 JITTER_M = 0.25
 """Standard deviation of where a place is asked about beside where it is, along both axes."""
 OWN_BODY_M = 3.5
@@ -43,18 +49,18 @@ class Places:
     """(n, 5): the vehicle; zeros where there is none."""
 
 
-def places(frame: Frame, agent: str, half_extent_m: float, rng: np.random.Generator) -> Places:
+def places(view: View, truth: FloatArray, half_extent_m: float, rng: np.random.Generator) -> Places:
     """Draw places of what one agent senses.
 
     Parameters
     ----------
-    frame : Frame
-    agent : str
+    view : View
+    truth : (n, 5) ndarray
+        All vehicles around it, its frame.
     half_extent_m : float
         Only places within +- this are of interest, along both axes.
     rng : numpy.random.Generator
     """
-    view, truth = frame.views[agent], frame.truth(agent)[:, :5]
     inside = (np.abs(truth[:, :2]) < half_extent_m - 1).all(axis=1) & (np.hypot(*truth[:, :2].T) > OWN_BODY_M)
     vehicles, free = truth[inside], _free(truth, half_extent_m, rng)
     boxes = np.concatenate(
@@ -107,25 +113,33 @@ def _slab(start: float, direction: FloatArray, half: float) -> tuple[FloatArray,
 
 def _free(vehicles: FloatArray, half_extent_m: float, rng: np.random.Generator) -> FloatArray:
     """Places (n, 3) with a heading where no vehicle is."""
+    in_lanes = round(LANE_SHARE * FREE_PLACES)
+    count = 4 * FREE_PLACES
     anywhere = np.column_stack(
-        [rng.uniform(-half_extent_m, half_extent_m, (4 * FREE_PLACES, 2)), rng.uniform(-np.pi, np.pi, 4 * FREE_PLACES)]
+        [rng.uniform(-half_extent_m, half_extent_m, (count, 2)), rng.uniform(-np.pi, np.pi, count)]
     )
-    found = [anywhere]
+    kinds: list[tuple[FloatArray, int, float]] = [(anywhere, FREE_PLACES - in_lanes, CLEARANCE_M)]
     if len(vehicles):
-        chosen = vehicles[rng.integers(len(vehicles), size=4 * FREE_PLACES)]
-        along = rng.uniform(-LANE_REACH_M, LANE_REACH_M, len(chosen))
-        aside = rng.normal(0.0, LANE_JITTER_M, len(chosen))
-        cos, sin = np.cos(chosen[:, 4]), np.sin(chosen[:, 4])
-        x, y = chosen[:, 0] + along * cos - aside * sin, chosen[:, 1] + along * sin + aside * cos
-        found.append(np.column_stack([x, y, chosen[:, 4]]))
+        lane = np.column_stack([rng.uniform(-LANE_REACH_M, LANE_REACH_M, count), rng.normal(0.0, LANE_JITTER_M, count)])
+        near = rng.uniform(-1.0, 1.0, (8 * NEAR_PLACES, 2)) * NEAR_REACH_M
+        kinds.append((_beside(vehicles, lane, rng), in_lanes, CLEARANCE_M))
+        kinds.append((_beside(vehicles, near, rng), NEAR_PLACES, NEAR_CLEARANCE_M))
     kept = []
-    wanted = (FREE_PLACES - round(LANE_SHARE * FREE_PLACES), round(LANE_SHARE * FREE_PLACES))
-    grown = vehicles + np.array([0.0, 0.0, 2 * CLEARANCE_M, 2 * CLEARANCE_M, 0.0])
-    for options, count in zip(found, wanted, strict=False):
+    for options, wanted, clearance_m in kinds:
         cars = np.column_stack([options[:, :2], np.tile(STANDARD[:2], (len(options), 1)), options[:, 2]])
+        grown = vehicles + np.array([0.0, 0.0, 2 * clearance_m, 2 * clearance_m, 0.0])
         apart = pairwise_iou(cars, grown).max(axis=1, initial=0.0) == 0.0
         inside = (np.abs(options[:, :2]) < half_extent_m - 1).all(axis=1) & (
             np.hypot(options[:, 0], options[:, 1]) > OWN_BODY_M
         )
-        kept.append(options[apart & inside][:count])
+        kept.append(options[apart & inside][:wanted])
     return np.concatenate(kept)
+
+
+def _beside(vehicles: FloatArray, off: FloatArray, rng: np.random.Generator) -> FloatArray:
+    """Places (n, 3), each so far along and across (n, 2) from some vehicle, headed as it is."""
+    chosen = vehicles[rng.integers(len(vehicles), size=len(off))]
+    cos, sin = np.cos(chosen[:, 4]), np.sin(chosen[:, 4])
+    x = chosen[:, 0] + off[:, 0] * cos - off[:, 1] * sin
+    y = chosen[:, 1] + off[:, 0] * sin + off[:, 1] * cos
+    return np.column_stack([x, y, chosen[:, 4]])

@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Callable, Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 
 import numpy as np
 import torch
@@ -13,10 +13,14 @@ from robosac.boxes import FloatArray
 from robosac.calibration.places import JITTER_M, OBSERVED_HITS, Places, places
 from robosac.detectors.base import Encoder, for_role
 from robosac.detectors.witness import Layout, Witness, WitnessNetwork
-from robosac.scenes import DEFAULT_DATA, Scene, SceneError, SceneSource, encoded, seconds_apart
+from robosac.scenes import DEFAULT_DATA, Scene, SceneError, SceneSource, View, encoded, seconds_apart
 from robosac.testimony import ACROSS, ALONG, LIKELIHOOD, X, Y
 
 _PLACES, _BATCHES = 61, 62
+BLOCKED_SHARE = 0.12
+"""Share of scans that lack a sector. What a witness could not see there it must not take for empty."""
+BLOCKED = (np.pi / 6, 2 * np.pi)
+"""Such a sector is between so wide, radians."""
 SIGHTED_M = (1.3, 1.0)
 """Vehicles are located from places up to so far along and across from their centres, metres."""
 SMALLEST, LARGEST = -3.0, 1.0
@@ -85,13 +89,26 @@ def lessons(
     learned = []
     for scene in scenes:
         for frame in seconds_apart(scene, recipe.frames_per_scene):
-            for agent, view in frame.views.items():
+            for agent, whole in frame.views.items():
+                view = _partly_blocked(whole, rng) if rng.random() < BLOCKED_SHARE else whole
                 message = for_role(encoded(view, detector), detector.info, "teammate")
                 sent = torch.from_numpy(np.asarray(message.tensors[layout.tensor], dtype=np.float16))
-                known = places(frame, agent, layout.half_extent_m, rng)
+                known = places(view, frame.truth(agent)[:, :5], layout.half_extent_m, rng)
                 learned.append(Lesson(sent, float(view.pose[2, 3]), known))
             tick()
     return learned
+
+
+def _partly_blocked(view: View, rng: np.random.Generator) -> View:
+    """A scan without the returns of a sector, as if something stood there just before the sensor; a recorded message as
+    it is.
+    """
+    if getattr(view, "message", None) is not None:
+        return view
+    azimuth = np.arctan2(view.points[:, 1], view.points[:, 0])
+    middle, half = rng.uniform(-np.pi, np.pi), rng.uniform(*BLOCKED) / 2
+    left = np.abs((azimuth - middle + np.pi) % (2 * np.pi) - np.pi) > half
+    return replace(view, points=view.points[left])
 
 
 def usual_size(detector: Encoder, scene: Scene) -> float:

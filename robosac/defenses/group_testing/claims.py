@@ -6,7 +6,7 @@ Whoever may have made the box up cannot speak for it: a claim is denied or suppo
 
 from __future__ import annotations
 
-from collections.abc import Collection
+from collections.abc import Collection, Sequence
 from dataclasses import dataclass
 from functools import cached_property
 
@@ -21,7 +21,7 @@ NEARLY_SUPPORTS = 2.5
 """From this L on, an agent is the second to support a box, if all but the first support it together."""
 DENIES = -3.0
 """An agent denies a place from this L on downwards."""
-EGO_KNOWS = -5.5
+EGO_KNOWS = -6.75
 """Where the ego's own L is so low, whoever supports a vehicle is wrong: nobody else has a part in what the ego saw."""
 WEIGHTY = 6.0
 """Testimony of several agents decides from this sum of L on, in either direction."""
@@ -32,11 +32,16 @@ the teammate who denies it most.
 CONFLICT_OWN, CONFLICT_SUM = 4.5, 10.0
 """L of one, and the sum of all others' the other way, from which on they are in conflict."""
 AROUND_M = 0.6
-"""L of a box is the greatest within so far along and across of its centre: a place a little off is no denial."""
+"""L of a box is the greatest within so far along and across of its centre: a place a little off is no denial. Where
+another box is beside it, that is not looked for on the other's side: there a witness sees that vehicle.
+"""
+BESIDE_M = 4.5
+"""Two boxes are beside one another if they are centred so near."""
 NOT_TOGETHER = 3
 """So many teammates do not lie together, or no more would be left to tell."""
 LEANS = -1.0
 """All others lean against a box if the sum of L without those who vouch for it is so low."""
+_SAME_M = 1e-3
 _STEPS = np.array([[0.0, 0.0], [1.0, 0.0], [-1.0, 0.0], [0.0, 1.0], [0.0, -1.0]])
 
 
@@ -52,14 +57,16 @@ class Claims:
     """(witnesses, n): L of each box."""
 
     @classmethod
-    def of(cls, boxes: FloatArray, heard: Testimony) -> Claims:
-        """Look up boxes (n, 6)."""
+    def of(cls, boxes: FloatArray, heard: Testimony, shown: FloatArray | None = None) -> Claims:
+        """Look up boxes (n, 5+), each by itself; or beside others that are ``shown`` (m, 2+), themselves among them."""
         cos, sin = np.cos(boxes[:, 4]), np.sin(boxes[:, 4])
         along, across = np.stack([cos, sin], axis=-1), np.stack([-sin, cos], axis=-1)
         around = boxes[:, None, :2] + AROUND_M * (
             _STEPS[None, :, :1] * along[:, None] + _STEPS[None, :, 1:] * across[:, None]
         )
         found = heard.likelihood(around.reshape(-1, 2)).reshape(len(heard.agents), len(boxes), len(_STEPS))
+        if shown is not None:
+            found[:, _nearer_to_another(around, shown)] = -np.inf
         return cls(boxes, heard.agents, found.max(axis=2))
 
     def without(self, agents: Collection[str]) -> Claims:
@@ -130,7 +137,7 @@ class Claims:
     def contradicted(self) -> BoolArray:
         """Which boxes (n,) are contradicted, whoever supports them.
 
-        Those with an L of -5.5 or less by the ego are. So are those that are denied for certain
+        Those with an L of -6.75 or less by the ego are. So are those that are denied for certain
         (`denied_for_certain`), if the sum of L without the teammate who supports a box most is at most -6. What the ego
         itself supports is not contradicted.
         """
@@ -156,7 +163,28 @@ class Claims:
         return known
 
 
+def _nearer_to_another(around: FloatArray, shown: FloatArray) -> BoolArray:
+    """Which places (n, k) around boxes, given as (n, k, 2) with their centres first, are nearer than these to another
+    box beside them, of those shown (m, 2+).
+    """
+    x, y = (shown[:, axis] - around[:, :1, axis] for axis in (0, 1))
+    apart = x * x + y * y
+    own, other = np.nonzero((apart > _SAME_M**2) & (apart <= BESIDE_M**2))
+    nearer = np.zeros(around.shape[:2], dtype=bool)
+    if len(own):
+        x, y = (around[own, :, axis] - shown[other, None, axis] for axis in (0, 1))
+        np.logical_or.at(nearer, own, x * x + y * y < (apart[own, other] - _SAME_M)[:, None])
+    return nearer
+
+
 def two_witnesses(speaking: BoolArray) -> BoolArray:
     """Which places (n,) the ego, or two teammates, speak of: ``speaking`` (witnesses, n), the ego first."""
     enough: BoolArray = speaking[0] | (np.add.reduce(speaking[1:], axis=0, dtype=np.int16) >= 2)
+    return enough
+
+
+def vouched(supporting: BoolArray, agents: Sequence[str], suspects: Collection[str]) -> BoolArray:
+    """Which places (n,) one of the agents supports, ``supporting`` (agents, n), who is no suspect, or two."""
+    others = np.array([name not in suspects for name in agents])
+    enough: BoolArray = supporting[others].any(axis=0) | (supporting.sum(axis=0) >= 2)
     return enough

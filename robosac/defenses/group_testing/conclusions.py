@@ -12,7 +12,7 @@ from robosac.defenses.group_testing.differences import SAME_LIE_M, blame
 from robosac.defenses.group_testing.findings import UNHEARD, Findings, one_out
 from robosac.defenses.group_testing.lies import Word
 from robosac.defenses.group_testing.model import CELLS, CLEAN, LIE
-from robosac.defenses.group_testing.objects import Lie, Shown
+from robosac.defenses.group_testing.objects import Lie
 from robosac.defenses.protocol import Hypothesis
 
 CLEARING = 1.5
@@ -188,7 +188,7 @@ def _clear(found: Findings) -> None:
     fused so. Holes count only where vehicles were taken away.
     """
     largest_first = sorted(found.shown, key=len, reverse=True)
-    best = next((subset for subset in largest_first if not _wrong(found, found.shown[subset])), ())
+    best = next((subset for subset in largest_first if not _wrong(found, subset)), ())
     cleared = tuple(name for name in best if not found.lies.worst(name))
     if not cleared:
         return
@@ -201,13 +201,11 @@ def _clear(found: Findings) -> None:
     found.known.posterior.update(nobody, all_of_them, log_likelihood)
 
 
-def _wrong(found: Findings, shown: Shown) -> bool:
-    frame = found.known.memory.frame
-    lies = [lie for lie in shown.lies if not found.lies.is_quiet(found.placed(lie.place), frame)]
-    return any(lie.kind != "gone" or _is_lost(found, shown, lie) for lie in lies)
+def _wrong(found: Findings, fused: Hypothesis) -> bool:
+    return any(lie.kind != "gone" or _is_lost(found, fused, lie) for lie in found.lies_in(fused))
 
 
-def _is_lost(found: Findings, shown: Shown, hole: Lie) -> bool:
+def _is_lost(found: Findings, fused: Hypothesis, hole: Lie) -> bool:
     """Whether some decoded part of a fusion shows the vehicle of a hole."""
-    parts = [part for part in found.shown if set(part) < set(shown.teammates)]
-    return any(found.is_real(shown.teammates, part, hole) for part in parts)
+    parts = [part for part in found.shown if set(part) < set(fused)]
+    return any(found.is_real(fused, part, hole) for part in parts)

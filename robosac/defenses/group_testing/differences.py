@@ -12,7 +12,7 @@ import numpy as np
 
 from robosac.boxes import BoolArray, FloatArray, IntArray, pairwise_iou
 from robosac.defenses.group_testing.claims import DENIES, SUPPORTS, WEIGHTY, two_witnesses
-from robosac.defenses.group_testing.objects import AWAY, CERTAIN, PLACED_SCORE, SHOWN_SCORE, Lie, Shown
+from robosac.defenses.group_testing.objects import AWAY, CERTAIN, CRISP_SCORE, PLACED_SCORE, SHOWN_SCORE, Lie, Shown
 
 OWN_DENIES = -4.0
 """Whose own message denies a place so far is not to blame for a box there."""
@@ -35,7 +35,6 @@ SHOWN_IOU = 0.3
 """A box shows a vehicle from this IoU on. A vehicle half of its length ahead of itself is lost where it is."""
 CARRIED_M = (1.0, 4.0)
 """A vehicle is carried off by so much."""
-CRISP_SCORE = 0.5
 
 
 def effects(joined: Shown, without: Shown, suspects: Sequence[str]) -> list[Lie]:

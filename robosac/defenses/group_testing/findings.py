@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Collection, Iterable, Mapping, Sequence
+from functools import cached_property
 
 import numpy as np
 
@@ -61,6 +62,7 @@ class Findings:
         self.hearing: Hearing | None = None
         self.pose: FloatArray = np.eye(4)
         self.differences: list[Difference] = []
+        self._alone: FloatArray | None = None
         self._gone: dict[tuple[Hypothesis, Hypothesis], FloatArray] = {}
         self._effects: dict[tuple[Hypothesis, Hypothesis, Hypothesis], list[Lie]] = {}
 
@@ -71,6 +73,7 @@ class Findings:
             return None
         if self.hearing is None:
             self.hearing = Hearing(outcome.testimony, self.unheard)
+            self._alone = outcome.alone
         if outcome.pose is not None:
             self.pose = outcome.pose
         shown = self.shown[outcome.teammates] = Shown(outcome.teammates, outcome.boxes, self.hearing)
@@ -130,10 +133,23 @@ class Findings:
         group = tuple(name for name in fused if lie.kind != "moved" and shown.goes_with(name, lie))
         return group if 2 <= len(group) < len(fused) else ()
 
-    def lies_in(self, answer: Hypothesis) -> list[Lie]:
-        """What is wrong in the answer, and not remembered as nobody's doing."""
+    def lies_in(self, fused: Hypothesis) -> list[Lie]:
+        """What is wrong in a fusion, and not remembered as nobody's doing, nor wrong in what the ego sees alone: nobody
+        else has a part in that. But what the ego misses somebody may still take away.
+        """
         frame = self.known.memory.frame
-        return [lie for lie in self.shown[answer].lies if not self.lies.is_quiet(self.placed(lie.place), frame)]
+        found = [lie for lie in self.shown[fused].lies if not self.lies.is_quiet(self.placed(lie.place), frame)]
+        return [lie for lie in found if lie.kind == "gone" or not self._is_of_ego(lie)]
+
+    def _is_of_ego(self, lie: Lie) -> bool:
+        same = (own for own in self._lies_of_ego if own.kind == lie.kind)
+        return any(np.hypot(*(own.place - lie.place)) <= SAME_LIE_M for own in same)
+
+    @cached_property
+    def _lies_of_ego(self) -> list[Lie]:
+        if self.hearing is None or self._alone is None:
+            return []
+        return Shown((), self._alone, self.hearing).lies
 
     def supporters(self, answer: Hypothesis, hole: Lie) -> Hypothesis:
         """The two of those fused who support a vehicle in a hole most, in the order of the team."""

@@ -15,12 +15,22 @@ from functools import cached_property
 import numpy as np
 
 from robosac.boxes import BoolArray, FloatArray, IntArray
-from robosac.defenses.group_testing.claims import CONFLICT_OWN, DENIES, SUPPORTS, WEIGHTY, Claims, two_witnesses
+from robosac.defenses.group_testing.claims import (
+    CONFLICT_OWN,
+    DENIES,
+    SUPPORTS,
+    WEIGHTY,
+    Claims,
+    two_witnesses,
+    vouched,
+)
 from robosac.defenses.protocol import Hypothesis
 from robosac.testimony import Testimony
 
 SHOWN_SCORE = 0.3
 """Boxes from this score on claim something. Fainter ones are as good as none: whoever dims a vehicle takes it away."""
+CRISP_SCORE = 0.5
+"""Nobody is to blame for boxes below this score: a detector makes many of them up by itself."""
 PLACED_SCORE = 0.4
 """Boxes from this score on have to be in their place."""
 SURE_SCORE = 0.9
@@ -42,8 +52,7 @@ RIM_M = 1.2
 AWAY = 2.5
 """A box is out of place if it is so many times farther from where witnesses see the vehicle than they may err."""
 IN_PLACE = 1.5
-"""A box is in its place if it is at most so many times farther from where witnesses see the vehicle than they may err.
-"""
+"""A box is in its place if it is at most so many times farther from where witnesses see it than they may err."""
 SLACK_ALONG_M = 0.15
 SLACK_ACROSS_M = 0.1
 """Added to what a witness says it may err: senders are not quite where they say."""
@@ -62,14 +71,12 @@ class Lie:
     """Whether the message of whoever is behind it says the contrary of what it does: that a ghost is none, or that a
     vehicle that it removes is there.
     """
-
     along: bool = False
     """Whether a vehicle is moved along itself only, or many are a little, as by a message that is late."""
     alone: bool = False
     """Whether a single witness supports the vehicle that is gone: one word against one."""
     said: bool = False
     """Whether the message of whoever is behind it says so, too: that a vehicle that it removes is not there."""
-
     by: Hypothesis = ()
     """Who says that a vehicle is moved."""
 
@@ -158,7 +165,7 @@ class Shown:
         self.boxes = boxes
         self._hearing = hearing
         self._testimony = hearing.heard
-        self.everybody = Claims.of(boxes, hearing.everybody)
+        self.everybody = Claims.of(boxes, hearing.everybody, boxes[boxes[:, 5] >= SHOWN_SCORE])
         """What everybody says of the boxes, heard or not."""
         self.claims = self.everybody.without(set(hearing.everybody.agents) - set(hearing.heard.agents))
 
@@ -255,18 +262,18 @@ class Shown:
 
     def stands(self, places: FloatArray) -> BoolArray:
         """Whether a vehicle stands at places (n, 2) by the word of somebody who is not among those fused, or of two."""
-        return _vouched(self._testimony.likelihood(places) >= SUPPORTS, self._testimony.agents, self.teammates)
+        return vouched(self._testimony.likelihood(places) >= SUPPORTS, self._testimony.agents, self.teammates)
 
     def vouched(self, joining: Hypothesis) -> BoolArray:
         """Which boxes (n,) somebody supports who is not among the joining, or two: nothing that one has made up."""
-        return _vouched(self.claims.supporting, self.claims.witnesses, joining)
+        return vouched(self.claims.supporting, self.claims.witnesses, joining)
 
     @cached_property
     def lies(self) -> list[Lie]:
-        """All that may be wrong."""
-        found = [Lie("ghost", box[:2]) for box in self.boxes[self.ghosts]]
-        found += [Lie("moved", box[:2]) for box in self.boxes[self.displaced]]
-        return found + [Lie("gone", place) for place in self.holes]
+        """All that somebody may be to blame for."""
+        ghosts = [Lie("ghost", box[:2]) for box in self.boxes[self.ghosts] if box[5] >= CRISP_SCORE]
+        moved = [Lie("moved", box[:2]) for box in self.boxes[self.displaced]]
+        return ghosts + moved + [Lie("gone", place) for place in self.holes]
 
     def odds_at(self, places: FloatArray) -> FloatArray:
         """Logarithm of the odds (n,) of the best box at each place (n, 2)."""
@@ -291,10 +298,3 @@ class Shown:
         inside = (np.abs(along) <= length) & (np.abs(across) <= boxes[:, 3] / 2 + RIM_M)
         covered: BoolArray = np.atleast_1d(inside.any(axis=1))
         return covered
-
-
-def _vouched(supporting: BoolArray, agents: Sequence[str], suspects: Collection[str]) -> BoolArray:
-    """Which places (n,) one of the agents supports, ``supporting`` (agents, n), who is no suspect, or two."""
-    others = np.array([name not in suspects for name in agents])
-    vouched: BoolArray = supporting[others].any(axis=0) | (supporting.sum(axis=0) >= 2)
-    return vouched

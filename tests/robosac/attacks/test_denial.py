@@ -89,8 +89,8 @@ def test_a_hidden_ghost_stands_where_it_is_denied_least_and_stays_there():
 
 
 def test_of_all_free_places_honest_messages_deny_that_of_a_hidden_ghost_least(detector):
-    (met,) = Encounters(detector, IntersectionScene(2)).sequence(1, "ghost-hidden", ["car-3"])
-    (other,) = Encounters(detector, IntersectionScene(2)).sequence(1, "ghost", ["car-3"])
+    (met,) = Encounters(detector, IntersectionScene(4)).sequence(1, "ghost-hidden", ["car-3"])
+    (other,) = Encounters(detector, IntersectionScene(4)).sequence(1, "ghost", ["car-3"])
     said = witness_of(detector.info).testify(EGO, {EGO: met.ego, **met.benign}).of([EGO, *met.honest])
     hidden, plain = (Claims.of(frame.lies[0].box[None, :5], said).likelihood.sum() for frame in (met, other))
     assert hidden >= plain

@@ -7,6 +7,7 @@ from robosac.boxes import pairwise_iou
 from robosac.calibration.places import (
     FREE_PLACES,
     JITTER_M,
+    NEAR_PLACES,
     OBSERVED_HITS,
     OWN_BODY_M,
     STANDARD,
@@ -82,11 +83,11 @@ def test_without_returns_nothing_is_hit(points):
 
 def test_places_are_where_vehicles_are_and_where_none_is():
     frame = IntersectionScene(1600).frame(0)
-    known = places(frame, "car-2", 32.0, np.random.default_rng(0))
     truth = frame.truth("car-2")[:, :5]
+    known = places(frame.views["car-2"], truth, 32.0, np.random.default_rng(0))
     vehicles = known.vehicle > 0
     assert 0 < vehicles.sum() <= len(truth)
-    assert 0.6 * FREE_PLACES < (~vehicles).sum() <= FREE_PLACES
+    assert 0.6 * FREE_PLACES < (~vehicles).sum() - NEAR_PLACES <= FREE_PLACES
     for box in known.box[vehicles]:
         assert (np.abs(truth - box).max(axis=1) < 1e-9).any()
     assert np.hypot(*(known.at - known.box[:, :2])[vehicles].T).max() < 5 * JITTER_M
@@ -102,6 +103,27 @@ def test_places_are_where_vehicles_are_and_where_none_is():
 
 def test_the_same_draws_give_the_same_places():
     frame = IntersectionScene(1600).frame(0)
-    one, again, other = (places(frame, "rsu", 32.0, np.random.default_rng(seed)) for seed in (1, 1, 2))
+    view, truth = frame.views["rsu"], frame.truth("rsu")[:, :5]
+    one, again, other = (places(view, truth, 32.0, np.random.default_rng(seed)) for seed in (1, 1, 2))
     np.testing.assert_array_equal(one.at, again.at)
     assert one.at.shape != other.at.shape or not np.array_equal(one.at, other.at)
+
+
+def test_some_free_places_are_right_beside_vehicles():
+    lone = np.array([[15.0, 5.0, *STANDARD[:2], 0.7]])
+    known = places(scan(), lone, 32.0, np.random.default_rng(0))
+    off = (known.at - lone[0, :2])[known.vehicle == 0] @ np.array(
+        [[np.cos(0.7), -np.sin(0.7)], [np.sin(0.7), np.cos(0.7)]]
+    )
+    near = (np.abs(off) < np.array([6.5, 4.5]) + 4 * JITTER_M).all(axis=1)
+    assert near.sum() >= NEAR_PLACES
+    aside = np.abs(off[near, 1])[np.abs(off[near, 0]) < 3.0]
+    assert len(aside) >= 3
+    assert aside.min() > STANDARD[1]
+    assert aside.min() < 3.5
+
+
+def test_where_no_vehicle_is_places_are_anywhere():
+    known = places(scan(), np.zeros((0, 5)), 32.0, np.random.default_rng(0))
+    assert len(known.at) > 0
+    assert not known.vehicle.any()

@@ -40,10 +40,12 @@ class World:
         self.testimony = saying(known)
         self.shows = shows
         self.speed = speed
+        self.alone = SEEN
+        """What the ego sees alone."""
 
     def judge(self, subset, _, frame):
         boxes = np.vstack([SEEN, self.shows(subset)])
-        told = {"testimony": self.testimony, "alone": SEEN}
+        told = {"testimony": self.testimony, "alone": self.alone}
         pose = np.eye(4)
         pose[0, 3] = self.speed * frame
         return Outcome(subset, 0.93, Verdict.CONSENSUS, boxes, SEEN, pose, frame, **told)

@@ -10,7 +10,7 @@ from tests.robosac.testifying import SPREAD_M, saying
 
 PLACE = (10.0, 4.0)
 BOX = np.array([[*PLACE, 4.5, 1.9, 0.3, 0.9]])
-YES, NO = 6.0, -7.0
+YES, NO = 6.0, -8.0
 
 
 def claim(ego, *teammates):
@@ -63,7 +63,8 @@ def test_a_suspects_own_word_is_left_out_whatever_it_is():
         ((-3.2, -6.0, -1.0, YES), True),
         ((-2.0, -5.0, -5.0, YES), True),
         ((-5.2, -3.5, YES), True),  # the ego does not lie
-        ((-6.0, YES), True),  # the ego knows
+        ((-7.0, YES), True),  # the ego knows
+        ((-6.5, YES), False),  # not quite
         ((-3.5, -3.5, YES), False),  # too little in all
     ],
 )
@@ -95,6 +96,17 @@ def test_a_place_a_little_off_is_no_denial():
     claims = Claims.of(BOX, heard)
     assert claims.likelihood[0, 0] > heard.likelihood(BOX[:, :2])[0, 0] + 1
     assert claims.likelihood[1, 0] == pytest.approx(-MOST)
+
+
+@pytest.mark.parametrize(("aside", "found"), [(3.0, False), (-3.0, True), (5.0, True), (None, True)])
+def test_what_is_seen_toward_a_box_beside_speaks_for_that_one(aside, found):
+    """A witness speaks of what is just to the left of a box. Another box is there, or to the right, or far."""
+    ahead, left = np.array([np.cos(0.3), np.sin(0.3)]), np.array([-np.sin(0.3), np.cos(0.3)])
+    heard = saying({"": [], "a": [(*(PLACE + (SPREAD_M + 0.9 * AROUND_M) * left), YES)]})
+    others = BOX if aside is None else np.vstack([BOX, BOX + [*(aside * left + 0.1 * ahead), 0, 0, 0, 0]])
+    alone, beside = (Claims.of(BOX, heard, shown).likelihood[1, 0] for shown in (None, others))
+    assert alone >= SUPPORTS
+    assert beside == pytest.approx(alone) if found else beside < SUPPORTS - 1
 
 
 def test_claims_are_looked_up_where_each_witness_stands():

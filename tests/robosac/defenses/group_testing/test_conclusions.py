@@ -144,6 +144,40 @@ def test_beside_few_others_nobody_is_to_blame_for_what_is_gone():
     assert "gone" in concluded(ERASED, (*more, LIAR), more).lies.levels[LIAR]
 
 
+def suspected(world, answer):
+    """The suspicion of one of an answer, before and after it was decoded in a frame."""
+    found = Findings(knowledge(), Lies(), tuple(TEAM), ())
+    before = found.known.suspicion()[answer[0]]
+    found.learn(world.judge(answer, None, 0))
+    conclude(found, answer)
+    return before, found.known.suspicion()[answer[0]]
+
+
+@pytest.mark.parametrize(("seen_by_ego", "cleared"), [(True, True), (False, False)])
+def test_what_is_wrong_in_what_the_ego_sees_alone_is_nobodys_doing(seen_by_ego, cleared):
+    """A box that all deny is no reason not to clear those fused, nor to leave them out, if the ego shows it alone."""
+    world = World(dict.fromkeys(("car-2", "car-3", "rsu"), NO), lambda _: CAR)
+    world.alone = np.vstack([SEEN, CAR]) if seen_by_ego else SEEN
+    before, after = suspected(world, ("car-2", "rsu"))
+    assert (after < before) == cleared
+    found = concluded(world, ("car-2", "rsu"))
+    assert bool(found.lies_in(("car-2", "rsu"))) != seen_by_ego
+
+
+def test_a_hole_may_be_somebodys_doing_though_the_ego_misses_the_vehicle_too():
+    assert [lie.kind for lie in concluded(ERASED, ("car-2", "car-3", LIAR)).lies_in(("car-2", "car-3", LIAR))] == [
+        "gone"
+    ]
+
+
+@pytest.mark.parametrize(("score", "asked"), [(0.45, False), (0.55, True)])
+def test_nobody_is_asked_about_a_faint_box(score, asked):
+    """Nobody is to blame for one, so there is nothing to find out."""
+    faint = CAR * [1, 1, 1, 1, 1, 0] + [0, 0, 0, 0, 0, score]
+    world = World(dict.fromkeys(("car-2", "car-3", "rsu"), NO), with_liar(faint, CAR[:0]))
+    assert bool(concluded(world, (*TEAM,)).lies_in((*TEAM,))) == asked
+
+
 @pytest.mark.parametrize(("seen_by_others", "unsteady"), [(True, False), (False, True)])
 def test_who_flickers_where_others_see_vehicles_is_not_unsteady(seen_by_others, unsteady):
     knowing = {EGO, *TEAM} if seen_by_others else {LIAR}

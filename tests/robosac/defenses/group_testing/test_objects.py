@@ -7,7 +7,7 @@ import pytest
 
 from robosac.defenses.group_testing.differences import carried, effects, gone, misplaced
 from robosac.defenses.group_testing.objects import Hearing, Shown
-from tests.robosac.testifying import saying
+from tests.robosac.testifying import SPREAD_M, saying
 
 PLACE = np.array([10.4, 4.3])
 ELSEWHERE = np.array([-12.4, -7.3])
@@ -293,3 +293,12 @@ def test_a_vehicle_beside_one_that_is_shown_is_missed_too():
         known[name].append((*beside, YES))
     ((x, y),) = Shown(TEAM, car(), Hearing(saying(known), ())).holes
     assert np.hypot(x - beside[0], y - beside[1]) < 1.0
+
+
+@pytest.mark.parametrize(("score", "vouched"), [(0.9, False), (0.2, True)])
+def test_who_sees_a_vehicle_beside_a_box_does_not_speak_for_that_box(score, vouched):
+    """Unless nothing else is shown there: faint boxes are as good as none."""
+    ghost, car = np.array([[10.0, 0.0, 4.5, 1.9, 0.0, 0.9]]), np.array([[10.0, 3.0, 4.5, 1.9, 0.0, score]])
+    heard = saying({"": [], "a": [(10.0, SPREAD_M + 0.3, 6.0)]})
+    shown = Shown(("a",), np.vstack([ghost, car]), Hearing(heard, ()))
+    assert shown.claims.supporting[1, 0] == vouched
