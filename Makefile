@@ -5,6 +5,11 @@ OUT ?= out
 HOST ?= 127.0.0.1
 PORT ?= 8000
 
+# tests that take time themselves, or start several processes: nothing else should run beside them
+ALONE := $(addprefix tests/service/test_,$(addsuffix .py,adversary alone behind_a_proxy cluster connections deadlines \
+	fair_shares gathering live_page overload shared_database stalls turns)) tests/service/store/test_faults.py \
+	$(addprefix tests/clients/test_,$(addsuffix .py,adversary crash_test fleet flood load_test overload trial))
+
 .PHONY: help demo serve test fuzz lint format docs bench clean
 
 help:
@@ -23,8 +28,8 @@ serve: $(VENV)/.installed
 	$(BIN)/robosac serve --host $(HOST) --port $(PORT)
 
 test: $(VENV)/.installed-dev
-	$(BIN)/pytest -n 2 --dist loadfile --ignore tests/service --ignore tests/clients --ignore tests/test_docs.py
-	$(BIN)/pytest tests/service tests/clients tests/test_docs.py
+	$(BIN)/pytest -n 2 --dist loadfile $(ALONE:%=--ignore %)
+	$(BIN)/pytest $(ALONE)
 
 fuzz: $(VENV)/.installed-dev
 	ROBOSAC_FUZZ_CASES=4000 $(BIN)/pytest tests/fuzz

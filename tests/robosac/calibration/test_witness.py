@@ -7,11 +7,19 @@ import pytest
 import torch
 
 from robosac.calibration.places import OBSERVED_HITS, Places
-from robosac.calibration.witness import Lesson, WitnessRecipe, lessons, train, training_scenes, usual_size
+from robosac.calibration.witness import (
+    Lesson,
+    WitnessRecipe,
+    _partly_blocked,
+    lessons,
+    train,
+    training_scenes,
+    usual_size,
+)
 from robosac.calibration.witness_check import check
-from robosac.detectors import DetectorInfo, TensorSpec
+from robosac.detectors import DetectorInfo, Message, TensorSpec, load
 from robosac.detectors.witness import Layout, Witness, WitnessNetwork
-from robosac.scenes import IntersectionScene, SceneError
+from robosac.scenes import IntersectionScene, SceneError, View
 
 CELLS, HALF_EXTENT_M = 12, 12.0  # cells of 2 m
 RECIPE = WitnessRecipe(epochs=15, batch=8, learning_rate=1e-2, seed=1)
@@ -156,3 +164,31 @@ def test_lessons_are_all_agents_messages_and_what_is_there(detector):
 def test_recipes_that_cannot_be(settings):
     with pytest.raises(ValueError, match="must be at least 1"):
         WitnessRecipe(**settings)
+
+
+@pytest.mark.parametrize("seed", range(6))
+def test_a_partly_blocked_scan_lacks_one_sector(seed):
+    azimuth = np.linspace(-np.pi, np.pi, 3601)[:-1]
+    scan = View(np.eye(4), np.column_stack([9 * np.cos(azimuth), 9 * np.sin(azimuth), np.zeros_like(azimuth)]))
+    left = _partly_blocked(scan, np.random.default_rng(seed)).points
+    there = np.isin(scan.points[:, 0] + 100 * scan.points[:, 1], left[:, 0] + 100 * left[:, 1])
+    assert np.pi / 6 - 0.01 < 2 * np.pi * (1 - there.mean()) < 2 * np.pi
+    assert (np.diff(there.astype(int), append=int(there[0])) != 0).sum() == 2
+
+
+def test_a_recorded_message_is_not_blocked():
+    view = IntersectionScene(1600).frame(0).views["rsu"]
+    recorded = View(view.pose, view.points, message=Message(view.pose, {}))
+    assert _partly_blocked(recorded, np.random.default_rng(0)) is recorded
+
+
+def test_a_part_of_the_scans_to_learn_from_is_blocked(monkeypatch):
+    detector, scene = load(), IntersectionScene(1600)
+    layout, recipe = Layout.of(detector.info, 1.0), WitnessRecipe(frames_per_scene=2)
+    whole = {}
+    for share in (0.0, 1.0):
+        monkeypatch.setattr("robosac.calibration.witness.BLOCKED_SHARE", share)
+        whole[share] = lessons(detector, layout, [scene], recipe, lambda: None)
+    assert all((a.map != b.map).any() for a, b in zip(whole[0.0], whole[1.0], strict=True))
+    hits = {share: np.concatenate([lesson.places.hits for lesson in of]) for share, of in whole.items()}
+    assert (hits[1.0] == 0).mean() > (hits[0.0] == 0).mean() + 0.1
