@@ -128,6 +128,17 @@ def test_a_ghost_beside_a_car_is_given_up_where_it_gets_too_close(surface):
         np.testing.assert_allclose(again, second + [0, 3, 0, 0, 0], atol=1e-9)
 
 
+def test_a_ghost_beside_a_car_is_not_where_an_agent_is_nor_far_away(surface):
+    first, second = street(surface)
+    agent = first + [0, 6, 0, 0, 0]
+    met = Situation(truth=np.array([first, second]), poses={"a": pose_matrix(*agent[:2], 1.7, 0.0)})
+    strike(GhostBeside(steps=1), surface, met)
+    np.testing.assert_allclose(met.lies[0].box, second + [0, 3, 0, 0, 0], atol=1e-9)
+    leaving = [np.array([first + [x, 0, 0, 0, 0]]) for x in (0.0, 4.0)]
+    driven = [pose_matrix(-28.0 * n, 0.0, 1.7, 0.0) for n in range(2)]  # 32 m behind the car
+    assert [len(lies) for lies in frames(GhostBeside(steps=1), surface, leaving, driven)] == [1, 0]
+
+
 def far_aside():
     """An attack by its place."""
     return Displace(distance=2.1)

@@ -153,15 +153,26 @@ def suspected(world, answer):
     return before, found.known.suspicion()[answer[0]]
 
 
-@pytest.mark.parametrize(("seen_by_ego", "cleared"), [(True, True), (False, False)])
-def test_what_is_wrong_in_what_the_ego_sees_alone_is_nobodys_doing(seen_by_ego, cleared):
+@pytest.mark.parametrize(("aside", "nobodys"), [(0.0, True), (2.0, True), (4.0, False), (None, False)])
+def test_what_is_wrong_in_what_the_ego_sees_alone_is_nobodys_doing(aside, nobodys):
     """A box that all deny is no reason not to clear those fused, nor to leave them out, if the ego shows it alone."""
     world = World(dict.fromkeys(("car-2", "car-3", "rsu"), NO), lambda _: CAR)
-    world.alone = np.vstack([SEEN, CAR]) if seen_by_ego else SEEN
+    if aside is not None:
+        world.alone = np.vstack([SEEN, CAR + [aside, 0, 0, 0, 0, 0]])
+        world.testimony = saying(
+            {
+                name: [(*PLACE + [x, 0.0], NO if name in ("car-2", "car-3", "rsu") else 0.0) for x in (0.0, aside)]
+                for name in (EGO, *TEAM)
+            }
+        )
     before, after = suspected(world, ("car-2", "rsu"))
-    assert (after < before) == cleared
-    found = concluded(world, ("car-2", "rsu"))
-    assert bool(found.lies_in(("car-2", "rsu"))) != seen_by_ego
+    assert (after < before) == nobodys
+    assert bool(concluded(world, ("car-2", "rsu")).lies_in(("car-2", "rsu"))) != nobodys
+
+
+def test_a_hole_that_nothing_fills_keeps_nobody_from_being_cleared():
+    before, after = suspected(World({"car-2": YES, "car-3": YES}, nothing), ("rsu", "car-5"))
+    assert after < before
 
 
 def test_a_hole_may_be_somebodys_doing_though_the_ego_misses_the_vehicle_too():
