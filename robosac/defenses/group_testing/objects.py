@@ -53,9 +53,9 @@ AWAY = 2.5
 """A box is out of place if it is so many times farther from where witnesses see the vehicle than they may err."""
 IN_PLACE = 1.5
 """A box is in its place if it is at most so many times farther from where witnesses see it than they may err."""
-SLACK_ALONG_M = 0.15
-SLACK_ACROSS_M = 0.1
-"""Added to what a witness says it may err: senders are not quite where they say."""
+SLACK_ALONG_M = 0.25
+SLACK_ACROSS_M = 0.2
+"""Added to what a witness says it may err: senders are not quite where they say, nor are boxes where all is honest."""
 _LOWEST = 0.05
 
 

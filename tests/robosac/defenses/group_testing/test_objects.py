@@ -6,7 +6,7 @@ import numpy as np
 import pytest
 
 from robosac.defenses.group_testing.differences import carried, effects, gone, misplaced
-from robosac.defenses.group_testing.objects import Hearing, Shown
+from robosac.defenses.group_testing.objects import SLACK_ACROSS_M, Hearing, Shown
 from tests.robosac.testifying import SPREAD_M, saying
 
 PLACE = np.array([10.4, 4.3])
@@ -182,8 +182,9 @@ def test_boxes_that_are_moved_a_little_are_misplaced_by_the_word_of_two_others(s
     heard = hearing(**said)
     near = Shown(("a", "b", "c"), np.vstack([car(off=(0.0, 0.1)), REST]), heard)
     aside = Shown(TEAM, np.vstack([car(off=(0.0, 0.5)), REST]), heard)
-    assert misplaced(aside, near, ["d"]) == pytest.approx(0.4 / 0.3 / np.sqrt(2) if some else 0.0, abs=0.1)
-    assert misplaced(near, aside, ["d"]) == pytest.approx(-0.4 / 0.3 / np.sqrt(2) if some else 0.0, abs=0.1)
+    grown = 0.4 / (0.2 + SLACK_ACROSS_M) / np.sqrt(2) if some else 0.0
+    assert misplaced(aside, near, ["d"]) == pytest.approx(grown, abs=0.1)
+    assert misplaced(near, aside, ["d"]) == pytest.approx(-grown, abs=0.1)
     far = Shown(TEAM, np.vstack([car(off=(0.0, 1.4)), REST]), heard)
     assert misplaced(far, near, ["d"]) == pytest.approx(
         2.0 / np.sqrt(2) if some else 0.0
