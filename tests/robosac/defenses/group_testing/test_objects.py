@@ -299,7 +299,6 @@ def test_a_vehicle_beside_one_that_is_shown_is_missed_too():
 @pytest.mark.parametrize(("score", "vouched"), [(0.9, False), (0.2, True)])
 def test_who_sees_a_vehicle_beside_a_box_does_not_speak_for_that_box(score, vouched):
     """Unless nothing else is shown there: faint boxes are as good as none."""
-    ghost, car = np.array([[10.0, 0.0, 4.5, 1.9, 0.0, 0.9]]), np.array([[10.0, 3.0, 4.5, 1.9, 0.0, score]])
+    boxes = np.array([[10.0, 0.0, 4.5, 1.9, 0.0, 0.9], [10.0, 3.0, 4.5, 1.9, 0.0, score]])
     heard = saying({"": [], "a": [(10.0, SPREAD_M + 0.3, 6.0)]})
-    shown = Shown(("a",), np.vstack([ghost, car]), Hearing(heard, ()))
-    assert shown.claims.supporting[1, 0] == vouched
+    assert Shown(("a",), boxes, Hearing(heard, ())).claims.supporting[1, 0] == vouched
