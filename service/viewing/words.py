@@ -29,6 +29,8 @@ LIES = {
     "moved": ("vehicle moved", "vehicles moved"),
     "late": ("vehicle moved along itself", "vehicles moved along themselves"),
     "veiled": ("change that its own message denies", "changes that its own message denies"),
+    "alone": ("vehicle removed that one other sees", "vehicles removed that one other sees"),
+    "straying": ("move of many vehicles by a little", "moves of many vehicles by a little"),
 }
 
 

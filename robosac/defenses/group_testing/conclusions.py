@@ -3,16 +3,17 @@
 from __future__ import annotations
 
 from collections import Counter
-from collections.abc import Sequence
+from collections.abc import Mapping, Sequence
 from dataclasses import replace
 
 import numpy as np
 
 from robosac.defenses.group_testing.differences import SAME_LIE_M, blame
 from robosac.defenses.group_testing.findings import UNHEARD, Findings, one_out
-from robosac.defenses.group_testing.lies import Word
+from robosac.defenses.group_testing.lies import AUDIT_FRAMES, Word
 from robosac.defenses.group_testing.model import CELLS, CLEAN, LIE
 from robosac.defenses.group_testing.objects import Lie
+from robosac.defenses.group_testing.straying import strays
 from robosac.defenses.protocol import Hypothesis
 
 CLEARING = 1.5
@@ -37,6 +38,7 @@ def conclude(found: Findings, answer: Hypothesis) -> None:
     comparisons = _comparisons(found)
     heard = [name for name in found.team if name not in found.unheard]
     frame = found.known.memory.frame
+    asked: dict[str, tuple[Hypothesis, Hypothesis]] = {}
     for joined, shown in found.shown.items():
         done = {
             suspect: found.effects(joined, without, (suspect,))
@@ -46,8 +48,8 @@ def conclude(found: Findings, answer: Hypothesis) -> None:
         for suspect, lies in blame(done, shown).items():
             others = len(heard) - (suspect in heard)
             enough = len(joined) > max(1, min(FEWEST_BESIDE, others))
-            if enough:
-                found.lies.audited[suspect] = frame
+            if enough and len(joined) > len(asked.get(suspect, ((), ()))[0]):
+                asked[suspect] = joined, tuple(name for name in joined if name != suspect)
             counting = [lie for lie in lies if enough or lie.counts_as == "ghost"]
             counting = [lie for lie in counting if found.calm or not lie.veiled]
             counting = _borne_out(found, suspect, counting, others)
@@ -56,6 +58,7 @@ def conclude(found: Findings, answer: Hypothesis) -> None:
     for name, lie in _together(found, answer):
         blamed[name].append(lie)
     conflicts = _conflicts(found, answer)
+    straying = _straying(found, asked)
     _leave_alone(found, answer)
     _clear(found)
     for name in found.team:
@@ -66,9 +69,11 @@ def conclude(found: Findings, answer: Hypothesis) -> None:
             counts[kind] = found.lies.counting(name, kind, places, frame)
             if any(lie.said for lie in of_kind):
                 counts[kind] = 1
-        weight = found.lies.add(name, counts)
+        weight, kinds = found.lies.add(name, counts), Counter(lie.counts_as for lie in blamed[name])
+        if straying.get(name, 0.0) > weight:  # no displacement counts twice
+            weight, kinds["straying"] = straying[name], 1
         if weight:
-            _accuse(found, name, weight, blamed[name], sum(conflicts.get(name, {}).values()))
+            _accuse(found, name, weight, kinds, blamed[name], sum(conflicts.get(name, {}).values()))
 
 
 def _borne_out(found: Findings, suspect: str, lies: Sequence[Lie], others: int) -> list[Lie]:
@@ -129,18 +134,34 @@ def _leave_alone(found: Findings, answer: Hypothesis) -> None:
     """What is wrong in the answer without anybody's doing: everybody was left out lately, or a hole is no loss. A hole
     that nobody speaks of who is fused tells nothing.
     """
+    if answer not in found.shown or not found.lies_in(answer):
+        return
     frame = found.known.memory.frame
     for name in one_out(answer, found.decoded):
         found.lies.left_out[name] = frame
     lying = any(found.lies.worst(name) for name in found.team)
     everybody = not lying and all(found.lies.recently_left_out(name, frame) for name in answer)
-    for lie in found.unexplained(answer) if answer in found.shown else ():
+    for lie in found.unexplained(answer):
         witnesses = found.supporters(answer, lie) if lie.kind == "gone" else ()
         if lie.kind == "gone" and not witnesses:
             continue
         tested = lie.kind == "gone" and witnesses in found.decoded
         if everybody or (tested and not found.is_real(answer, witnesses, lie)):
             found.lies.leave_alone(found.placed(lie.place), frame)
+
+
+def _straying(found: Findings, asked: Mapping[str, tuple[Hypothesis, Hypothesis]]) -> dict[str, float]:
+    """What it adds to suspicion how much each of those strays who were left out of a fusion (`asked`), where it adds
+    anything.
+    """
+    memory, weights = found.known.memory, dict[str, float]()
+    for name, (joined, without) in asked.items():
+        anew = memory.frame - found.lies.audited.get(name, -AUDIT_FRAMES) >= AUDIT_FRAMES
+        by = strays(found.shown[joined], found.shown[without], name)
+        if weight := memory.straying.learn(name, by, anew=anew):
+            weights[name] = weight
+        found.lies.audited[name] = memory.frame
+    return weights
 
 
 def _comparisons(found: Findings) -> dict[tuple[Hypothesis, Hypothesis], str]:
@@ -158,10 +179,11 @@ def _comparisons(found: Findings) -> dict[tuple[Hypothesis, Hypothesis], str]:
     }
 
 
-def _accuse(found: Findings, name: str, weight: float, lies: Sequence[Lie], conflicts: int) -> None:
+def _accuse(
+    found: Findings, name: str, weight: float, kinds: Mapping[str, int], lies: Sequence[Lie], conflicts: int
+) -> None:
     """A piece of evidence on one teammate: all kinds of attack explain it alike."""
-    kinds = len(found.known.model.kinds)
-    log_likelihood = np.zeros(CLEAN + CELLS * kinds)
+    log_likelihood = np.zeros(CLEAN + CELLS * len(found.known.model.kinds))
     log_likelihood[CLEAN:] = weight * max(LEAST_CALM, found.known.memory.steadiness.calm)
     before = found.known.suspicion()[name]
     nobody, one = found.known.rows([(), (name,)])
@@ -175,7 +197,7 @@ def _accuse(found: Findings, name: str, weight: float, lies: Sequence[Lie], conf
             "frame": found.known.memory.frame,
             "test": "objects",
             "teammates": [name],
-            "kinds": dict(sorted(Counter(lie.counts_as for lie in lies).items())),
+            "kinds": dict(sorted(kinds.items())),
             "conflicts": conflicts,
             "places": places,
             "log_likelihood_ratio": round(float(ratio), 3),
@@ -189,7 +211,8 @@ def _clear(found: Findings) -> None:
     """
     largest_first = sorted(found.shown, key=len, reverse=True)
     best = next((subset for subset in largest_first if not _wrong(found, subset)), ())
-    cleared = tuple(name for name in best if not found.lies.worst(name))
+    straying = found.known.memory.straying
+    cleared = tuple(name for name in best if not found.lies.worst(name) and not straying.rising(name))
     if not cleared:
         return
     model = found.known.model

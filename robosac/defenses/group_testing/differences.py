@@ -12,7 +12,8 @@ import numpy as np
 
 from robosac.boxes import BoolArray, FloatArray, IntArray, pairwise_iou
 from robosac.defenses.group_testing.claims import DENIES, SUPPORTS, WEIGHTY, two_witnesses
-from robosac.defenses.group_testing.objects import AWAY, CERTAIN, CRISP_SCORE, PLACED_SCORE, SHOWN_SCORE, Lie, Shown
+from robosac.defenses.group_testing.hearing import CERTAIN
+from robosac.defenses.group_testing.objects import AWAY, CRISP_SCORE, PLACED_SCORE, SHOWN_SCORE, Lie, Shown
 
 OWN_DENIES = -4.0
 """Whose own message denies a place so far is not to blame for a box there."""
@@ -113,14 +114,23 @@ def _grown(joined: Shown, without: Shown, joining: Collection[str]) -> tuple[Flo
     now, before = joined.away(joining), without.away(joining)
     placed = (joined.boxes[:, 5] >= PLACED_SCORE) & (now > 0.0)
     known = (without.boxes[:, 5] >= PLACED_SCORE) & (before > 0.0)
-    here, there = joined.boxes[placed, :2], without.boxes[known, :2]
-    if not len(there):
-        return here[:0], now[:0]
-    apart = np.hypot(*np.moveaxis(here[:, None] - there[None], -1, 0))
-    near, same = apart.min(axis=1) <= SAME_BOX_M, apart.argmin(axis=1)
+    here, there = same_boxes(joined, without, placed, known)
     most = 2 * MOST_AWAY
-    grown = np.minimum(now[placed], most) - np.minimum(before[known][same], most)
-    return here[near], np.clip(grown[near], -MOST_AWAY, MOST_AWAY)
+    grown = np.minimum(now[here], most) - np.minimum(before[there], most)
+    return joined.boxes[here, :2], np.clip(grown, -MOST_AWAY, MOST_AWAY)
+
+
+def same_boxes(joined: Shown, without: Shown, placed: BoolArray, known: BoolArray) -> tuple[IntArray, IntArray]:
+    """Boxes of a fusion, of those (n,) that are ``placed``, for which another one shows the same vehicle: their places
+    there, and those of the nearest ones here, of those (m,) that are ``known``; (k,) each.
+    """
+    now, before = np.flatnonzero(placed), np.flatnonzero(known)
+    if not len(now) or not len(before):
+        return now[:0], before[:0]
+    x, y = (joined.boxes[now, None, axis] - without.boxes[before, axis] for axis in (0, 1))
+    apart = np.hypot(x, y)
+    near = apart.min(axis=1) <= SAME_BOX_M
+    return now[near], before[apart.argmin(axis=1)[near]]
 
 
 def carried(joined: Shown, without: Shown, suspects: Collection[str]) -> IntArray:

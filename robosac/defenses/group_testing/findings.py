@@ -10,9 +10,10 @@ import numpy as np
 from robosac.boxes import FloatArray
 from robosac.defenses.group_testing.claims import SUPPORTS
 from robosac.defenses.group_testing.differences import SAME_LIE_M, effects, gone
+from robosac.defenses.group_testing.hearing import REACH_M, Hearing
 from robosac.defenses.group_testing.knowledge import Knowledge
 from robosac.defenses.group_testing.lies import Lies
-from robosac.defenses.group_testing.objects import REACH_M, Hearing, Lie, Shown
+from robosac.defenses.group_testing.objects import Lie, Shown
 from robosac.defenses.protocol import Difference, Hypothesis, Outcome
 from robosac.testimony import Testimony
 

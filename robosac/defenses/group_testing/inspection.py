@@ -9,13 +9,12 @@ import numpy as np
 from robosac.defenses.group_testing.candidates import UNRESOLVED
 from robosac.defenses.group_testing.conclusions import conclude
 from robosac.defenses.group_testing.findings import Findings, one_out
+from robosac.defenses.group_testing.lies import AUDIT_FRAMES
 from robosac.defenses.group_testing.objects import Lie, Shown
 from robosac.defenses.group_testing.posterior import EXACT
 from robosac.defenses.group_testing.standing import Judged, judge
 from robosac.defenses.protocol import Difference, Hypothesis, Outcome
 
-AUDIT_FRAMES = 40
-"""After so many frames a teammate of the answer is left out again, to see what it does."""
 SUSPECT = 0.5
 """Who is suspected more than this, and not named, is asked again each frame, so as to be cleared or named."""
 
@@ -52,7 +51,8 @@ class Inspection:
 
     def _questions(self, answer: Hypothesis) -> Iterator[Hypothesis]:
         """What is worth decoding, in this order: those to be asked again; whether what is missing is real; the answer
-        without all that vouch for a lie, if they are several; without each, the likeliest first.
+        without all that vouch for a lie, if they are several; without each, the likeliest first; without those who may
+        stray, and those whose turn it is.
         """
         yield from self._again(answer)
         if answer not in self._found.shown:
@@ -71,7 +71,8 @@ class Inspection:
                 yield self._without(answer, *group)
         # the answer may change within a frame, and nobody would be left out of the same one
         self._whole = answer if self._whole is None else self._whole
-        yield from (self._without(self._whole, name) for name in self._due(self._whole))
+        again = self._found.known.memory.straying.to_be_asked(self._whole)
+        yield from (self._without(self._whole, name) for name in (*again, *self._due(self._whole)))
 
     def conclude(self, answer: Hypothesis) -> None:
         """Who lied in this frame; the posterior learns it, and memory keeps it."""

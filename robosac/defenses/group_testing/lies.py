@@ -36,6 +36,13 @@ class Rule:
     always. A lie that the sender's own message tells, too, counts always (`objects.Lie.said`).
     """
 
+    def after(self, level: float, highest: float, count: float) -> tuple[float, float, float]:
+        """A level after a frame with so many lies, the highest since it was 0, and what new steps add to suspicion."""
+        level = max(0.0, level + self.gain * min(count, self.most) - self.drift)
+        level = min(level, MOST_LEVEL * self.names)
+        weight = sum(w for step, w in self.weights if highest < step <= level)
+        return round(level, 4), round(max(level, highest), 4) if level else 0.0, weight
+
 
 RULES: Mapping[str, Rule] = {
     "ghost": Rule(1.5, 1, 0.5, 3.0, ((1.0, 5.0), (2.0, 2.0), (3.0, 3.0))),
@@ -58,6 +65,8 @@ RECENT_FRAMES = 3
 QUIET_M = 3.0
 """Places nearer than this are one, metres."""
 MOST_QUIET = 32
+AUDIT_FRAMES = 40
+"""After so many frames a teammate of the answer is left out again, to see what it does."""
 PLACE_FRAMES = 50
 """See `Rule.times`."""
 
@@ -84,9 +93,9 @@ class Lies:
     counted, and how often it has counted since.
     """
     left_out: dict[str, int] = field(default_factory=dict)
-    """By teammate: the frame of the session in which an answer was last decoded without it, to see what it does."""
+    """By teammate: the frame of the session in which something was wrong, and an answer was last decoded without it."""
     audited: dict[str, int] = field(default_factory=dict)
-    """The same for a fusion of enough others to tell."""
+    """By teammate: the frame in which it was last left out of a fusion of enough others to tell what it does."""
     accusers: dict[str, dict[str, int]] = field(default_factory=dict)
     """By teammate: who said that it moves vehicles, and how often."""
 
@@ -120,13 +129,10 @@ class Lies:
         known = self.levels.setdefault(teammate, {})
         weight = 0.0
         for kind, rule in RULES.items():
-            before, highest = known.get(kind, (0.0, 0.0))
-            level = max(0.0, before + rule.gain * min(counts.get(kind, 0), rule.most) - rule.drift)
-            level = min(level, MOST_LEVEL * rule.names)
-            weight += sum(w for step, w in rule.weights if highest < step <= level)
-            known.pop(kind, None)
+            level, highest, added = rule.after(*known.pop(kind, (0.0, 0.0)), counts.get(kind, 0))
+            weight += added
             if level:
-                known[kind] = (round(level, 4), round(max(level, highest), 4))
+                known[kind] = level, highest
         if not known:
             del self.levels[teammate]
         return weight

@@ -15,6 +15,7 @@ from robosac.boxes import FloatArray
 from robosac.defenses.group_testing.lies import Lies
 from robosac.defenses.group_testing.steadiness import Steadiness
 from robosac.defenses.group_testing.strangeness import Strangeness
+from robosac.defenses.group_testing.straying import Straying
 
 REPEAT_MEMORY = 60
 """Frames after which a test counts as new."""
@@ -78,6 +79,7 @@ class Memory:
     """That frame's number, as its outcomes gave it."""
     lies: Lies = field(default_factory=Lies)
     """About objects."""
+    straying: Straying = field(default_factory=Straying)
     steadiness: Steadiness = field(default_factory=Steadiness)
     strangeness: Strangeness = field(default_factory=Strangeness)
 
@@ -124,6 +126,7 @@ class Memory:
         """Remember who left."""
         self.evidence.pop(teammate, None)
         self.lies.forget(teammate)
+        self.straying.forget(teammate)
         self.steadiness.levels.pop(teammate, None)
         self.left[teammate] = (suspicion, self.frame)
         while len(self.left) > MAX_LEFT:  # not by their order, which a state that was stored has lost
@@ -146,6 +149,7 @@ class Memory:
             "shown": {f"{key:016x}": decimals.as_text(boxes.ravel(), 6) for key, boxes in self.shown.items()},
             "shown_in": self.shown_in,
             "lies": self.lies.to_state(),
+            "straying": self.straying.to_state(),
             "steadiness": self.steadiness.to_state(),
             "strangeness": self.strangeness.to_state(),
         }
@@ -162,6 +166,7 @@ class Memory:
             shown={int(key, 16): _boxes(kept) for key, kept in state.get("shown", {}).items()},
             shown_in=int(state.get("shown_in", 0)),
             lies=Lies.from_state(state["lies"]) if "lies" in state else Lies(),
+            straying=Straying.from_state(state.get("straying", {})),
             steadiness=Steadiness.from_state(state["steadiness"]) if "steadiness" in state else Steadiness(),
             strangeness=Strangeness.from_state(state.get("strangeness", ())),
         )

@@ -6,12 +6,12 @@ import pytest
 from robosac.defenses import EGO
 from robosac.defenses.group_testing import GroupTesting, GroupTestingSettings
 from robosac.defenses.group_testing.findings import Findings
+from robosac.defenses.group_testing.hearing import Hearing
 from robosac.defenses.group_testing.inspection import Inspection
 from robosac.defenses.group_testing.knowledge import Knowledge
 from robosac.defenses.group_testing.lies import Lies
 from robosac.defenses.group_testing.memory import Memory
 from robosac.defenses.group_testing.model import CELLS, CLEAN
-from robosac.defenses.group_testing.objects import Hearing
 from robosac.defenses.group_testing.posterior import Posterior
 from tests.robosac.defenses.group_testing.conversing import TEAM, make_model
 from tests.robosac.defenses.group_testing.one_place import (

@@ -6,7 +6,8 @@ import numpy as np
 import pytest
 
 from robosac.defenses.group_testing.differences import carried, effects, gone, misplaced
-from robosac.defenses.group_testing.objects import SLACK_ACROSS_M, Hearing, Shown
+from robosac.defenses.group_testing.hearing import Hearing
+from robosac.defenses.group_testing.objects import SLACK_ACROSS_M, Shown
 from tests.robosac.testifying import SPREAD_M, saying
 
 PLACE = np.array([10.4, 4.3])

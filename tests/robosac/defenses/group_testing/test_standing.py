@@ -6,7 +6,8 @@ import pytest
 from robosac.answers import Standing, Support
 from robosac.defenses import EGO
 from robosac.defenses.group_testing import GroupTesting, GroupTestingSettings
-from robosac.defenses.group_testing.objects import Hearing, Shown
+from robosac.defenses.group_testing.hearing import Hearing
+from robosac.defenses.group_testing.objects import Shown
 from robosac.defenses.group_testing.standing import judge
 from tests.robosac.defenses.group_testing.conversing import TEAM
 from tests.robosac.defenses.group_testing.one_place import (

@@ -1,0 +1,82 @@
+"""What all messages of a frame say: of places, and of where vehicles stand."""
+
+from __future__ import annotations
+
+from collections.abc import Collection
+from functools import cached_property
+
+import numpy as np
+
+from robosac.boxes import FloatArray
+from robosac.defenses.group_testing.claims import CONFLICT_OWN, WEIGHTY, Claims, two_witnesses
+from robosac.testimony import Testimony
+
+STANDING_SUM = 10.0
+"""A vehicle stands where the sum of L is so much."""
+CERTAIN = 4.0
+"""From this L on, two teammates or the ego know that a vehicle stands in a place."""
+REACH_M = 2.2
+"""A box is at a place if it is centred so near."""
+APART_M = 3.0
+"""Vehicles are so far apart."""
+OWN_M = 3.0
+"""What is centred so near the ego's sensor is the ego."""
+EDGE_M = 1.0
+"""What is centred so near the edge of the ego's map may be beyond it."""
+
+
+class Hearing:
+    """What all messages of a frame say, and what decoded fusions are worth by that.
+
+    Parameters
+    ----------
+    testimony : Testimony
+    unheard : collection of str
+        Those whose testimony counts for nothing.
+    """
+
+    def __init__(self, testimony: Testimony, unheard: Collection[str]) -> None:
+        self.everybody = testimony
+        self.heard = testimony.of([name for name in testimony.agents if name not in unheard])
+        self._said: dict[bytes, FloatArray] = {}
+
+    def said(self, place: FloatArray) -> FloatArray:
+        """What everybody says of a place (2,), heard or not: (agents,)."""
+        asked = place.tobytes()
+        if asked not in self._said:
+            self._said[asked] = self.everybody.likelihood(place[None])[:, 0]
+        return self._said[asked]
+
+    def alone(self, agent: str, unheard: Collection[str]) -> int:
+        """In how many places, `APART_M` apart, an agent sees a vehicle against the word of all who are heard."""
+        over, places = self.everybody.over_ego, self.everybody.ego_places()
+        index = self.everybody.agents.index(agent)
+        rows, columns = np.nonzero(over[index] >= CONFLICT_OWN)
+        said = np.minimum(np.maximum(over[:, rows, columns], -WEIGHTY), WEIGHTY)
+        supported, _ = Claims(places[rows, columns], self.everybody.agents, said).in_conflict(unheard)
+        surest = np.argsort(-over[index, rows, columns], kind="stable")
+        left, count = places[rows, columns][surest[supported[index, surest]]], 0
+        while len(left):
+            left, count = left[np.hypot(*(left - left[0]).T) > APART_M], count + 1
+        return count
+
+    @cached_property
+    def standing(self) -> FloatArray:
+        """Centres (k, 2) of vehicles that the ego, or two teammates, know of, and all together without the one who
+        denies them most. The surest come first; of one vehicle there may be many.
+
+        What no fusion shows is none of them: the ego itself, which others see, and what is centred at the edge of its
+        map or beyond.
+        """
+        rows, columns = np.nonzero(two_witnesses(self.heard.over_ego >= CERTAIN))
+        over = np.minimum(np.maximum(self.heard.over_ego[:, rows, columns], -WEIGHTY), WEIGHTY)
+        total = over.sum(axis=0) - np.minimum(over[1:].min(axis=0, initial=0.0), 0.0)
+        enough = np.flatnonzero(total >= STANDING_SUM)
+        order = enough[np.argsort(-total[enough], kind="stable")]
+        places = self.heard.ego_places()[rows[order], columns[order]]
+        supporting = over[:, order] >= CERTAIN
+        centres = self.heard.centres(places, supporting)
+        far, outermost = np.hypot(*centres.T), np.abs(centres).max(axis=1, initial=0.0)
+        shown = (far > OWN_M) & (outermost <= self.heard.half_extent_m - EDGE_M)
+        standing: FloatArray = centres[shown & (np.hypot(*(centres - places).T) <= REACH_M)]
+        return standing

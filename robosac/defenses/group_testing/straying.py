@@ -1,0 +1,130 @@
+"""Who moves many vehicles a little: each by less than testimony can place it, all together by more than chance.
+
+One frame cannot tell. What honest messages do to the places of boxes differs from frame to frame, and goes either way.
+What an attacker does adds up.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Iterable, Mapping
+from dataclasses import dataclass, field
+from typing import Any
+
+import numpy as np
+
+from robosac.boxes import FloatArray
+from robosac.defenses.group_testing.differences import same_boxes
+from robosac.defenses.group_testing.lies import Rule
+from robosac.defenses.group_testing.objects import PLACED_SCORE, SLACK_ACROSS_M, SLACK_ALONG_M, Shown
+
+OWN_WORD = 0.7
+"""What it counts where boxes end up by a teammate's own word, beside the word of others. Honest messages pull boxes to
+where their senders see the vehicles, be their poses right or wrong.
+"""
+LEAST_RISE = -1.2
+"""Neither word takes off more than this: a message is no better for being wrong about all places alike."""
+MOST_RISE = 2.0
+"""What a single box counts, at most, in either direction."""
+FEW = 4
+"""Added to the number of boxes: where there are few, they tell little."""
+FEWEST_WITNESSES = 2
+"""Boxes count by the word of so many others, at least."""
+RULE = Rule(1.0, 1, 0.1, 1.5, ((0.75, 2.0), (1.0, 3.0), (1.5, 4.0)), malice=False)
+"""How the levels grow. Nobody is named for it: whoever is late, or wrong about its pose, strays as well."""
+HEAD_START = 0.5
+"""Whoever was not left out for long begins at this level, so that it is looked at again until it has proved harmless
+(Lucas and Crosier, Fast Initial Response for CUSUM Quality-Control Schemes, Technometrics 24, 1982).
+"""
+MOST_AT_ONCE = 2
+"""So many are looked at again in a frame, at most."""
+
+
+def strays(joined: Shown, without: Shown, suspect: str) -> float:
+    """How much farther boxes are from where witnesses see the vehicles than they are without a teammate.
+
+    With d the distance of a box from the median of where those who support it see the vehicle, in units of
+    `SLACK_ALONG_M` and `SLACK_ACROSS_M`, a box counts what ``ln(1 + d^2)`` grows by. Of n boxes this is the sum by the
+    square root of n + 4: by the word of all others, and .7 of the same by the suspect's own word. For honest messages
+    the first is around 0 and the second below; whoever moves boxes against its own word is above in both. One of four
+    others that lies about the places moves no median far.
+
+    Boxes of score >= .4 count that are in both fusions, and that two others support there, or the suspect.
+    """
+    now, before = same_boxes(joined, without, *(shown.boxes[:, 5] >= PLACED_SCORE for shown in (joined, without)))
+    centres = (joined.seen.centre[:, now] + without.seen.centre[:, before]) / 2  # not a number where one has none
+    own = np.array([name == suspect for name in joined.claims.witnesses])
+    boxes, others, total = joined.boxes[now], without.boxes[before], 0.0
+    for said, fewest, worth in ((centres[~own], FEWEST_WITNESSES, 1.0), (centres[own], 1, OWN_WORD)):
+        counts = (~np.isnan(said[..., 0])).sum(axis=0) >= fewest
+        if counts.any():
+            rise = _rise(boxes[counts], others[counts], _median(said[:, counts]))
+            total += worth * max(rise, LEAST_RISE)
+    return total
+
+
+def _median(places: FloatArray) -> FloatArray:
+    """The median (n, 2) of places (witnesses, n, 2) along each axis, of those that are numbers: at least one."""
+    ranked, count = np.sort(places, axis=0), (~np.isnan(places)).sum(axis=0)
+    low, high = (np.take_along_axis(ranked, at[None], axis=0)[0] for at in ((count - 1) // 2, count // 2))
+    median: FloatArray = (low + high) / 2
+    return median
+
+
+def _rise(now: FloatArray, before: FloatArray, places: FloatArray) -> float:
+    """What ``ln(1 + d^2)`` grows by, over boxes (n, 6) of two fusions and the places (n, 2) of their vehicles."""
+    cos, sin = np.cos(before[:, 4]), np.sin(before[:, 4])
+    logarithms = []
+    for boxes in (now, before):
+        x, y = (boxes[:, :2] - places).T
+        along, across = (x * cos + y * sin) / SLACK_ALONG_M, (y * cos - x * sin) / SLACK_ACROSS_M
+        logarithms.append(np.log1p(along**2 + across**2))
+    grown = np.minimum(np.maximum(logarithms[0] - logarithms[1], -MOST_RISE), MOST_RISE)
+    return float(grown.sum() / np.sqrt(len(grown) + FEW))
+
+
+@dataclass
+class Straying:
+    """Mutable while a frame is judged."""
+
+    levels: dict[str, tuple[float, float]] = field(default_factory=dict)
+    """By teammate: a cumulative sum of what it `strays`, as `RULE` has it, and the highest since it was 0."""
+
+    def learn(self, teammate: str, by: float, *, anew: bool) -> float:
+        """Take in how much a teammate strays; what new levels add to its suspicion, which takes two frames.
+
+        Parameters
+        ----------
+        teammate : str
+        by : float
+            See `strays`.
+        anew : bool
+            Whether it was not left out for long.
+        """
+        level, highest = self.levels.pop(teammate, (HEAD_START, 0.0) if anew else (0.0, 0.0))
+        level, reached, weight = RULE.after(level, highest, by)
+        if level:
+            self.levels[teammate] = level, highest if anew else reached
+        return 0.0 if anew else weight
+
+    def rising(self, teammate: str) -> bool:
+        """Whether there is so much against a teammate that it adds to suspicion."""
+        return self.levels.get(teammate, (0.0, 0.0))[0] >= RULE.weights[0][0]
+
+    def to_be_asked(self, teammates: Iterable[str]) -> list[str]:
+        """Who of these is to be left out again, the worst first."""
+        return sorted((name for name in teammates if name in self.levels), key=lambda name: -self.levels[name][0])[
+            :MOST_AT_ONCE
+        ]
+
+    def forget(self, teammate: str) -> None:
+        """It left."""
+        self.levels.pop(teammate, None)
+
+    def to_state(self) -> dict[str, Any]:
+        """JSON values that `from_state` reads."""
+        return {name: list(pair) for name, pair in self.levels.items()}
+
+    @classmethod
+    def from_state(cls, state: Mapping[str, Any]) -> Straying:
+        """What `to_state` wrote."""
+        return cls({str(name): (float(level), float(highest)) for name, (level, highest) in state.items()})

@@ -1,0 +1,132 @@
+"""Who moves many vehicles a little, over the frames."""
+
+import json
+from dataclasses import replace
+
+import numpy as np
+import pytest
+
+from robosac.defenses import EGO
+from robosac.defenses.group_testing.hearing import Hearing
+from robosac.defenses.group_testing.objects import SLACK_ACROSS_M, Shown
+from robosac.defenses.group_testing.straying import (
+    FEW,
+    HEAD_START,
+    LEAST_RISE,
+    MOST_AT_ONCE,
+    MOST_RISE,
+    OWN_WORD,
+    RULE,
+    Straying,
+    strays,
+)
+from tests.robosac.defenses.group_testing.conversing import TEAM
+from tests.robosac.defenses.group_testing.one_place import HONEST, LIAR, SEEN, YES, World, nothing
+from tests.robosac.testifying import saying
+
+ASIDE_M = 0.055
+"""Too little for testimony to tell of one box, or of all in one frame."""
+OTHERS = tuple(name for name in TEAM if name != LIAR)
+
+
+def aside(boxes, by=ASIDE_M):
+    return boxes + [0, by, 0, 0, 0, 0]
+
+
+def strayed(by, seen=(), speaking=(EGO, *TEAM)):
+    """How much the liar strays that moves all boxes by so much; agents may see the vehicles elsewhere."""
+    places = [(x, y, YES) for x, y in SEEN[:, :2]]
+    testimony = saying({name: places if name in speaking else [] for name in (EGO, *TEAM)}, seen=dict(seen))
+    hearing = Hearing(testimony, ())
+    return strays(Shown(TEAM, aside(SEEN, by), hearing), Shown(OTHERS, SEEN, hearing), LIAR)
+
+
+def growth(by):
+    """What all boxes count together, of which each was in its place."""
+    return min(np.log1p((by / SLACK_ACROSS_M) ** 2), MOST_RISE) * len(SEEN) / np.sqrt(len(SEEN) + FEW)
+
+
+def test_what_moves_against_the_word_of_others_and_its_own_counts_by_both():
+    assert strayed(0.1) == pytest.approx((1 + OWN_WORD) * growth(0.1), rel=0.01)
+    assert strayed(0.0) == pytest.approx(0.0, abs=0.01)
+
+
+@pytest.mark.parametrize("by", [0.1, 0.8])
+def test_whose_own_word_goes_along_is_wrong_about_its_pose_and_counts_less(by):
+    own = OWN_WORD * max(-growth(by), LEAST_RISE)
+    assert strayed(by, {LIAR: SEEN[:, :2] + [0, by]}) == pytest.approx(growth(by) + own, rel=0.02)
+
+
+def test_one_liar_among_the_others_moves_no_median():
+    """It says that all vehicles are where an honest teammate does not have them."""
+    honest = strayed(0.05)
+    assert strayed(0.05, {"car-2": SEEN[:, :2] - [0, 1.0]}) == pytest.approx(honest, abs=0.05)
+
+
+@pytest.mark.parametrize("speaking", [(), ("car-2",)])
+def test_fewer_than_two_others_tell_nothing(speaking):
+    assert strayed(0.1, speaking=speaking) == 0.0
+
+
+class Shifting(World):
+    """Whoever fuses the liar has all vehicles a little aside."""
+
+    def judge(self, subset, *rest):
+        outcome = super().judge(subset, *rest)
+        return replace(outcome, boxes=aside(outcome.boxes)) if LIAR in subset else outcome
+
+
+def test_who_strays_frame_after_frame_is_left_out_and_not_named():
+    met = Shifting({}, nothing).play(20)
+    assert LIAR in met[0][0].accepted
+    assert all(LIAR not in decision.accepted for decision, _ in met[5:])
+    assert all(set(OTHERS) <= set(decision.accepted) for decision, _ in met)
+    assert not any(decision.named for decision, _ in met)
+    last, _ = met[-1]
+    kinds = [item["kinds"] for item in last.state["memory"]["evidence"][LIAR] if item["test"] == "objects"]
+    assert kinds
+    assert all(kind == {"straying": 1} for kind in kinds)
+
+
+def test_the_honest_are_asked_again_until_they_proved_harmless_and_no_longer():
+    met = HONEST.play(20)
+    asked = [sum(len(subset) == len(TEAM) - 1 for subset in tested) for _, tested in met]
+    assert asked[2] == MOST_AT_ONCE == max(asked[2:])
+    assert not any(asked[17:])
+    assert met[-1][0].state["memory"]["straying"] == {}
+    assert all(set(decision.accepted) == set(TEAM) for decision, _ in met)
+
+
+def test_one_frame_does_not_tell():
+    straying = Straying()
+    assert straying.learn(LIAR, 5.0, anew=True) == 0.0
+    assert straying.rising(LIAR)
+    level = HEAD_START + RULE.most - RULE.drift
+    assert straying.levels[LIAR] == (pytest.approx(level), 0.0)
+    assert straying.learn(LIAR, 0.0, anew=False) == sum(w for step, w in RULE.weights if step <= level - RULE.drift)
+    assert straying.learn(LIAR, 0.0, anew=False) == 0.0
+
+
+def test_whoever_pulls_boxes_to_their_places_is_cleared():
+    straying = Straying()
+    straying.learn(LIAR, 0.0, anew=True)
+    assert straying.to_be_asked(TEAM) == [LIAR]
+    straying.learn(LIAR, -1.0, anew=False)
+    assert straying.to_be_asked(TEAM) == []
+    straying.learn(LIAR, 0.3, anew=False)
+    assert straying.levels[LIAR][0] == pytest.approx(0.3 - RULE.drift)
+
+
+def test_the_worst_few_are_asked_first():
+    straying = Straying({name: (level, level) for name, level in zip(TEAM, (0.2, 0.7, 0.1, 0.9, 0.3), strict=True)})
+    assert straying.to_be_asked(TEAM) == [TEAM[3], TEAM[1]]
+    assert straying.to_be_asked(TEAM[:1]) == [TEAM[0]]
+
+
+def test_levels_are_kept_and_forgotten():
+    straying = Straying()
+    straying.learn(LIAR, 0.4, anew=True)
+    kept = Straying.from_state(json.loads(json.dumps(straying.to_state())))
+    assert kept == straying
+    kept.forget(LIAR)
+    assert kept == Straying()
