@@ -71,8 +71,8 @@ class Inspection:
                 yield self._without(answer, *group)
         # the answer may change within a frame, and nobody would be left out of the same one
         self._whole = answer if self._whole is None else self._whole
-        again = self._found.known.memory.straying.to_be_asked(self._whole)
-        yield from (self._without(self._whole, name) for name in (*again, *self._due(self._whole)))
+        again = (*self._straying(self._whole), *self._due(self._whole))
+        yield from (self._without(self._whole, name) for name in again)
 
     def conclude(self, answer: Hypothesis) -> None:
         """Who lied in this frame; the posterior learns it, and memory keeps it."""
@@ -118,6 +118,12 @@ class Inspection:
     @staticmethod
     def _without(answer: Hypothesis, *group: str) -> Hypothesis:
         return tuple(name for name in answer if name not in group)
+
+    def _straying(self, whole: Hypothesis) -> list[str]:
+        """Who may stray: in larger teams, where all take too many passes, those against whom there is something."""
+        straying = self._found.known.memory.straying
+        large = len(self._found.team) > EXACT
+        return [name for name in straying.to_be_asked(whole) if straying.rising(name) or not large]
 
     def _due(self, whole: Hypothesis) -> list[str]:
         """Who is to be left out although nothing seems wrong, to see what it takes away: all that never were, and one
