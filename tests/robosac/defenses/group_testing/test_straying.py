@@ -6,9 +6,17 @@ from dataclasses import replace
 import numpy as np
 import pytest
 
-from robosac.defenses import EGO
+from robosac.answers import Verdict
+from robosac.defenses import EGO, Outcome
+from robosac.defenses.group_testing.conclusions import conclude
+from robosac.defenses.group_testing.findings import Findings
 from robosac.defenses.group_testing.hearing import Hearing
+from robosac.defenses.group_testing.inspection import Inspection
+from robosac.defenses.group_testing.knowledge import Knowledge
+from robosac.defenses.group_testing.lies import Lies
+from robosac.defenses.group_testing.memory import Memory
 from robosac.defenses.group_testing.objects import SLACK_ACROSS_M, Shown
+from robosac.defenses.group_testing.posterior import Posterior
 from robosac.defenses.group_testing.straying import (
     FEW,
     HEAD_START,
@@ -21,7 +29,7 @@ from robosac.defenses.group_testing.straying import (
     strays,
 )
 from tests.robosac.defenses.group_testing.conversing import TEAM
-from tests.robosac.defenses.group_testing.one_place import HONEST, LIAR, SEEN, YES, World, nothing
+from tests.robosac.defenses.group_testing.one_place import HONEST, LIAR, MODEL, SEEN, YES, World, nothing
 from tests.robosac.testifying import saying
 
 ASIDE_M = 0.055
@@ -68,6 +76,15 @@ def test_fewer_than_two_others_tell_nothing(speaking):
     assert strayed(0.1, speaking=speaking) == 0.0
 
 
+def test_of_two_others_each_counts_half():
+    seen = {EGO: SEEN[:, :2] - [0, 0.1], "car-2": SEEN[:, :2] + [0, 0.1]}
+    assert strayed(0.1, seen, speaking=(EGO, "car-2")) == pytest.approx(growth(0.1), rel=0.01)
+
+
+def test_boxes_of_different_vehicles_are_not_compared():
+    assert strayed(2.0) == 0.0
+
+
 class Shifting(World):
     """Whoever fuses the liar has all vehicles a little aside."""
 
@@ -95,6 +112,37 @@ def test_the_honest_are_asked_again_until_they_proved_harmless_and_no_longer():
     assert not any(asked[17:])
     assert met[-1][0].state["memory"]["straying"] == {}
     assert all(set(decision.accepted) == set(TEAM) for decision, _ in met)
+
+
+@pytest.mark.parametrize(("beside", "learned"), [(1, False), (3, True)])
+def test_beside_few_others_one_message_changes_too_much_to_tell(beside, learned):
+    memory, world = Memory(), Shifting({}, nothing)
+    found = Findings(Knowledge(MODEL, Posterior(len(MODEL.kinds), 0.5, 0.25, TEAM), memory), Lies(), TEAM, ())
+    small = OTHERS[:beside]
+    large = tuple(name for name in TEAM if name in {*small, LIAR})
+    for subset in (small, large):
+        found.learn(world.judge(subset, None, 0))
+    conclude(found, large)
+    assert (LIAR in memory.straying.levels) == learned
+
+
+@pytest.mark.parametrize(("size", "level", "asked"), [(6, 0.3, True), (8, 0.3, False), (8, 0.8, True)])
+def test_of_a_large_team_only_those_are_asked_again_against_whom_there_is_something(size, level, asked):
+    team = tuple(f"v{i}" for i in range(size))
+    posterior = Posterior(len(MODEL.kinds), 1e-3, 0.25, team)
+    memory = Memory(straying=Straying({"v1": (level, level)}))
+    found = Findings(Knowledge(MODEL, posterior, memory), Lies(audited=dict.fromkeys(team, 0)), team, ())
+    testimony = saying({name: [(x, y, YES) for x, y in SEEN[:, :2]] for name in (EGO, *team)})
+    told = {"testimony": testimony, "alone": SEEN}
+    found.learn(Outcome(team, 0.93, Verdict.CONSENSUS, SEEN, SEEN, np.eye(4), 0, **told))
+    without = tuple(name for name in team if name != "v1")
+    assert Inspection(found, keep_contradicted=False).next_test(team) == (without if asked else None)
+
+
+def test_who_leaves_is_forgotten():
+    memory = Memory(straying=Straying({LIAR: (0.7, 0.7)}))
+    memory.leave(LIAR, 0.1)
+    assert memory.straying == Straying()
 
 
 def test_one_frame_does_not_tell():
