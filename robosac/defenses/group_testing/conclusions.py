@@ -71,6 +71,7 @@ def conclude(found: Findings, answer: Hypothesis) -> None:
                 counts[kind] = 1
         weight, kinds = found.lies.add(name, counts), Counter(lie.counts_as for lie in blamed[name])
         if straying.get(name, 0.0) > weight:  # no displacement counts twice
+            found.known.memory.straying.note(name, (straying[name] - weight) * _worth(found))
             weight, kinds["straying"] = straying[name], 1
         if weight:
             _accuse(found, name, weight, kinds, blamed[name], sum(conflicts.get(name, {}).values()))
@@ -184,7 +185,7 @@ def _accuse(
 ) -> None:
     """A piece of evidence on one teammate: all kinds of attack explain it alike."""
     log_likelihood = np.zeros(CLEAN + CELLS * len(found.known.model.kinds))
-    log_likelihood[CLEAN:] = weight * max(LEAST_CALM, found.known.memory.steadiness.calm)
+    log_likelihood[CLEAN:] = weight * _worth(found)
     before = found.known.suspicion()[name]
     nobody, one = found.known.rows([(), (name,)])
     found.known.posterior.update(nobody, one, log_likelihood)
@@ -203,6 +204,11 @@ def _accuse(
             "log_likelihood_ratio": round(float(ratio), 3),
         },
     )
+
+
+def _worth(found: Findings) -> float:
+    """What evidence on objects counts for, by how steady the ego is."""
+    return max(LEAST_CALM, found.known.memory.steadiness.calm)
 
 
 def _clear(found: Findings) -> None:

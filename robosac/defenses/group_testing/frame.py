@@ -108,7 +108,7 @@ class JudgedFrame:
         named = [
             name
             for name, p in suspicion.items()
-            if p >= CLEARED_BELOW and (name in named_before or self._is_attacker(name, p > naming_bound))
+            if p >= CLEARED_BELOW and (name in named_before or self._is_attacker(name, p, naming_bound))
         ]
         believed = self._trusted.union(*(o.teammates for o in outcomes if self._verified(o)))
         trusted = [name for name, p in suspicion.items() if name in believed and p <= TRUSTED_BELOW]
@@ -122,14 +122,21 @@ class JudgedFrame:
         differences = (*self._evidence.differences, *inspection.differences)
         return Decision(accepted, source, rejected, ratio, state, suspicion, objects, contradicted, differences)
 
-    def _is_attacker(self, name: str, certain: bool) -> bool:
-        """Whether a teammate is to be named: it lied about objects too often, or it is suspected for certain by several
-        tests and its own fusions are too unsteady.
+    def _is_attacker(self, name: str, suspicion: float, naming_bound: float) -> bool:
+        """Whether a teammate is to be named: it is suspected, and lied about objects too often; or it is suspected for
+        certain by several tests, and its own fusions are too unsteady. Nobody is suspected here for straying.
         """
         memory = self._known.memory
+        suspicion = memory.straying.without(name, suspicion)
+        if suspicion < CLEARED_BELOW:
+            return False
         if memory.lies.guilt(name) >= (1.0 if memory.steadiness.calm >= CALM else UNSTEADY_LEVELS):
             return True
-        return certain and memory.subsets_against(name) >= SUBSETS_TO_NAME and memory.steadiness.names(name)
+        return (
+            suspicion > naming_bound
+            and memory.subsets_against(name) >= SUBSETS_TO_NAME
+            and memory.steadiness.names(name)
+        )
 
     def _best_answer(self) -> tuple[Hypothesis, float, Source]:
         """Of the decoded subsets that may be answered, the most useful; the ego alone if none is of use."""

@@ -6,6 +6,7 @@ What an attacker does adds up.
 
 from __future__ import annotations
 
+import math
 from collections.abc import Iterable, Mapping
 from dataclasses import dataclass, field
 from typing import Any
@@ -88,6 +89,8 @@ class Straying:
 
     levels: dict[str, tuple[float, float]] = field(default_factory=dict)
     """By teammate: a cumulative sum of what it `strays`, as `RULE` has it, and the highest since it was 0."""
+    weights: dict[str, float] = field(default_factory=dict)
+    """By teammate: what has been added to the logarithm of the odds that it attacks, since its level was 0."""
 
     def learn(self, teammate: str, by: float, *, anew: bool) -> float:
         """Take in how much a teammate strays; what new levels add to its suspicion, which takes two frames.
@@ -104,7 +107,19 @@ class Straying:
         level, reached, weight = RULE.after(level, highest, by)
         if level:
             self.levels[teammate] = level, highest if anew else reached
+        else:
+            self.weights.pop(teammate, None)
         return 0.0 if anew else weight
+
+    def note(self, teammate: str, weight: float) -> None:
+        """Note what has been added to a teammate's suspicion for straying alone."""
+        if teammate in self.levels:
+            self.weights[teammate] = round(self.weights.get(teammate, 0.0) + weight, 4)
+
+    def without(self, teammate: str, suspicion: float) -> float:
+        """A teammate's suspicion as it were without what straying has added."""
+        kept = (1.0 - suspicion) * math.exp(self.weights.get(teammate, 0.0))
+        return suspicion / (suspicion + kept)
 
     def rising(self, teammate: str) -> bool:
         """Whether there is so much against a teammate that it adds to suspicion."""
@@ -119,12 +134,14 @@ class Straying:
     def forget(self, teammate: str) -> None:
         """It left."""
         self.levels.pop(teammate, None)
+        self.weights.pop(teammate, None)
 
     def to_state(self) -> dict[str, Any]:
         """JSON values that `from_state` reads."""
-        return {name: list(pair) for name, pair in self.levels.items()}
+        return {name: [*pair, self.weights.get(name, 0.0)] for name, pair in self.levels.items()}
 
     @classmethod
     def from_state(cls, state: Mapping[str, Any]) -> Straying:
         """What `to_state` wrote."""
-        return cls({str(name): (float(level), float(highest)) for name, (level, highest) in state.items()})
+        levels = {str(name): (float(level), float(highest)) for name, (level, highest, _) in state.items()}
+        return cls(levels, {str(name): float(weight) for name, (_, _, weight) in state.items() if weight})

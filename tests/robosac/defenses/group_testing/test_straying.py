@@ -100,6 +100,8 @@ def test_who_strays_frame_after_frame_is_left_out_and_not_named():
     assert all(set(OTHERS) <= set(decision.accepted) for decision, _ in met)
     assert not any(decision.named for decision, _ in met)
     last, _ = met[-1]
+    added = last.state["memory"]["straying"][LIAR][2]
+    assert added == pytest.approx(sum(weight for _, weight in RULE.weights))
     kinds = [item["kinds"] for item in last.state["memory"]["evidence"][LIAR] if item["test"] == "objects"]
     assert kinds
     assert all(kind == {"straying": 1} for kind in kinds)
@@ -155,6 +157,18 @@ def test_one_frame_does_not_tell():
     assert straying.learn(LIAR, 0.0, anew=False) == 0.0
 
 
+def test_nobody_is_named_for_what_straying_adds():
+    straying = Straying({LIAR: (1.2, 1.2)})
+    straying.note(LIAR, 3.0)
+    straying.note(LIAR, 2.0)
+    assert straying.without(LIAR, 0.99) == pytest.approx(0.99 / (0.99 + 0.01 * np.exp(5.0)))
+    assert straying.without(OTHERS[0], 0.99) == pytest.approx(0.99)
+    straying.learn(LIAR, -2.0, anew=False)
+    assert straying == Straying()
+    straying.note(LIAR, 3.0)
+    assert straying == Straying()
+
+
 def test_whoever_pulls_boxes_to_their_places_is_cleared():
     straying = Straying()
     straying.learn(LIAR, 0.0, anew=True)
@@ -174,7 +188,10 @@ def test_the_worst_few_are_asked_first():
 def test_levels_are_kept_and_forgotten():
     straying = Straying()
     straying.learn(LIAR, 0.4, anew=True)
+    straying.note(LIAR, 2.0)
+    straying.learn("rsu", 0.2, anew=True)
     kept = Straying.from_state(json.loads(json.dumps(straying.to_state())))
     assert kept == straying
-    kept.forget(LIAR)
+    for name in (LIAR, "rsu"):
+        kept.forget(name)
     assert kept == Straying()
