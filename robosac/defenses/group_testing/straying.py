@@ -127,9 +127,8 @@ class Straying:
 
     def to_be_asked(self, teammates: Iterable[str]) -> list[str]:
         """Who of these is to be left out again, the worst first."""
-        return sorted((name for name in teammates if name in self.levels), key=lambda name: -self.levels[name][0])[
-            :MOST_AT_ONCE
-        ]
+        straying = [name for name in teammates if name in self.levels]
+        return sorted(straying, key=lambda name: -self.levels[name][0])[:MOST_AT_ONCE]
 
     def forget(self, teammate: str) -> None:
         """It left."""
