@@ -9,12 +9,15 @@ import pytest
 from robosac.answers import Verdict
 from robosac.defenses import EGO, Outcome
 from robosac.defenses.group_testing.conclusions import conclude
+from robosac.defenses.group_testing.evidence import Evidence
 from robosac.defenses.group_testing.findings import Findings
+from robosac.defenses.group_testing.frame import JudgedFrame
 from robosac.defenses.group_testing.hearing import Hearing
 from robosac.defenses.group_testing.inspection import Inspection
 from robosac.defenses.group_testing.knowledge import Knowledge
 from robosac.defenses.group_testing.lies import Lies
 from robosac.defenses.group_testing.memory import Memory
+from robosac.defenses.group_testing.model import CELLS, CLEAN
 from robosac.defenses.group_testing.objects import SLACK_ACROSS_M, Shown
 from robosac.defenses.group_testing.posterior import Posterior
 from robosac.defenses.group_testing.straying import (
@@ -167,6 +170,19 @@ def test_nobody_is_named_for_what_straying_adds():
     assert straying == Straying()
     straying.note(LIAR, 3.0)
     assert straying == Straying()
+
+
+@pytest.mark.parametrize("added", [0.0, 9.0])
+def test_a_liar_is_named_only_if_more_than_straying_makes_it_suspected(added):
+    posterior = Posterior(len(MODEL.kinds), 0.5, 0.25, TEAM)
+    memory = Memory(lies=Lies(levels={LIAR: {"ghost": (9.0, 9.0)}}))
+    memory.straying = Straying({LIAR: (1.0, 1.0)}, {LIAR: added})
+    accusing = np.repeat([0.0, 6.0], [CLEAN, CELLS * len(MODEL.kinds)])
+    posterior.update(*(np.array([name in of for name in posterior.members]) for of in ((), (LIAR,))), accusing)
+    known = Knowledge(MODEL, posterior, memory)
+    frame = JudgedFrame(known, Evidence(known), TEAM, frozenset())
+    inspection = Inspection(Findings(known, memory.lies, TEAM, ()), keep_contradicted=False)
+    assert frame.decide(frozenset(), 0.99, inspection).named == (() if added else (LIAR,))
 
 
 def test_whoever_pulls_boxes_to_their_places_is_cleared():
