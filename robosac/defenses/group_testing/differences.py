@@ -36,6 +36,8 @@ SHOWN_IOU = 0.3
 """A box shows a vehicle from this IoU on. A vehicle half of its length ahead of itself is lost where it is."""
 CARRIED_M = (1.0, 4.0)
 """A vehicle is carried off by so much."""
+ASIDE_M = 1.0
+"""Whoever is late carries a vehicle at most so far across itself."""
 
 
 def effects(joined: Shown, without: Shown, suspects: Sequence[str]) -> list[Lie]:
@@ -46,6 +48,8 @@ def effects(joined: Shown, without: Shown, suspects: Sequence[str]) -> list[Lie]
     - ``gone``: a box without them where the others support a vehicle, and with them no box shows it (`gone`);
     - ``moved``: a box that is out of place, and without them less so. If it is so along itself only, it may be late. So
       it may if many boxes together are `misplaced`, each a little. Or a box that they have `carried` off.
+
+    What is gone or carried off may be late, too, where a box shows it along itself and they see it there.
     """
     contradicted = joined.claims.contradicted_by_others(suspects)
     ghosts = (contradicted | joined.on_nobodys_word) & (joined.boxes[:, 5] >= CRISP_SCORE)
@@ -53,17 +57,15 @@ def effects(joined: Shown, without: Shown, suspects: Sequence[str]) -> list[Lie]
     drop = joined.odds_at(grown[:, :2]) - without.odds_at(grown[:, :2])
     veiled = (own <= OWN_DENIES) | ~contradicted[ghosts]
     found = [Lie("ghost", grown[i, :2], bool(veiled[i])) for i in np.flatnonzero(drop >= EFFECT)]
-    which = gone(joined, without, suspects)
-    lost, own = without.boxes[which], without.own(suspects)[:, which].min(axis=0)
-    drop = without.odds_at(lost[:, :2]) - joined.odds_at(lost[:, :2])
-    taken = np.flatnonzero((lost[:, 5] >= CRISP_SCORE) & (drop >= GONE_EFFECT))
-    found += [Lie("gone", lost[i, :2], bool(own[i] >= SUPPORTS), said=bool(own[i] <= DENIES)) for i in taken]
+    farther = _farther(joined, without)
+    late = set(farther[1, _may_be_late(joined, without, farther, suspects)].tolist())
+    found += _taken(joined, without, suspects, late)
     found += [Lie("gone", without.boxes[i, :2], alone=True) for i in gone_alone(joined, without, suspects)]
     away, aside, other = joined.away(suspects), joined.away(suspects, across=True), without.away(suspects)
-    farther: dict[int, int] = dict(_farther(joined, without).T.tolist())
+    counterpart: dict[int, int] = dict(farther.T.tolist())
     for index in np.flatnonzero((away >= AWAY) & (joined.boxes[:, 5] >= PLACED_SCORE) & ~ghosts).tolist():
         same = _at(without, joined.boxes[index])
-        same = farther.get(index) if same is None else same
+        same = counterpart.get(index) if same is None else same
         if same is not None and 0.0 < other[same] <= away[index] - AWAY_EFFECT:
             by, along = joined.accusers(index, suspects), bool(aside[index] < AWAY)
             found.append(Lie("moved", joined.boxes[index, :2], along=along, by=by))
@@ -71,11 +73,22 @@ def effects(joined: Shown, without: Shown, suspects: Sequence[str]) -> list[Lie]
         both = joined.boxes[index, :2], without.boxes[at, :2]
         if all(np.hypot(*(lie.place - place)) > SAME_LIE_M for lie in found for place in both):
             by = _speaking_for(joined, index, without, at, suspects)
-            found.append(Lie("moved", joined.boxes[index, :2], by=by))
+            found.append(Lie("moved", joined.boxes[index, :2], along=at in late, by=by))
     if all(lie.kind != "moved" for lie in found) and misplaced(joined, without, suspects) >= ADRIFT:
         places, grown = _grown(joined, without, suspects)
         found.append(Lie("moved", places[grown.argmax()], along=True))
     return found
+
+
+def _taken(joined: Shown, without: Shown, suspects: Sequence[str], late: Collection[int]) -> list[Lie]:
+    """Lies of the kind ``gone``; which boxes without the suspects a late message may have carried off is given."""
+    which = gone(joined, without, suspects)
+    lost, own = without.boxes[which], without.own(suspects)[:, which].min(axis=0)
+    drop = without.odds_at(lost[:, :2]) - joined.odds_at(lost[:, :2])
+    return [
+        Lie("gone", lost[i, :2], bool(own[i] >= SUPPORTS), along=int(which[i]) in late, said=bool(own[i] <= DENIES))
+        for i in np.flatnonzero((lost[:, 5] >= CRISP_SCORE) & (drop >= GONE_EFFECT))
+    ]
 
 
 def blame(found: Mapping[str, Sequence[Lie]], joined: Shown) -> dict[str, list[Lie]]:
@@ -160,6 +173,18 @@ def _farther(joined: Shown, without: Shown) -> IntArray:
     same = (apart.argmin(axis=0)[nearest] == np.arange(len(before))) & (far >= CARRIED_M[0]) & (far <= CARRIED_M[1])
     farther: IntArray = np.stack([now[nearest[same]], before[same]])
     return farther
+
+
+def _may_be_late(joined: Shown, without: Shown, pairs: IntArray, suspects: Sequence[str]) -> BoolArray:
+    """Which vehicles (k,), by their boxes (2, k) in two fusions, are carried along themselves only, to where the
+    suspects' own messages see them, rather than where they are without those: so does a message that is late.
+    """
+    there, here = joined.boxes[pairs[0]], without.boxes[pairs[1]]
+    x, y = here[:, 0] - there[:, 0], here[:, 1] - there[:, 1]
+    across = np.abs(y * np.cos(there[:, 4]) - x * np.sin(there[:, 4]))
+    own = joined.own(suspects)[:, pairs[0]].max(axis=0)
+    late: BoolArray = (across <= ASIDE_M) & (own >= SUPPORTS) & (own >= without.own(suspects)[:, pairs[1]].max(axis=0))
+    return late
 
 
 def _speaking_for(joined: Shown, index: int, without: Shown, at: int, suspects: Collection[str]) -> tuple[str, ...]:
