@@ -5,10 +5,15 @@ OUT ?= out
 HOST ?= 127.0.0.1
 PORT ?= 8000
 
-# tests that take time themselves, or start several processes: nothing else should run beside them
-ALONE := $(addprefix tests/service/test_,$(addsuffix .py,adversary alone behind_a_proxy cluster connections deadlines \
-	fair_shares gathering live_page overload shared_database stalls turns)) tests/service/store/test_faults.py \
-	$(addprefix tests/clients/test_,$(addsuffix .py,adversary crash_test fleet flood load_test overload trial))
+# tests that start several processes, a browser, a cluster or a database server: they come after the others
+SEVERAL := $(addprefix tests/,$(addsuffix .py,clients/test_crash_test service/test_cluster service/test_live_page \
+	clients/test_fleet service/test_behind_a_proxy clients/test_trial))
+# tests that take time themselves: nothing else should run beside them
+ALONE := $(addprefix tests/service/test_,$(addsuffix .py,adversary alone connections deadlines fair_shares gathering \
+	overload shared_database stalls turns)) tests/service/store/test_faults.py \
+	$(addprefix tests/clients/test_,$(addsuffix .py,adversary flood load_test overload))
+
+IN_TWO := -n 2 --dist loadfile --no-loadscope-reorder
 
 .PHONY: help demo serve test fuzz lint format docs bench clean
 
@@ -28,7 +33,8 @@ serve: $(VENV)/.installed
 	$(BIN)/robosac serve --host $(HOST) --port $(PORT)
 
 test: $(VENV)/.installed-dev
-	$(BIN)/pytest -n 2 --dist loadfile $(ALONE:%=--ignore %)
+	$(BIN)/pytest $(IN_TWO) $(patsubst %,--ignore %,$(SEVERAL) $(ALONE))
+	$(BIN)/pytest $(IN_TWO) $(SEVERAL)
 	$(BIN)/pytest $(ALONE)
 
 fuzz: $(VENV)/.installed-dev

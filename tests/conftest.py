@@ -11,7 +11,14 @@ from tests.recorded import moments
 
 GOLDEN = Path(__file__).parent / "golden"
 
+LONGEST = ("test_own", "test_training", "test_experiments", "test_words", "test_worlds", "test_remembering")
+"""Files that take long come first, or one process would be left with the last of them while the other has none."""
+
 torch.set_num_threads(1)
+
+
+def pytest_collection_modifyitems(items: list[pytest.Item]) -> None:
+    items.sort(key=lambda item: item.path.stem not in LONGEST)
 
 
 @pytest.fixture

@@ -4,16 +4,17 @@ import csv
 import io
 import os
 import re
-import subprocess
 import sys
 from pathlib import Path
 
 import httpx
 import pytest
 from rich.console import Console
+from typer.testing import CliRunner
 
 from clients.fleet import FleetOptions, run_fleet
 from clients.local_gateway import local_gateway
+from robosac.cli import app
 from robosac.defenses.group_testing import Calibration
 
 DOCS = Path(__file__).parents[1] / "docs"
@@ -36,8 +37,7 @@ def own(tmp_path, monkeypatch):
 
 
 def robosac(*arguments):
-    words = [sys.executable, "-c", "from robosac.cli import app; app()", *map(str, arguments)]
-    return subprocess.run(words, check=False, capture_output=True, text=True, timeout=300)
+    return CliRunner().invoke(app, [*map(str, arguments)], env={"COLUMNS": "200"})
 
 
 def said(done):
@@ -49,7 +49,7 @@ def test_all_four_are_compared(own):
     options = ["--detector", "my_detector:build", "--data", "my_data:Road", "--defense", "my_defense:RunningScore"]
     settings = ["--setting", "my_attack:Suppress:1", "--only", "one_by_one", "--scenes", 2, "--frames", 6, "--jobs", 2]
     done = robosac("compare", "--out", "out", *options, *settings)
-    assert done.returncode == 0, done.stderr
+    assert done.exit_code == 0, done.stderr
     with (own / "out" / "comparison.csv").open() as file:
         rows = {row["defense"]: row for row in csv.DictReader(file)}
     assert list(rows) == ["oracle", "one_by_one", "my_defense:RunningScore", "ego only"]
@@ -62,7 +62,7 @@ async def test_all_four_are_calibrated_served_and_driven(own, monkeypatch):
     attacks = ["--attack", "pgd", "--attack", "my_attack:Suppress", "--scenes", 16, "--check-scenes", 0]
     path = own / "my_detector.calibration.json"
     done = robosac("calibrate", *options, *attacks, "--out", path)
-    assert done.returncode == 0, done.stdout
+    assert done.exit_code == 0, done.stdout
     assert Calibration.read(path).recipe["data"] == "my_data:Road"
     monkeypatch.setenv("ROBOSAC_EXTRA_DETECTORS", "my_detector:build")
     monkeypatch.setenv("ROBOSAC_EXTRA_DEFENSES", "my_defense:RunningScore")
@@ -88,7 +88,7 @@ def test_data_can_be_disturbed_and_compared_with_itself(own):
     worlds = ["--world", "my_data:Road", "--world", "my_worlds:WetRoad"]
     short = ["--setting", "honest:0", "--only", "no defence", "--scenes", 2, "--frames", 6, "--jobs", 2]
     done = robosac("compare", *worlds, *short, "--out", "out")
-    assert done.returncode == 0, done.stderr
+    assert done.exit_code == 0, done.stderr
     with (own / "out" / "worlds.csv").open() as file:
         dry, wet = csv.DictReader(file)
     assert (dry["world"], wet["world"]) == ("my_data-Road", "my_worlds-WetRoad")
@@ -103,25 +103,25 @@ def test_data_can_be_disturbed_and_compared_with_itself(own):
 
 def test_what_cannot_be_is_said_before_the_work(own):
     shifting = robosac("calibrate", "--detector", "my_detector:build", "--data", "my_data:Road", "--out", "x.json")
-    assert shifting.returncode == 2
+    assert shifting.exit_code == 2
     assert "for --attack: invent cannot attack the detector occupancy-max: its attack surface lacks" in said(shifting)
     assert "It can be calibrated with the others: pgd, erase" in said(shifting)
     assert "frames" not in shifting.stdout
     few = ["--attack", "pgd", "--pose-error", 0, "--scenes", 2, "--check-scenes", 0, "--out", "x.json"]
     small = robosac("calibrate", "--detector", "my_detector:build", "--data", "my_data:Road", *few)
-    assert small.returncode == 2
+    assert small.exit_code == 2
     assert "for --scenes: 2 scenes are too few" in said(small)
     assert "take 6" in said(small)
     quick = ["--quick", "--scenes", 1, "--frames", 6, "--only", "one_by_one", "--only", "group_testing"]
     asked = robosac("compare", "--detector", "my_detector:build", "--out", "out", *quick)
-    assert asked.returncode == 2
+    assert asked.exit_code == 2
     assert "for --only: group_testing: the detector occupancy-max is not calibrated" in said(asked)
     short = ["--setting", "honest:0", "--scenes", 1, "--frames", 6, "--live"]
     rest = robosac("compare", "--detector", "my_detector:build", "--data", "my_data:Road", "--out", "out", *short)
-    assert rest.returncode == 0, rest.stderr
+    assert rest.exit_code == 0, rest.stderr
     assert "Left out: group_testing: the detector occupancy-max is not calibrated" in " ".join(rest.stdout.split())
     shifted = robosac("fleet", "--detector", "my_detector:build", "--data", "my_data:Road", "--attack", "shift")
-    assert shifted.returncode == 2
+    assert shifted.exit_code == 2
     assert "for --detector: shift cannot attack the detector occupancy-max" in said(shifted)
     many = robosac("evaluate", "--data", "my_data:Road", "--scenes", 1, "--collaborators", 3)
     assert "no 3 of 3 teammates can be free of 1 attackers" in said(many)

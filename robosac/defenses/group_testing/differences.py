@@ -36,8 +36,8 @@ SHOWN_IOU = 0.3
 """A box shows a vehicle from this IoU on. A vehicle half of its length ahead of itself is lost where it is."""
 CARRIED_M = (1.0, 4.0)
 """A vehicle is carried off by so much."""
-ASIDE_M = 1.0
-"""Whoever is late carries a vehicle at most so far across itself."""
+LATE_M, LATE_ACROSS_M = (1.0, 6.0), 1.0
+"""Whoever is late shows a vehicle so far ahead or behind, and at most so far across itself."""
 
 
 def effects(joined: Shown, without: Shown, suspects: Sequence[str]) -> list[Lie]:
@@ -57,37 +57,39 @@ def effects(joined: Shown, without: Shown, suspects: Sequence[str]) -> list[Lie]
     drop = joined.odds_at(grown[:, :2]) - without.odds_at(grown[:, :2])
     veiled = (own <= OWN_DENIES) | ~contradicted[ghosts]
     found = [Lie("ghost", grown[i, :2], bool(veiled[i])) for i in np.flatnonzero(drop >= EFFECT)]
-    farther = _farther(joined, without)
-    late = set(farther[1, _may_be_late(joined, without, farther, suspects)].tolist())
-    found += _taken(joined, without, suspects, late)
+    found += _taken(joined, without, suspects)
     found += [Lie("gone", without.boxes[i, :2], alone=True) for i in gone_alone(joined, without, suspects)]
     away, aside, other = joined.away(suspects), joined.away(suspects, across=True), without.away(suspects)
-    counterpart: dict[int, int] = dict(farther.T.tolist())
+    farther: dict[int, int] = dict(_farther(joined, without).T.tolist())
     for index in np.flatnonzero((away >= AWAY) & (joined.boxes[:, 5] >= PLACED_SCORE) & ~ghosts).tolist():
         same = _at(without, joined.boxes[index])
-        same = counterpart.get(index) if same is None else same
+        same = farther.get(index) if same is None else same
         if same is not None and 0.0 < other[same] <= away[index] - AWAY_EFFECT:
             by, along = joined.accusers(index, suspects), bool(aside[index] < AWAY)
             found.append(Lie("moved", joined.boxes[index, :2], along=along, by=by))
-    for index, at in carried(joined, without, suspects).T.tolist():
+    off = carried(joined, without, suspects)
+    for index, at, late in zip(*off.tolist(), _may_be_late(joined, without, off[1], suspects).tolist(), strict=True):
         both = joined.boxes[index, :2], without.boxes[at, :2]
         if all(np.hypot(*(lie.place - place)) > SAME_LIE_M for lie in found for place in both):
             by = _speaking_for(joined, index, without, at, suspects)
-            found.append(Lie("moved", joined.boxes[index, :2], along=at in late, by=by))
+            found.append(Lie("moved", joined.boxes[index, :2], along=late, by=by))
     if all(lie.kind != "moved" for lie in found) and misplaced(joined, without, suspects) >= ADRIFT:
         places, grown = _grown(joined, without, suspects)
         found.append(Lie("moved", places[grown.argmax()], along=True))
     return found
 
 
-def _taken(joined: Shown, without: Shown, suspects: Sequence[str], late: Collection[int]) -> list[Lie]:
-    """Lies of the kind ``gone``; which boxes without the suspects a late message may have carried off is given."""
+def _taken(joined: Shown, without: Shown, suspects: Sequence[str]) -> list[Lie]:
+    """Lies of the kind ``gone``."""
     which = gone(joined, without, suspects)
-    lost, own = without.boxes[which], without.own(suspects)[:, which].min(axis=0)
+    lost = without.boxes[which]
     drop = without.odds_at(lost[:, :2]) - joined.odds_at(lost[:, :2])
+    which = which[(lost[:, 5] >= CRISP_SCORE) & (drop >= GONE_EFFECT)]
+    own = without.own(suspects)[:, which].min(axis=0).tolist()
+    late = _may_be_late(joined, without, which, suspects).tolist()
     return [
-        Lie("gone", lost[i, :2], bool(own[i] >= SUPPORTS), along=int(which[i]) in late, said=bool(own[i] <= DENIES))
-        for i in np.flatnonzero((lost[:, 5] >= CRISP_SCORE) & (drop >= GONE_EFFECT))
+        Lie("gone", without.boxes[at, :2], said >= SUPPORTS, along=old, said=said <= DENIES)
+        for at, said, old in zip(which.tolist(), own, late, strict=True)
     ]
 
 
@@ -175,16 +177,25 @@ def _farther(joined: Shown, without: Shown) -> IntArray:
     return farther
 
 
-def _may_be_late(joined: Shown, without: Shown, pairs: IntArray, suspects: Sequence[str]) -> BoolArray:
-    """Which vehicles (k,), by their boxes (2, k) in two fusions, are carried along themselves only, to where the
-    suspects' own messages see them, rather than where they are without those: so does a message that is late.
+def _may_be_late(joined: Shown, without: Shown, which: IntArray, suspects: Sequence[str]) -> BoolArray:
+    """Of which vehicles (k,), by their boxes in the second fusion, a late message may be the cause: the first one shows
+    a vehicle ahead or behind that the second does not, and the suspects' own messages see it there rather than here.
     """
-    there, here = joined.boxes[pairs[0]], without.boxes[pairs[1]]
-    x, y = here[:, 0] - there[:, 0], here[:, 1] - there[:, 1]
-    across = np.abs(y * np.cos(there[:, 4]) - x * np.sin(there[:, 4]))
-    own = joined.own(suspects)[:, pairs[0]].max(axis=0)
-    late: BoolArray = (across <= ASIDE_M) & (own >= SUPPORTS) & (own >= without.own(suspects)[:, pairs[1]].max(axis=0))
-    return late
+    new = joined.boxes[:, 5] >= SHOWN_SCORE
+    if not len(which) or not new.any():
+        return np.zeros(len(which), dtype=bool)
+    known = without.boxes[without.boxes[:, 5] >= SHOWN_SCORE]
+    own = joined.own(suspects).max(axis=0)
+    there = joined.boxes[:, None, :2]
+    new &= (own >= SUPPORTS) & (np.hypot(*(there - known[:, :2]).T).min(axis=0, initial=np.inf) >= LATE_M[0])
+    here = without.boxes[which]
+    x, y = (there[new] - here[:, :2]).transpose(2, 0, 1)
+    cos, sin = np.cos(here[:, 4]), np.sin(here[:, 4])
+    along, across = np.abs(x * cos + y * sin), np.abs(y * cos - x * sin)
+    rather = own[new, None] >= without.own(suspects)[:, which].max(axis=0)
+    late = rather & (across <= LATE_ACROSS_M) & (along >= LATE_M[0]) & (along <= LATE_M[1])
+    may_be: BoolArray = late.any(axis=0)
+    return may_be
 
 
 def _speaking_for(joined: Shown, index: int, without: Shown, at: int, suspects: Collection[str]) -> tuple[str, ...]:

@@ -127,7 +127,8 @@ AHEAD, ASIDE = (3.3, 0.0), (0.0, 2.1)
         (AHEAD, 2.0, {"there": 4.0, "here": YES}, "gone veiled"),  # but where it is
         ((3.0, 1.2), 0.0, {"there": YES, "here": NO}, "gone gone"),
         (ASIDE, 0.0, {"there": YES, "here": NO}, "moved moved"),
-        ((4.5, 0.0), 0.0, {"there": YES, "here": NO}, "gone gone"),
+        ((5.8, 0.0), 0.0, {"there": YES, "here": NO}, "gone late"),
+        ((6.4, 0.0), 0.0, {"there": YES, "here": NO}, "gone gone"),
     ],
 )
 def test_a_late_message_carries_a_vehicle_along_itself_to_where_it_saw_it(off, yaw, own, lie):
@@ -139,6 +140,15 @@ def test_a_late_message_carries_a_vehicle_along_itself_to_where_it_saw_it(off, y
     first, *more = effects(Shown(TEAM, there, heard), Shown(("a", "b", "c"), car(yaw=yaw), heard), ["d"])
     assert f"{first.kind} {first.counts_as}" == lie
     assert {each.kind for each in more} <= {"moved"}
+
+
+def test_a_late_message_carries_a_vehicle_farther_than_the_next_lane():
+    beside = car(off=(0.0, 3.4))
+    words = {name: [(*PLACE, YES), (*beside[0, :2], YES)] for name in ("", "b", "c")} | {"a": []}
+    late = car(off=(4.2, 0.0))
+    heard = Hearing(saying(words | {"d": [(*PLACE, NO), (*late[0, :2], YES)]}), ())
+    joined, without = Shown(TEAM, np.vstack([late, beside]), heard), Shown(("a", "b", "c"), car(), heard)
+    assert [lie.counts_as for lie in effects(joined, without, ["d"])] == ["late"]
 
 
 def test_a_late_message_takes_no_vehicle_away_that_another_box_is_ahead_of():
