@@ -61,6 +61,9 @@ class Database(Protocol):
     is kept.
     """
 
+    failed: bool
+    """Whether the last `write` met a fault of the database."""
+
     async def read(self, work: Work[T]) -> T:
         """Run work that only reads."""
 
@@ -89,7 +92,24 @@ def connect(text: str, limits: Limits | None = None) -> Database:
     return Sqlite(url) if url.get_backend_name() == "sqlite" else Postgres(url, limits or Limits())
 
 
-class Postgres:
+class _Failing:
+    """What a database knows of its own faults."""
+
+    failed = False
+
+    @contextmanager
+    def _changing(self, *failures: type[Exception]) -> Iterator[None]:
+        """As `_unavailable`, for a `write`."""
+        try:
+            with _unavailable(*failures):
+                yield
+        except StoreUnavailable:
+            self.failed = True
+            raise
+        self.failed = False
+
+
+class Postgres(_Failing):
     """PostgreSQL, for several gateways on several machines."""
 
     def __init__(self, url: URL, limits: Limits) -> None:
@@ -119,7 +139,7 @@ class Postgres:
     async def write(self, work: Work[T], first: Callable[[], object] = _nothing) -> T:
         if first is not _nothing:
             await asyncio.to_thread(first)
-        with _unavailable(*self._failures):
+        with self._changing(*self._failures):
             async with self._engine.begin() as connection:
                 return await connection.run_sync(work)
 
@@ -127,7 +147,7 @@ class Postgres:
         await self._engine.dispose()
 
 
-class Sqlite:
+class Sqlite(_Failing):
     """One SQLite file in WAL mode, or a database in memory, which has a single connection."""
 
     def __init__(self, url: URL) -> None:
@@ -149,7 +169,7 @@ class Sqlite:
         self._waiting.append((Piece(work, first), done))
         if self._writing is None:
             self._writing = asyncio.create_task(self._write_all())
-        with _unavailable():
+        with self._changing():
             return await done
 
     async def close(self) -> None:

@@ -1,8 +1,11 @@
-"""What is kept once: secrets, made when they are first asked for, and proofs, of which each counts once."""
+"""What is kept once: secrets, made when they are first asked for, proofs, of which each counts once, and a change that
+tells whether changes are taken.
+"""
 
 from __future__ import annotations
 
 from collections.abc import Callable
+from secrets import token_hex
 
 from sqlalchemy import Connection, delete, func, select, text
 
@@ -19,6 +22,14 @@ def secret(connection: Connection, name: str, make: Callable[[], str]) -> str:
     connection.execute(keep, {"name": name, "value": make()})
     value: str = connection.execute(select(secrets.c.value).where(secrets.c.name == name)).scalar_one()
     return value
+
+
+def change(connection: Connection) -> None:
+    """Change something that means nothing."""
+    keep = text(
+        "INSERT INTO secrets (name, value) VALUES ('changed', :value) ON CONFLICT (name) DO UPDATE SET value = :value"
+    )
+    connection.execute(keep, {"value": token_hex(16)})
 
 
 def use_proof(

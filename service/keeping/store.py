@@ -252,8 +252,13 @@ class Store:
         return await self._database.read(lambda connection: connection.execute(query).scalar_one())
 
     async def ping(self) -> None:
-        """Find out whether the database takes changes; it makes none."""
-        await self._execute(NO_CHANGE)
+        """Find out whether the database takes changes. It makes none, but after one that failed: a full disk would take
+        what changes nothing.
+        """
+        if self._database.failed:
+            await self._database.write(once.change)
+        else:
+            await self._execute(NO_CHANGE)
 
     async def secret(self, name: str, make: Callable[[], str]) -> str:
         """A secret that outlives the process: what ``make`` gave when it was first asked for."""

@@ -143,6 +143,8 @@ async def on_a_full_disk(path, full, good_frame):
         with full(path):
             assert await ego.post_for(0.5)
             assert (await served.http.get("/healthz")).status_code == 200
+            problem(await served.http.get("/readyz"), 503, "store-unavailable")
+        assert (await served.http.get("/readyz")).status_code == 200  # though nobody has sent a frame
         await ego.check()
 
 
