@@ -151,6 +151,15 @@ def test_a_late_message_carries_a_vehicle_farther_than_the_next_lane():
     assert [lie.counts_as for lie in effects(joined, without, ["d"])] == ["late"]
 
 
+@pytest.mark.parametrize(("score", "before", "counts_as"), [(0.3, 0.25, "late"), (0.25, 0.25, "gone")])
+def test_boxes_too_faint_to_be_shown_are_no_vehicles_of_a_late_message(score, before, counts_as):
+    words = {name: [(*PLACE, YES)] for name in ("", "b", "c")} | {"a": []}
+    ahead = car(off=AHEAD, score=score)
+    heard = Hearing(saying(words | {"d": [(*PLACE, NO), (*ahead[0, :2], YES)]}), ())
+    without = Shown(("a", "b", "c"), np.vstack([car(), car(off=AHEAD, score=before)]), heard)
+    assert [lie.counts_as for lie in effects(Shown(TEAM, ahead, heard), without, ["d"])] == [counts_as]
+
+
 def test_a_late_message_takes_no_vehicle_away_that_another_box_is_ahead_of():
     """The box ahead is in both fusions: it shows another vehicle."""
     words = {name: [(*PLACE, YES)] for name in ("", "b", "c")} | {"a": []}
