@@ -62,19 +62,27 @@ def conclude(found: Findings, answer: Hypothesis) -> None:
     _leave_alone(found, answer)
     _clear(found)
     for name in found.team:
-        counts = dict(conflicts.get(name, {}))
-        for kind in {lie.counts_as for lie in blamed[name]}:
-            of_kind = [lie for lie in blamed[name] if lie.counts_as == kind]
+        counts, lies = dict(conflicts.get(name, {})), _late(found, name, blamed[name])
+        for kind in {lie.counts_as for lie in lies}:
+            of_kind = [lie for lie in lies if lie.counts_as == kind]
             places = [found.placed(lie.place) for lie in of_kind]
             counts[kind] = found.lies.counting(name, kind, places, frame)
             if any(lie.said for lie in of_kind):
                 counts[kind] = 1
-        weight, kinds = found.lies.add(name, counts), Counter(lie.counts_as for lie in blamed[name])
+        weight, kinds = found.lies.add(name, counts), Counter(lie.counts_as for lie in lies)
         if straying.get(name, 0.0) > weight:  # no displacement counts twice
             found.known.memory.straying.note(name, (straying[name] - weight) * _worth(found))
             weight, kinds["straying"] = straying[name], 1
         if weight:
-            _accuse(found, name, weight, kinds, blamed[name], sum(conflicts.get(name, {}).values()))
+            _accuse(found, name, weight, kinds, lies, sum(conflicts.get(name, {}).values()))
+
+
+def _late(found: Findings, suspect: str, lies: Sequence[Lie]) -> list[Lie]:
+    """Lies of which those count as late that a late message explains."""
+    late = found.late(suspect) if lies else None
+    if late is None:
+        return list(lies)
+    return [replace(lie, along=True) if late.explains(lie.place) else lie for lie in lies]
 
 
 def _borne_out(found: Findings, suspect: str, lies: Sequence[Lie], others: int) -> list[Lie]:
@@ -109,7 +117,7 @@ def _conflicts(found: Findings, answer: Hypothesis) -> dict[str, dict[str, int]]
 
     Given by teammate and by the kind they count as. Whoever denies what all others see where its own message shows
     nothing, and sees nothing against their word elsewhere, may be blind there, as a scanner is behind a wall of its
-    own: ``unseen``.
+    own: ``unseen``. What a late message explains is ``late``.
     """
     if answer not in found.shown or found.hearing is None:
         return {}
@@ -125,8 +133,11 @@ def _conflicts(found: Findings, answer: Hypothesis) -> dict[str, dict[str, int]]
         unseen = denied & found.hearing.everybody.is_empty(name, claims.boxes[:, :2])
         if unseen.any() and found.hearing.alone(name, found.unheard) >= FEWEST_SEEN:
             unseen[:] = False
-        for kind, which in (("conflict", (supported | denied) & ~unseen), ("unseen", unseen)):
-            places = [found.placed(box[:2]) for box in claims.boxes[which]]
+        kinds = np.where(unseen, "unseen", "conflict")
+        if (late := found.late(name)) is not None:
+            kinds[[late.explains(box[:2]) for box in claims.boxes]] = "late"
+        for kind in ("conflict", "unseen", "late"):
+            places = [found.placed(box[:2]) for box in claims.boxes[(supported | denied) & (kinds == kind)]]
             counts.setdefault(name, {})[kind] = found.lies.counting(name, kind, places, frame, once)
     return counts
 

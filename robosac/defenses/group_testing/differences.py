@@ -12,7 +12,7 @@ import numpy as np
 
 from robosac.boxes import BoolArray, FloatArray, IntArray, pairwise_iou
 from robosac.defenses.group_testing.claims import DENIES, SUPPORTS, WEIGHTY, two_witnesses
-from robosac.defenses.group_testing.hearing import CERTAIN
+from robosac.defenses.group_testing.hearing import CERTAIN, OWN_M
 from robosac.defenses.group_testing.objects import AWAY, CRISP_SCORE, PLACED_SCORE, SHOWN_SCORE, Lie, Shown
 
 OWN_DENIES = -4.0
@@ -36,8 +36,6 @@ SHOWN_IOU = 0.3
 """A box shows a vehicle from this IoU on. A vehicle half of its length ahead of itself is lost where it is."""
 CARRIED_M = (1.0, 4.0)
 """A vehicle is carried off by so much."""
-LATE_M, LATE_ACROSS_M = (1.0, 6.0), 1.0
-"""Whoever is late shows a vehicle so far ahead or behind, and at most so far across itself."""
 
 
 def effects(joined: Shown, without: Shown, suspects: Sequence[str]) -> list[Lie]:
@@ -48,8 +46,6 @@ def effects(joined: Shown, without: Shown, suspects: Sequence[str]) -> list[Lie]
     - ``gone``: a box without them where the others support a vehicle, and with them no box shows it (`gone`);
     - ``moved``: a box that is out of place, and without them less so. If it is so along itself only, it may be late. So
       it may if many boxes together are `misplaced`, each a little. Or a box that they have `carried` off.
-
-    What is gone or carried off may be late, too, where a box shows it along itself and they see it there.
     """
     contradicted = joined.claims.contradicted_by_others(suspects)
     ghosts = (contradicted | joined.on_nobodys_word) & (joined.boxes[:, 5] >= CRISP_SCORE)
@@ -67,12 +63,11 @@ def effects(joined: Shown, without: Shown, suspects: Sequence[str]) -> list[Lie]
         if same is not None and 0.0 < other[same] <= away[index] - AWAY_EFFECT:
             by, along = joined.accusers(index, suspects), bool(aside[index] < AWAY)
             found.append(Lie("moved", joined.boxes[index, :2], along=along, by=by))
-    off = carried(joined, without, suspects)
-    for index, at, late in zip(*off.tolist(), _may_be_late(joined, without, off[1], suspects).tolist(), strict=True):
+    for index, at in carried(joined, without, suspects).T.tolist():
         both = joined.boxes[index, :2], without.boxes[at, :2]
         if all(np.hypot(*(lie.place - place)) > SAME_LIE_M for lie in found for place in both):
             by = _speaking_for(joined, index, without, at, suspects)
-            found.append(Lie("moved", joined.boxes[index, :2], along=late, by=by))
+            found.append(Lie("moved", joined.boxes[index, :2], by=by))
     if all(lie.kind != "moved" for lie in found) and misplaced(joined, without, suspects) >= ADRIFT:
         places, grown = _grown(joined, without, suspects)
         found.append(Lie("moved", places[grown.argmax()], along=True))
@@ -86,10 +81,9 @@ def _taken(joined: Shown, without: Shown, suspects: Sequence[str]) -> list[Lie]:
     drop = without.odds_at(lost[:, :2]) - joined.odds_at(lost[:, :2])
     which = which[(lost[:, 5] >= CRISP_SCORE) & (drop >= GONE_EFFECT)]
     own = without.own(suspects)[:, which].min(axis=0).tolist()
-    late = _may_be_late(joined, without, which, suspects).tolist()
     return [
-        Lie("gone", without.boxes[at, :2], said >= SUPPORTS, along=old, said=said <= DENIES)
-        for at, said, old in zip(which.tolist(), own, late, strict=True)
+        Lie("gone", without.boxes[at, :2], said >= SUPPORTS, said=said <= DENIES)
+        for at, said in zip(which.tolist(), own, strict=True)
     ]
 
 
@@ -177,27 +171,6 @@ def _farther(joined: Shown, without: Shown) -> IntArray:
     return farther
 
 
-def _may_be_late(joined: Shown, without: Shown, which: IntArray, suspects: Sequence[str]) -> BoolArray:
-    """Of which vehicles (k,), by their boxes in the second fusion, a late message may be the cause: the first one shows
-    a vehicle ahead or behind that the second does not, and the suspects' own messages see it there rather than here.
-    """
-    new = joined.boxes[:, 5] >= SHOWN_SCORE
-    if not len(which) or not new.any():
-        return np.zeros(len(which), dtype=bool)
-    known = without.boxes[without.boxes[:, 5] >= SHOWN_SCORE]
-    own = joined.own(suspects).max(axis=0)
-    there = joined.boxes[:, None, :2]
-    new &= (own >= SUPPORTS) & (np.hypot(*(there - known[:, :2]).T).min(axis=0, initial=np.inf) >= LATE_M[0])
-    here = without.boxes[which]
-    x, y = (there[new] - here[:, :2]).transpose(2, 0, 1)
-    cos, sin = np.cos(here[:, 4]), np.sin(here[:, 4])
-    along, across = np.abs(x * cos + y * sin), np.abs(y * cos - x * sin)
-    rather = own[new, None] >= without.own(suspects)[:, which].max(axis=0)
-    late = rather & (across <= LATE_ACROSS_M) & (along >= LATE_M[0]) & (along <= LATE_M[1])
-    may_be: BoolArray = late.any(axis=0)
-    return may_be
-
-
 def _speaking_for(joined: Shown, index: int, without: Shown, at: int, suspects: Collection[str]) -> tuple[str, ...]:
     """Who but the suspects supports a box of the second fusion, and not one of the first."""
     here, there = without.claims.supporting[:, at], joined.claims.supporting[:, index]
@@ -232,10 +205,11 @@ def gone_alone(joined: Shown, without: Shown, suspects: Collection[str]) -> IntA
 
 def _lost(joined: Shown, without: Shown) -> tuple[BoolArray, FloatArray]:
     """Which boxes (n,) of the second fusion nothing in the first one shows, and by how much (n,) the logarithm of
-    their odds is higher there.
+    their odds is higher there. None is the ego itself, as others see it.
     """
     shown = joined.boxes[joined.boxes[:, 5] >= SHOWN_SCORE]
     lost: BoolArray = pairwise_iou(without.boxes, shown).max(axis=1, initial=0.0) < SHOWN_IOU
+    lost &= np.hypot(*without.boxes[:, :2].T) > OWN_M
     return lost, without.odds_at(without.boxes[:, :2]) - joined.odds_at(without.boxes[:, :2])
 
 

@@ -10,11 +10,13 @@ import numpy as np
 from robosac.boxes import FloatArray
 from robosac.defenses.group_testing.claims import SUPPORTS
 from robosac.defenses.group_testing.differences import SAME_LIE_M, effects, gone
+from robosac.defenses.group_testing.geometry import WITNESS_SCORE, followed
 from robosac.defenses.group_testing.hearing import REACH_M, Hearing
 from robosac.defenses.group_testing.knowledge import Knowledge
+from robosac.defenses.group_testing.lateness import Late, Place, late, motions, senders
 from robosac.defenses.group_testing.lies import Lies
 from robosac.defenses.group_testing.objects import Lie, Shown
-from robosac.defenses.protocol import Difference, Hypothesis, Outcome
+from robosac.defenses.protocol import EGO, Difference, Hypothesis, Outcome
 from robosac.testimony import Testimony
 
 CALM = 0.5
@@ -65,6 +67,7 @@ class Findings:
         self.differences: list[Difference] = []
         self._alone: FloatArray | None = None
         self._gone: dict[tuple[Hypothesis, Hypothesis], FloatArray] = {}
+        self._late: dict[str, Late | None] = {}
         self._effects: dict[tuple[Hypothesis, Hypothesis, Hypothesis], list[Lie]] = {}
 
     def learn(self, outcome: Outcome) -> Shown | None:
@@ -107,6 +110,36 @@ class Findings:
         if asked not in self._effects:
             self._effects[asked] = effects(self.shown[joined], self.shown[without], suspects)
         return self._effects[asked]
+
+    @cached_property
+    def senders(self) -> dict[str, Place]:
+        """Where in the world each sender is that is known to be somewhere."""
+        return {} if self.hearing is None else senders(self.hearing.everybody, self.pose)
+
+    def late(self, sender: str) -> Late | None:
+        """What is to be known of a sender's message if it is late. It is told from the vehicles that the largest fusion
+        without it shows, where one is decoded.
+        """
+        if sender not in self._late:
+            self._late[sender] = self._is_late(sender)
+        return self._late[sender]
+
+    def _is_late(self, sender: str) -> Late | None:
+        memory, now = self.known.memory, self.senders
+        if self.hearing is None or not memory.shown or not {sender, EGO} <= memory.senders.keys() & now.keys():
+            return None
+        without = [fused for fused in self.shown if sender not in fused]
+        fused = max(without or self.shown, key=len)
+        shown = self.shown[fused]
+        others = shown.everybody.without({sender}).supporting.any(axis=0)
+        rows = followed(shown.boxes[others & (shown.boxes[:, 5] >= WITNESS_SCORE)], self.pose)
+        before = memory.shown.get(self.known.key(fused), max(memory.shown.values(), key=len))
+        moved = motions(rows, before)
+        known = ~np.isnan(moved[:, 0])
+        since = {name: np.subtract(now[name], memory.senders[name]) for name in (sender, EGO)}
+        centres = np.concatenate([rows[known, :2], [now[EGO]]]) - now[EGO]
+        moved, turn = np.concatenate([moved[known], [since[EGO]]]), self.pose[:2, :2]  # the ego is a vehicle, too
+        return late(self.hearing.everybody, sender, since[sender] @ turn, centres @ turn, moved @ turn)
 
     def note(self, joined: Hypothesis, without: Hypothesis, lies: Sequence[Lie]) -> None:
         """Note for whoever looks on what is wrong in a fusion by the fault of those whom the other one does without."""

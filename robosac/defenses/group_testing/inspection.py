@@ -77,6 +77,7 @@ class Inspection:
     def conclude(self, answer: Hypothesis) -> None:
         """Who lied in this frame; the posterior learns it, and memory keeps it."""
         conclude(self._found, answer)
+        self._found.known.memory.senders = self._found.senders
 
     def judged(self, answer: Hypothesis) -> Judged | None:
         """How each box of an answer stands; None where nothing is known of objects."""

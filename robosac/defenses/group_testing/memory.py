@@ -77,6 +77,8 @@ class Memory:
     """
     shown_in: int = 0
     """That frame's number, as its outcomes gave it."""
+    senders: dict[str, tuple[float, float]] = field(default_factory=dict)
+    """Where in the world each sender was in that frame: x, y, metres; see `lateness.senders`."""
     lies: Lies = field(default_factory=Lies)
     """About objects."""
     straying: Straying = field(default_factory=Straying)
@@ -148,6 +150,7 @@ class Memory:
             "left": {name: [p, f] for name, (p, f) in self.left.items()},
             "shown": {f"{key:016x}": decimals.as_text(boxes.ravel(), 6) for key, boxes in self.shown.items()},
             "shown_in": self.shown_in,
+            "senders": {name: list(place) for name, place in self.senders.items()},
             "lies": self.lies.to_state(),
             "straying": self.straying.to_state(),
             "steadiness": self.steadiness.to_state(),
@@ -162,9 +165,10 @@ class Memory:
             tests={int(key, 16): (int(f), int(s)) for key, (f, s) in state["tests"].items()},
             evidence={name: [dict(item) for item in items] for name, items in state["evidence"].items()},
             left={name: (float(p), int(f)) for name, (p, f) in state["left"].items()},
-            # neither is in the states of older versions
+            # none of them is in the states of older versions
             shown={int(key, 16): _boxes(kept) for key, kept in state.get("shown", {}).items()},
             shown_in=int(state.get("shown_in", 0)),
+            senders={name: (float(x), float(y)) for name, (x, y) in state.get("senders", {}).items()},
             lies=Lies.from_state(state["lies"]) if "lies" in state else Lies(),
             straying=Straying.from_state(state.get("straying", {})),
             steadiness=Steadiness.from_state(state["steadiness"]) if "steadiness" in state else Steadiness(),

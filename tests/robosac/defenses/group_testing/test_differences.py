@@ -18,7 +18,7 @@ from tests.robosac.defenses.group_testing.fusions import (
     car,
     hearing,
 )
-from tests.robosac.testifying import SPREAD_M, saying
+from tests.robosac.testifying import saying
 
 
 def found(heard, joined, without, suspect="d"):
@@ -114,59 +114,14 @@ def test_a_vehicle_is_carried_off_by_the_word_of_those_who_see_it_elsewhere():
     assert (lie.kind, lie.counts_as, set(lie.by)) == ("moved", "moved", {"", "b", "c"})
 
 
-AHEAD, ASIDE = (3.3, 0.0), (0.0, 2.1)
-
-
-@pytest.mark.parametrize(
-    ("off", "yaw", "own", "lie"),
-    [
-        (AHEAD, 2.0, {"there": YES, "here": NO}, "gone late"),
-        ((-3.3, 0.9), 0.0, {"there": YES, "here": NO}, "gone late"),
-        ((1.6, 0.0), 0.0, {"there": YES, "here": 4.0}, "moved late"),
-        (AHEAD, 2.0, {"there": 2.0, "here": NO}, "gone gone"),  # it does not see the vehicle there
-        (AHEAD, 2.0, {"there": 4.0, "here": YES}, "gone veiled"),  # but where it is
-        ((3.0, 1.2), 0.0, {"there": YES, "here": NO}, "gone gone"),
-        (ASIDE, 0.0, {"there": YES, "here": NO}, "moved moved"),
-        ((5.8, 0.0), 0.0, {"there": YES, "here": NO}, "gone late"),
-        ((6.4, 0.0), 0.0, {"there": YES, "here": NO}, "gone gone"),
-    ],
-)
-def test_a_late_message_carries_a_vehicle_along_itself_to_where_it_saw_it(off, yaw, own, lie):
-    there = car(off=off, yaw=yaw)
-    far = np.hypot(*off) > SPREAD_M  # nearer than that the others speak of both places
-    said = [(*PLACE, YES)] if far else [(*PLACE, YES), (*there[0, :2], -1.0)]
-    words = {"": said, "a": [], "b": said, "c": said, "d": [(*PLACE, own["here"]), (*there[0, :2], own["there"])]}
-    heard = Hearing(saying(words), ())
-    first, *more = effects(Shown(TEAM, there, heard), Shown(("a", "b", "c"), car(yaw=yaw), heard), ["d"])
-    assert f"{first.kind} {first.counts_as}" == lie
-    assert {each.kind for each in more} <= {"moved"}
-
-
-def test_a_late_message_carries_a_vehicle_farther_than_the_next_lane():
-    beside = car(off=(0.0, 3.4))
-    words = {name: [(*PLACE, YES), (*beside[0, :2], YES)] for name in ("", "b", "c")} | {"a": []}
-    late = car(off=(4.2, 0.0))
-    heard = Hearing(saying(words | {"d": [(*PLACE, NO), (*late[0, :2], YES)]}), ())
-    joined, without = Shown(TEAM, np.vstack([late, beside]), heard), Shown(("a", "b", "c"), car(), heard)
-    assert [lie.counts_as for lie in effects(joined, without, ["d"])] == ["late"]
-
-
-@pytest.mark.parametrize(("score", "before", "counts_as"), [(0.3, 0.25, "late"), (0.25, 0.25, "gone")])
-def test_boxes_too_faint_to_be_shown_are_no_vehicles_of_a_late_message(score, before, counts_as):
-    words = {name: [(*PLACE, YES)] for name in ("", "b", "c")} | {"a": []}
-    ahead = car(off=AHEAD, score=score)
-    heard = Hearing(saying(words | {"d": [(*PLACE, NO), (*ahead[0, :2], YES)]}), ())
-    without = Shown(("a", "b", "c"), np.vstack([car(), car(off=AHEAD, score=before)]), heard)
-    assert [lie.counts_as for lie in effects(Shown(TEAM, ahead, heard), without, ["d"])] == [counts_as]
-
-
-def test_a_late_message_takes_no_vehicle_away_that_another_box_is_ahead_of():
-    """The box ahead is in both fusions: it shows another vehicle."""
-    words = {name: [(*PLACE, YES)] for name in ("", "b", "c")} | {"a": []}
-    ahead = car(off=AHEAD)
-    heard = Hearing(saying(words | {"d": [(*PLACE, NO), (*ahead[0, :2], YES)]}), ())
-    lies = effects(Shown(TEAM, ahead, heard), Shown(("a", "b", "c"), np.vstack([car(), ahead]), heard), ["d"])
-    assert [lie.counts_as for lie in lies] == ["gone"]
+@pytest.mark.parametrize(("far", "lost"), [(2.9, 0), (3.1, 1)])
+def test_nobody_takes_away_the_ego_itself(far, lost):
+    """Others see it, and where their messages are late, beside where it is."""
+    place = np.array([far, 0.0])
+    heard = hearing(place=place, b=YES, c=YES)
+    joined, without = Shown(TEAM, NOTHING, heard), Shown(("a", "b", "c"), car(place), heard)
+    assert len(gone(joined, without)) == lost
+    assert len(effects(joined, without, ["d"])) == lost
 
 
 @pytest.mark.parametrize(

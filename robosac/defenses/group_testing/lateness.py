@@ -1,0 +1,107 @@
+"""Messages that are late: they show every vehicle where it was, moved along with a sender that has moved since.
+
+Nobody is to blame for that. If a message is k frames late, and comes with the pose of now, it shows a vehicle
+``k (c - m)`` from where it is: c is how far the sender has moved since the frame before, m how far the vehicle has.
+With the pose of then that is ``-k m``. So its own testimony L tells how late a message is: it is greatest there, and
+not where the vehicles are. An older message is a replay.
+"""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+
+import numpy as np
+
+from robosac.boxes import FloatArray
+from robosac.defenses.group_testing.claims import SUPPORTS
+from robosac.defenses.group_testing.geometry import ACROSS_M, ALONG_M, TURN_RAD
+from robosac.testimony import Testimony
+
+DELAYS = np.array([0.0, 0.5, 1.0, 1.5, 2.0, 2.5, 3.0, 4.0, 5.0, 6.0])
+"""How late a message may be, frames."""
+LATEST = 2.5
+"""What is later is no late message, but a replay: half a second at 5 Hz."""
+MOVED_M = 1.0
+"""Vehicles tell how late a message is that it would show so far off in a frame."""
+FITS = 6.0
+"""L of a late message, summed over vehicles, is at least so much where it shows them, and greater by as much than where
+they are.
+"""
+CLEAR, FEWEST = 1.0, 2
+"""At least so many vehicles fit clearly better, by so much L, and twice as many as fit clearly worse: a lie about one or
+two does not excuse itself.
+"""
+SAME_M = 2.0
+"""What is so near a vehicle, or the way to where a late message shows it, is about that vehicle."""
+Place = tuple[float, float]
+
+
+@dataclass(frozen=True)
+class Late:
+    """Where a late message shows vehicles, and where they are."""
+
+    true: FloatArray
+    """(n, 2): ego frame, metres; of those that its sender sees elsewhere."""
+    shown: FloatArray
+    """(n, 2)."""
+
+    def explains(self, place: FloatArray) -> bool:
+        """Whether a place (2,) is on the way of a vehicle from where it is to where it is shown, or near."""
+        way = self.shown - self.true
+        along = ((place - self.true) * way).sum(axis=1) / (way * way).sum(axis=1)
+        nearest = self.true + np.minimum(np.maximum(along, 0.0), 1.0)[:, None] * way
+        return bool((np.hypot(*(place - nearest).T) <= SAME_M).any())
+
+
+def late(testimony: Testimony, sender: str, moved: FloatArray, centres: FloatArray, motions: FloatArray) -> Late | None:
+    """What is to be known of a sender's message if it is late; None if it is not.
+
+    Parameters
+    ----------
+    testimony : Testimony
+    sender : str
+    moved : (2,) ndarray
+        How far it has moved since the frame before; ego frame, metres.
+    centres, motions : (n, 2) ndarray
+        Where vehicles are that others see, and how far each has moved since the frame before.
+    """
+    said_by = testimony.of({sender})
+    best: tuple[float, Late] | None = None
+    for off in (moved - motions, -motions):
+        telling = np.hypot(*off.T) >= MOVED_M
+        places = centres[telling] + DELAYS[:, None, None] * off[telling]
+        said = said_by.likelihood(places.reshape(-1, 2)).reshape(places.shape[:2])
+        sums = said.sum(axis=1)
+        at = int(sums.argmax())
+        gain = said[at] - said[0]
+        better, worse = int((gain >= CLEAR).sum()), int((gain <= -CLEAR).sum())
+        fits = DELAYS[at] <= LATEST and sums[at] >= FITS and gain.sum() >= FITS
+        if fits and better >= max(FEWEST, 2 * worse) and (best is None or sums[at] > best[0]):
+            sees = said[1 : at + 1].max(axis=0) >= SUPPORTS  # others may be late, too, and vehicles not where they say
+            best = float(sums[at]), Late(centres[telling][sees], places[at, sees])
+    return None if best is None else best[1]
+
+
+def senders(testimony: Testimony, pose: FloatArray) -> dict[str, Place]:
+    """Where in the world each sender is, metres, rounded to 1 cm; ``pose`` is the ego's."""
+    turns, moves = testimony.from_ego[:, :2, :2], testimony.from_ego[:, :2, 2]
+    origins = -np.einsum("nji,nj->ni", turns, moves)
+    placed = (origins @ pose[:2, :2].T + pose[:2, 3]).round(2)
+    return {name: (x, y) for name, (x, y) in zip(testimony.agents, placed.tolist(), strict=True)}
+
+
+def motions(now: FloatArray, before: FloatArray) -> FloatArray:
+    """How far (n, 2) each of some boxes (n, 4) has moved since the frame before, in which there were others (m, 4), as
+    `geometry.followed` gives them; not a number for what was not there.
+    """
+    found = np.full((len(now), 2), np.nan)
+    if not len(now) or not len(before):
+        return found
+    x, y = now[:, :1] - before[:, 0], now[:, 1:2] - before[:, 1]
+    cos, sin = np.cos(now[:, 2:3]), np.sin(now[:, 2:3])
+    turned = np.abs((now[:, 2:3] - before[:, 2] + np.pi / 2) % np.pi - np.pi / 2)
+    same = (np.abs(cos * x + sin * y) < ALONG_M) & (np.abs(cos * y - sin * x) < ACROSS_M) & (turned < TURN_RAD)
+    apart = np.where(same, np.hypot(x, y), np.inf)
+    nearest, known = apart.argmin(axis=1), same.any(axis=1)
+    found[known] = (now[:, :2] - before[nearest, :2])[known]
+    return found

@@ -1,0 +1,139 @@
+"""Whose message is late, and what that explains."""
+
+import json
+
+import numpy as np
+import pytest
+
+from robosac.answers import Verdict
+from robosac.boxes import pose_matrix
+from robosac.defenses import EGO, Outcome
+from robosac.defenses.group_testing.lateness import Late, late, motions, senders
+from tests.robosac.defenses.group_testing.conversing import TEAM, run_frame
+from tests.robosac.defenses.group_testing.one_place import DEFENSE, LIAR
+from tests.robosac.testifying import saying
+
+YES, NO = 5.5, -7.0
+SPEED = np.array([3.0, 0.0])
+"""Of all vehicles, metres a frame."""
+PLACES = np.array([[-16.0, -12.0], [-14.0, -4.0], [-15.0, 4.0], [-13.0, 12.0]])
+"""Where they are in frame 0."""
+STILL = np.zeros(2)
+
+
+def shown_at(places, true=PLACES):
+    """What a message says that shows vehicles in other places than where they are."""
+    wrong = [(*place, NO) for place, shown in zip(true, places, strict=True) if (place != shown).any()]
+    return wrong + [(*place, YES) for place in places]
+
+
+def told(places, moved=STILL, centres=PLACES, speeds=SPEED):
+    """What is known of a message that shows vehicles in these places."""
+    heard = saying({EGO: [], "a": [], "d": shown_at(places, centres if len(centres) else PLACES)})
+    return late(heard, "d", np.asarray(moved), centres, np.broadcast_to(speeds, centres.shape))
+
+
+@pytest.mark.parametrize(("frames", "is_late"), [(0, False), (1, True), (2, True), (2.5, True), (3, False), (5, False)])
+@pytest.mark.parametrize("moved", [(0.0, 0.0), (-2.0, 0.0), (0.0, 3.0)])
+def test_a_message_is_late_if_it_fits_best_where_vehicles_were(frames, is_late, moved):
+    """With the pose of now, what it shows has moved along with its sender."""
+    found = told(PLACES + frames * (moved - SPEED), moved)
+    assert (found is not None) == is_late
+    if found is not None:
+        assert found.true == pytest.approx(PLACES)
+        assert np.hypot(*(found.shown - PLACES).T) == pytest.approx(frames * np.hypot(*(moved - SPEED)), abs=2.0)
+
+
+@pytest.mark.parametrize("frames", [1, 2])
+def test_with_the_pose_of_then_what_it_shows_has_not_moved_along(frames):
+    found = told(PLACES - frames * SPEED, moved=(0.0, 3.0))
+    assert found is not None
+    assert found.shown == pytest.approx(PLACES - frames * SPEED, abs=2.0)
+
+
+def test_where_nothing_moves_nobody_is_late():
+    assert told(PLACES + [-3.0, 0.0], speeds=STILL) is None
+    assert told(PLACES + [-3.0, 0.0], centres=PLACES[:0]) is None
+
+
+@pytest.mark.parametrize(("vehicles", "firmly", "is_late"), [(1, YES, False), (2, YES, True), (2, 2.5, False)])
+def test_a_message_is_late_by_two_vehicles_at_least_of_which_it_is_sure(vehicles, firmly, is_late):
+    true = PLACES[:vehicles]
+    heard = saying({EGO: [], "d": [(*place, firmly) for place in true - SPEED]})
+    assert (late(heard, "d", STILL, true, np.broadcast_to(SPEED, true.shape)) is not None) == is_late
+
+
+@pytest.mark.parametrize(("moved", "is_late"), [(1, False), (2, False), (4, True), (5, True), (6, True)])
+def test_a_lie_about_some_vehicles_does_not_excuse_itself(moved, is_late):
+    true = np.vstack([PLACES, PLACES[:2] + [20.0, 0.0]])
+    places = np.where(np.arange(6)[:, None] < moved, true - 2 * SPEED, true)
+    assert (told(places, centres=true) is not None) == is_late
+
+
+@pytest.mark.parametrize(
+    ("place", "explained"),
+    [
+        ((10.0, 0.0), True),
+        ((8.0, 1.9), True),
+        ((6.0, 0.0), True),
+        ((4.1, 0.0), True),
+        ((8.0, 2.1), False),
+        ((12.1, 0.0), False),
+        ((3.9, 0.0), False),
+    ],
+)
+def test_what_lies_on_the_way_of_a_vehicle_is_explained(place, explained):
+    ways = Late(np.array([[10.0, 0.0], [-20.0, 5.0]]), np.array([[6.0, 0.0], [-24.0, 5.0]]))
+    assert ways.explains(np.array(place)) == explained
+    assert not Late(np.zeros((0, 2)), np.zeros((0, 2))).explains(np.array(place))
+
+
+def test_senders_are_where_their_poses_say():
+    ego = pose_matrix(5.0, -3.0, 1.8, 0.7)
+    poses = {EGO: ego, "a": pose_matrix(12.004, 8.0, 1.8, -2.0), "b": pose_matrix(-4.0, 1.0, 5.0, 3.0)}
+    found = senders(saying(dict.fromkeys(poses, ()), poses), ego)
+    assert found == {EGO: (5.0, -3.0), "a": (12.0, 8.0), "b": (-4.0, 1.0)}
+    json.dumps(found)
+
+
+def test_vehicles_are_followed_along_themselves():
+    before = np.array([[0.0, 0.0, 0.0, 0.9], [8.0, 0.0, 0.0, 0.9], [20.0, 1.0, 1.5, 0.4]])
+    now = np.array([[3.0, 0.1, 0.0, 0.9], [5.5, 0.9, 0.0, 0.9], [10.0, 0.0, np.pi, 0.9], [20.0, 3.0, -1.6, 0.9]])
+    found = motions(now, before)
+    assert found[[0, 2, 3]] == pytest.approx(np.array([[3.0, 0.1], [2.0, 0.0], [0.0, 2.0]]))
+    assert np.isnan(found[1]).all()  # in no lane of those before
+    assert np.isnan(motions(now, before[:0])).all()
+    assert motions(now[:0], before).shape == (0, 2)
+
+
+def drive(frames, delay):
+    """Decisions in traffic, where one teammate's message is so many frames old."""
+    state, rng, found = DEFENSE.initial_state(TEAM), np.random.default_rng(0), []
+    for frame in range(frames):
+        true = PLACES + frame * SPEED
+        old = shown_at(true - min(delay, frame) * SPEED, true)
+        heard = saying({**{name: shown_at(true, true) for name in (EGO, *TEAM)}, LIAR: old})
+        boxes = np.column_stack([true, np.tile([4.5, 1.9, 0.0, 0.9], (len(true), 1))])
+
+        def judge(subset, _, number, boxes=boxes, heard=heard):
+            told = {"testimony": heard, "alone": boxes}
+            return Outcome(subset, 0.93, Verdict.CONSENSUS, boxes, boxes, np.eye(4), number, **told)
+
+        decision, _ = run_frame(DEFENSE, state, TEAM, [], rng, judge=judge)
+        state = json.loads(json.dumps(decision.state))
+        found.append(decision)
+    return found
+
+
+@pytest.mark.parametrize(("delay", "names"), [(0, set()), (1, set()), (2, set()), (5, {LIAR})])
+def test_who_is_late_is_not_named_and_who_replays_is(delay, names):
+    found = drive(10, delay)
+    assert {name for decision in found for name in decision.named} == names
+    levels = found[-1].state["memory"]["lies"]["levels"].get(LIAR, {})
+    assert ("late" in levels) == (0 < delay < 5)
+    assert ("conflict" in levels) == (delay == 5)
+
+
+def test_where_senders_were_is_known_for_one_frame():
+    state = drive(2, 0)[-1].state
+    assert state["memory"]["senders"] == {name: [0.0, 0.0] for name in (EGO, *TEAM)}
