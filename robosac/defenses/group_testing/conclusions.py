@@ -62,7 +62,9 @@ def conclude(found: Findings, answer: Hypothesis) -> None:
     _leave_alone(found, answer)
     _clear(found)
     for name in found.team:
-        counts, lies = dict(conflicts.get(name, {})), _late(found, name, blamed[name])
+        counts, lies = dict(conflicts.get(name, {})), blamed[name]
+        if lies and found.late(name):
+            lies = [replace(lie, along=True) for lie in lies]
         for kind in {lie.counts_as for lie in lies}:
             of_kind = [lie for lie in lies if lie.counts_as == kind]
             places = [found.placed(lie.place) for lie in of_kind]
@@ -75,14 +77,6 @@ def conclude(found: Findings, answer: Hypothesis) -> None:
             weight, kinds["straying"] = straying[name], 1
         if weight:
             _accuse(found, name, weight, kinds, lies, sum(conflicts.get(name, {}).values()))
-
-
-def _late(found: Findings, suspect: str, lies: Sequence[Lie]) -> list[Lie]:
-    """Lies of which those count as late that a late message explains."""
-    late = found.late(suspect) if lies else None
-    if late is None:
-        return list(lies)
-    return [replace(lie, along=True) if late.explains(lie.place) else lie for lie in lies]
 
 
 def _borne_out(found: Findings, suspect: str, lies: Sequence[Lie], others: int) -> list[Lie]:
@@ -117,7 +111,7 @@ def _conflicts(found: Findings, answer: Hypothesis) -> dict[str, dict[str, int]]
 
     Given by teammate and by the kind they count as. Whoever denies what all others see where its own message shows
     nothing, and sees nothing against their word elsewhere, may be blind there, as a scanner is behind a wall of its
-    own: ``unseen``. What a late message explains is ``late``.
+    own: ``unseen``. What a late message says is ``late``.
     """
     if answer not in found.shown or found.hearing is None:
         return {}
@@ -134,8 +128,8 @@ def _conflicts(found: Findings, answer: Hypothesis) -> dict[str, dict[str, int]]
         if unseen.any() and found.hearing.alone(name, found.unheard) >= FEWEST_SEEN:
             unseen[:] = False
         kinds = np.where(unseen, "unseen", "conflict")
-        if (late := found.late(name)) is not None:
-            kinds[[late.explains(box[:2]) for box in claims.boxes]] = "late"
+        if found.late(name):
+            kinds[:] = "late"
         for kind in ("conflict", "unseen", "late"):
             places = [found.placed(box[:2]) for box in claims.boxes[(supported | denied) & (kinds == kind)]]
             counts.setdefault(name, {})[kind] = found.lies.counting(name, kind, places, frame, once)

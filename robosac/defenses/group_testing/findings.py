@@ -13,7 +13,7 @@ from robosac.defenses.group_testing.differences import SAME_LIE_M, effects, gone
 from robosac.defenses.group_testing.geometry import WITNESS_SCORE, followed
 from robosac.defenses.group_testing.hearing import REACH_M, Hearing
 from robosac.defenses.group_testing.knowledge import Knowledge
-from robosac.defenses.group_testing.lateness import Late, Place, late, motions, senders
+from robosac.defenses.group_testing.lateness import Place, late, motions, senders
 from robosac.defenses.group_testing.lies import Lies
 from robosac.defenses.group_testing.objects import Lie, Shown
 from robosac.defenses.protocol import EGO, Difference, Hypothesis, Outcome
@@ -23,6 +23,7 @@ CALM = 0.5
 """From here on the ego counts as steady."""
 DONE = {"ghost": "invented", "gone": "removed", "moved": "displaced"}
 """What was done to an object, by the kind of a lie."""
+NOTHING = np.zeros((0, 4))
 UNHEARD = 0.9
 """The testimony of those suspected more than this counts for nothing."""
 
@@ -67,7 +68,7 @@ class Findings:
         self.differences: list[Difference] = []
         self._alone: FloatArray | None = None
         self._gone: dict[tuple[Hypothesis, Hypothesis], FloatArray] = {}
-        self._late: dict[str, Late | None] = {}
+        self._late: dict[str, bool] = {}
         self._effects: dict[tuple[Hypothesis, Hypothesis, Hypothesis], list[Lie]] = {}
 
     def learn(self, outcome: Outcome) -> Shown | None:
@@ -116,30 +117,33 @@ class Findings:
         """Where in the world each sender is that is known to be somewhere."""
         return {} if self.hearing is None else senders(self.hearing.everybody, self.pose)
 
-    def late(self, sender: str) -> Late | None:
-        """What is to be known of a sender's message if it is late. It is told from the vehicles that the largest fusion
-        without it shows, where one is decoded.
+    def late(self, sender: str) -> bool:
+        """Whether a sender's message is late: by the vehicles that the largest fusion without it shows, where one is
+        decoded, or by those that the ego sees alone, as all others may be late, too.
         """
         if sender not in self._late:
-            self._late[sender] = self._is_late(sender)
+            self._late[sender] = self._late_beside(sender, self._without(sender)) or self._late_beside(sender, ())
         return self._late[sender]
 
-    def _is_late(self, sender: str) -> Late | None:
-        memory, now = self.known.memory, self.senders
-        if self.hearing is None or not memory.shown or not {sender, EGO} <= memory.senders.keys() & now.keys():
-            return None
+    def _without(self, sender: str) -> Hypothesis:
         without = [fused for fused in self.shown if sender not in fused]
-        fused = max(without or self.shown, key=len)
-        shown = self.shown[fused]
+        return max(without or self.shown, key=len, default=())
+
+    def _late_beside(self, sender: str, fused: Hypothesis) -> bool:
+        memory, now = self.known.memory, self.senders
+        before = memory.shown.get(self.known.key(fused), max(memory.shown.values(), key=len, default=NOTHING))
+        shown = self.shown.get(fused) or self._of_ego
+        if shown is None or not len(before) or not {sender, EGO} <= memory.senders.keys() & now.keys():
+            return False
         others = shown.everybody.without({sender}).supporting.any(axis=0)
         rows = followed(shown.boxes[others & (shown.boxes[:, 5] >= WITNESS_SCORE)], self.pose)
-        before = memory.shown.get(self.known.key(fused), max(memory.shown.values(), key=len))
+        since = {name: np.subtract(now[name], memory.senders[name]) for name in (sender, EGO)}
         moved = motions(rows, before)
         known = ~np.isnan(moved[:, 0])
-        since = {name: np.subtract(now[name], memory.senders[name]) for name in (sender, EGO)}
         centres = np.concatenate([rows[known, :2], [now[EGO]]]) - now[EGO]
-        moved, turn = np.concatenate([moved[known], [since[EGO]]]), self.pose[:2, :2]  # the ego is a vehicle, too
-        return late(self.hearing.everybody, sender, since[sender] @ turn, centres @ turn, moved @ turn)
+        moved = np.concatenate([moved[known], [since[EGO]]])  # the ego is a vehicle, too
+        turn = self.pose[:2, :2]
+        return late(self.said(), sender, since[sender] @ turn, centres @ turn, moved @ turn)
 
     def note(self, joined: Hypothesis, without: Hypothesis, lies: Sequence[Lie]) -> None:
         """Note for whoever looks on what is wrong in a fusion by the fault of those whom the other one does without."""
@@ -181,9 +185,14 @@ class Findings:
 
     @cached_property
     def _lies_of_ego(self) -> list[Lie]:
+        return [] if self._of_ego is None else self._of_ego.lies
+
+    @cached_property
+    def _of_ego(self) -> Shown | None:
+        """What the ego shows alone."""
         if self.hearing is None or self._alone is None:
-            return []
-        return Shown((), self._alone, self.hearing).lies
+            return None
+        return Shown((), self._alone, self.hearing)
 
     def supporters(self, answer: Hypothesis, hole: Lie) -> Hypothesis:
         """The two of those fused who support a vehicle in a hole most, in the order of the team."""

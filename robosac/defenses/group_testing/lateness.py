@@ -8,12 +8,9 @@ not where the vehicles are. An older message is a replay.
 
 from __future__ import annotations
 
-from dataclasses import dataclass
-
 import numpy as np
 
 from robosac.boxes import FloatArray
-from robosac.defenses.group_testing.claims import SUPPORTS
 from robosac.defenses.group_testing.geometry import ACROSS_M, ALONG_M, TURN_RAD
 from robosac.testimony import Testimony
 
@@ -28,33 +25,14 @@ FITS = 6.0
 they are.
 """
 CLEAR, FEWEST = 1.0, 2
-"""At least so many vehicles fit clearly better, by so much L, and twice as many as fit clearly worse: a lie about one or
-two does not excuse itself.
+"""At least so many vehicles fit better, by so much L, and twice as many as fit worse: a lie about one or two does not
+excuse itself.
 """
-SAME_M = 2.0
-"""What is so near a vehicle, or the way to where a late message shows it, is about that vehicle."""
 Place = tuple[float, float]
 
 
-@dataclass(frozen=True)
-class Late:
-    """Where a late message shows vehicles, and where they are."""
-
-    true: FloatArray
-    """(n, 2): ego frame, metres; of those that its sender sees elsewhere."""
-    shown: FloatArray
-    """(n, 2)."""
-
-    def explains(self, place: FloatArray) -> bool:
-        """Whether a place (2,) is on the way of a vehicle from where it is to where it is shown, or near."""
-        way = self.shown - self.true
-        along = ((place - self.true) * way).sum(axis=1) / (way * way).sum(axis=1)
-        nearest = self.true + np.minimum(np.maximum(along, 0.0), 1.0)[:, None] * way
-        return bool((np.hypot(*(place - nearest).T) <= SAME_M).any())
-
-
-def late(testimony: Testimony, sender: str, moved: FloatArray, centres: FloatArray, motions: FloatArray) -> Late | None:
-    """What is to be known of a sender's message if it is late; None if it is not.
+def late(testimony: Testimony, sender: str, moved: FloatArray, centres: FloatArray, motions: FloatArray) -> bool:
+    """Whether a sender's message is late.
 
     Parameters
     ----------
@@ -66,20 +44,22 @@ def late(testimony: Testimony, sender: str, moved: FloatArray, centres: FloatArr
         Where vehicles are that others see, and how far each has moved since the frame before.
     """
     said_by = testimony.of({sender})
-    best: tuple[float, Late] | None = None
-    for off in (moved - motions, -motions):
-        telling = np.hypot(*off.T) >= MOVED_M
-        places = centres[telling] + DELAYS[:, None, None] * off[telling]
-        said = said_by.likelihood(places.reshape(-1, 2)).reshape(places.shape[:2])
-        sums = said.sum(axis=1)
-        at = int(sums.argmax())
-        gain = said[at] - said[0]
-        better, worse = int((gain >= CLEAR).sum()), int((gain <= -CLEAR).sum())
-        fits = DELAYS[at] <= LATEST and sums[at] >= FITS and gain.sum() >= FITS
-        if fits and better >= max(FEWEST, 2 * worse) and (best is None or sums[at] > best[0]):
-            sees = said[1 : at + 1].max(axis=0) >= SUPPORTS  # others may be late, too, and vehicles not where they say
-            best = float(sums[at]), Late(centres[telling][sees], places[at, sees])
-    return None if best is None else best[1]
+    return any(_fits(said_by, centres, off) for off in (moved - motions, -motions))
+
+
+def _fits(testimony: Testimony, centres: FloatArray, off: FloatArray) -> bool:
+    """Whether one sender's testimony fits a late message best. One frame late it would show each vehicle so far ``off``
+    (n, 2) from where it is.
+    """
+    telling = np.hypot(*off.T) >= MOVED_M
+    places = centres[telling] + DELAYS[:, None, None] * off[telling]
+    said = testimony.likelihood(places.reshape(-1, 2)).reshape(places.shape[:2])
+    sums = said.sum(axis=1)
+    best = int(sums.argmax())
+    gain = said[best] - said[0]
+    better, worse = int((gain >= CLEAR).sum()), int((gain <= -CLEAR).sum())
+    enough = bool(sums[best] >= FITS and gain.sum() >= FITS and better >= max(FEWEST, 2 * worse))
+    return enough and bool(DELAYS[best] <= LATEST)
 
 
 def senders(testimony: Testimony, pose: FloatArray) -> dict[str, Place]:

@@ -1,4 +1,4 @@
-"""Whose message is late, and what that explains."""
+"""Whose message is late."""
 
 import json
 
@@ -8,9 +8,15 @@ import pytest
 from robosac.answers import Verdict
 from robosac.boxes import pose_matrix
 from robosac.defenses import EGO, Outcome
-from robosac.defenses.group_testing.lateness import Late, late, motions, senders
+from robosac.defenses.group_testing.findings import Findings
+from robosac.defenses.group_testing.geometry import followed
+from robosac.defenses.group_testing.knowledge import Knowledge
+from robosac.defenses.group_testing.lateness import late, motions, senders
+from robosac.defenses.group_testing.lies import Lies
+from robosac.defenses.group_testing.memory import Memory
+from robosac.defenses.group_testing.posterior import Posterior
 from tests.robosac.defenses.group_testing.conversing import TEAM, run_frame
-from tests.robosac.defenses.group_testing.one_place import DEFENSE, LIAR
+from tests.robosac.defenses.group_testing.one_place import DEFENSE, LIAR, MODEL
 from tests.robosac.testifying import saying
 
 YES, NO = 5.5, -7.0
@@ -28,7 +34,7 @@ def shown_at(places, true=PLACES):
 
 
 def told(places, moved=STILL, centres=PLACES, speeds=SPEED):
-    """What is known of a message that shows vehicles in these places."""
+    """Whether a message is late that shows vehicles in these places."""
     heard = saying({EGO: [], "a": [], "d": shown_at(places, centres if len(centres) else PLACES)})
     return late(heard, "d", np.asarray(moved), centres, np.broadcast_to(speeds, centres.shape))
 
@@ -37,55 +43,31 @@ def told(places, moved=STILL, centres=PLACES, speeds=SPEED):
 @pytest.mark.parametrize("moved", [(0.0, 0.0), (-2.0, 0.0), (0.0, 3.0)])
 def test_a_message_is_late_if_it_fits_best_where_vehicles_were(frames, is_late, moved):
     """With the pose of now, what it shows has moved along with its sender."""
-    found = told(PLACES + frames * (moved - SPEED), moved)
-    assert (found is not None) == is_late
-    if found is not None:
-        assert found.true == pytest.approx(PLACES)
-        assert np.hypot(*(found.shown - PLACES).T) == pytest.approx(frames * np.hypot(*(moved - SPEED)), abs=2.0)
+    assert told(PLACES + frames * (moved - SPEED), moved) == is_late
 
 
-@pytest.mark.parametrize("frames", [1, 2])
-def test_with_the_pose_of_then_what_it_shows_has_not_moved_along(frames):
-    found = told(PLACES - frames * SPEED, moved=(0.0, 3.0))
-    assert found is not None
-    assert found.shown == pytest.approx(PLACES - frames * SPEED, abs=2.0)
+@pytest.mark.parametrize(("frames", "is_late"), [(1, True), (2, True), (5, False)])
+def test_with_the_pose_of_then_what_it_shows_has_not_moved_along(frames, is_late):
+    assert told(PLACES - frames * SPEED, moved=(0.0, 3.0)) == is_late
 
 
 def test_where_nothing_moves_nobody_is_late():
-    assert told(PLACES + [-3.0, 0.0], speeds=STILL) is None
-    assert told(PLACES + [-3.0, 0.0], centres=PLACES[:0]) is None
+    assert told(PLACES + [-3.0, 0.0], speeds=STILL) is False
+    assert told(PLACES + [-3.0, 0.0], centres=PLACES[:0]) is False
 
 
 @pytest.mark.parametrize(("vehicles", "firmly", "is_late"), [(1, YES, False), (2, YES, True), (2, 2.5, False)])
 def test_a_message_is_late_by_two_vehicles_at_least_of_which_it_is_sure(vehicles, firmly, is_late):
     true = PLACES[:vehicles]
     heard = saying({EGO: [], "d": [(*place, firmly) for place in true - SPEED]})
-    assert (late(heard, "d", STILL, true, np.broadcast_to(SPEED, true.shape)) is not None) == is_late
+    assert late(heard, "d", STILL, true, np.broadcast_to(SPEED, true.shape)) == is_late
 
 
 @pytest.mark.parametrize(("moved", "is_late"), [(1, False), (2, False), (4, True), (5, True), (6, True)])
 def test_a_lie_about_some_vehicles_does_not_excuse_itself(moved, is_late):
     true = np.vstack([PLACES, PLACES[:2] + [20.0, 0.0]])
     places = np.where(np.arange(6)[:, None] < moved, true - 2 * SPEED, true)
-    assert (told(places, centres=true) is not None) == is_late
-
-
-@pytest.mark.parametrize(
-    ("place", "explained"),
-    [
-        ((10.0, 0.0), True),
-        ((8.0, 1.9), True),
-        ((6.0, 0.0), True),
-        ((4.1, 0.0), True),
-        ((8.0, 2.1), False),
-        ((12.1, 0.0), False),
-        ((3.9, 0.0), False),
-    ],
-)
-def test_what_lies_on_the_way_of_a_vehicle_is_explained(place, explained):
-    ways = Late(np.array([[10.0, 0.0], [-20.0, 5.0]]), np.array([[6.0, 0.0], [-24.0, 5.0]]))
-    assert ways.explains(np.array(place)) == explained
-    assert not Late(np.zeros((0, 2)), np.zeros((0, 2))).explains(np.array(place))
+    assert told(places, centres=true) == is_late
 
 
 def test_senders_are_where_their_poses_say():
@@ -106,14 +88,17 @@ def test_vehicles_are_followed_along_themselves():
     assert motions(now[:0], before).shape == (0, 2)
 
 
+def cars(centres):
+    return np.column_stack([centres, np.tile([4.5, 1.9, 0.0, 0.9], (len(centres), 1))])
+
+
 def drive(frames, delay):
     """Decisions in traffic, where one teammate's message is so many frames old."""
     state, rng, found = DEFENSE.initial_state(TEAM), np.random.default_rng(0), []
     for frame in range(frames):
         true = PLACES + frame * SPEED
         old = shown_at(true - min(delay, frame) * SPEED, true)
-        heard = saying({**{name: shown_at(true, true) for name in (EGO, *TEAM)}, LIAR: old})
-        boxes = np.column_stack([true, np.tile([4.5, 1.9, 0.0, 0.9], (len(true), 1))])
+        heard, boxes = saying({**dict.fromkeys((EGO, *TEAM), shown_at(true, true)), LIAR: old}), cars(true)
 
         def judge(subset, _, number, boxes=boxes, heard=heard):
             told = {"testimony": heard, "alone": boxes}
@@ -137,3 +122,23 @@ def test_who_is_late_is_not_named_and_who_replays_is(delay, names):
 def test_where_senders_were_is_known_for_one_frame():
     state = drive(2, 0)[-1].state
     assert state["memory"]["senders"] == {name: [0.0, 0.0] for name in (EGO, *TEAM)}
+
+
+@pytest.mark.parametrize("asked", ["fused", "alone", "nowhere"])
+@pytest.mark.parametrize("missing", [None, "shown", EGO, LIAR])
+def test_who_is_late_is_told_by_what_others_see_or_by_what_the_ego_sees_alone(asked, missing):
+    """Where all others are late, too, their boxes are not where vehicles are."""
+    rest = tuple(name for name in TEAM if name != LIAR)
+    memory = Memory(senders=dict.fromkeys((EGO, *TEAM), (0.0, 0.0)))
+    known = Knowledge(MODEL, Posterior(len(MODEL.kinds), 0.5, 0.25, TEAM), memory)
+    memory.shown = {known.key(subset): followed(cars(PLACES - SPEED), np.eye(4)) for subset in ((), rest)}
+    if missing == "shown":
+        memory.shown = {}
+    memory.senders.pop(missing, None)
+    known_by = {EGO: shown_at(PLACES), "car-2": shown_at(PLACES), LIAR: shown_at(PLACES - SPEED)}
+    boxes = {name: cars(PLACES if name == asked else PLACES + [20.0, 0.0]) for name in ("fused", "alone")}
+    found = Findings(known, Lies(), TEAM, ())
+    told = {"testimony": saying({**dict.fromkeys(TEAM, ()), **known_by}), "alone": boxes["alone"]}
+    found.learn(Outcome(rest, 0.9, Verdict.CONSENSUS, boxes["fused"], boxes["alone"], np.eye(4), 1, **told))
+    assert found.late(LIAR) == (asked != "nowhere" and missing is None)
+    assert not found.late("car-2")
