@@ -82,13 +82,13 @@ def _read(path: Path, changed: int) -> Calibration:  # noqa: ARG001 (a changed f
     return Calibration.read(path)
 
 
-_witnesses: dict[Path, tuple[int, str, Witness]] = {}
+_witnesses: dict[tuple[Path, str], tuple[int, str, Witness]] = {}
 
 
 def _open(path: Path, changed: int, info: DetectorInfo) -> Witness:
-    known = _witnesses.get(path)
+    known = _witnesses.get((path, info.device))
     if known is None or known[:2] != (changed, info.weights_digest):
-        known = _witnesses[path] = (changed, info.weights_digest, Witness.open(path, info))
+        known = _witnesses[path, info.device] = (changed, info.weights_digest, Witness.open(path, info))
     return known[2]
 
 

@@ -15,7 +15,7 @@ from speed.turns import Part, in_turns, rows
 from torch.nn import functional
 
 from robosac.detectors import Message
-from robosac.detectors.v2xsim.anchors import anchor_boxes, decode, detections, to_lidar
+from robosac.detectors.v2xsim.anchors import anchor_boxes, decode, detections, detections_of_each, to_lidar
 from robosac.detectors.v2xsim.detector import V2XSimDetector, write_weights
 from robosac.detectors.v2xsim.fast import FastDecoder
 from robosac.detectors.v2xsim.network import GRID, LAYERS, V2XSimNetwork, published_shapes, select_published
@@ -60,7 +60,7 @@ def part(turns: int) -> Part:
             detections(logits[:, 1] - logits[:, 0], codes, THRESHOLD)
 
         def quick(name: str) -> None:
-            detections(*fast[name].decode(maps, contexts[name]), THRESHOLD)
+            detections_of_each(*fast[name].decode(maps, contexts[name]), THRESHOLD)
 
         times = in_turns(
             {

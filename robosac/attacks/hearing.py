@@ -7,6 +7,7 @@ own message says. Nobody can change what another one's says.
 from __future__ import annotations
 
 from collections.abc import Mapping
+from dataclasses import replace
 from functools import cached_property
 
 import numpy as np
@@ -77,7 +78,7 @@ class Hearing:
         OSError
             If it cannot be read.
         """
-        witness = witness_of(info)
+        witness = witness_of(replace(info, device="cpu"))  # where surfaces and what attackers perturb are
         if witness is None:
             return None
         layout = witness.layout

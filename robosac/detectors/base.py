@@ -64,6 +64,8 @@ class DetectorInfo:
     """Whether columns of the maps in messages run along minus x."""
     precision: Precision = "float32"
     """The numbers in which fused maps are decoded. The name ends with ``@PRECISION``, unless that is float32."""
+    device: str = field(default="cpu", compare=False)
+    """Where it computes. It is the same detector wherever that is."""
 
     @property
     def narrower(self) -> dict[str, tuple[str, ...]]:
@@ -201,6 +203,22 @@ class Precise(Protocol):
 
     def in_precision(self, precision: Precision) -> Self:
         """The same detector in another precision; it shares the weights."""
+
+
+@runtime_checkable
+class Placeable(Protocol):
+    """What can compute on more than one device."""
+
+    def on_device(self, device: str) -> Self:
+        """The same detector on another device (`robosac.detectors.device.as_device`); nothing is shared that changes.
+
+        Frames are prepared and decoded there. Scans are encoded, and attackers compute, on the processor.
+
+        Raises
+        ------
+        ValueError
+            If torch cannot compute there.
+        """
 
 
 class Encoder(Preparer, Protocol):

@@ -2,13 +2,15 @@
 
 from __future__ import annotations
 
+from collections.abc import Iterator
 from functools import lru_cache
 
 import numpy as np
 import torch
 from torch.nn import functional
 
-from robosac.boxes import FloatArray, nms
+from robosac.boxes import FloatArray, IntArray, nms
+from robosac.detectors.device import CPU
 from robosac.detectors.network import HEAD
 from robosac.detectors.voxels import AREA_M
 
@@ -18,6 +20,8 @@ OWN_BODY_M = 2.0
 MAX_PEAKS = 200
 """Candidates before suppression: bounds the work that a flooded frame can cause."""
 NMS_IOU = 0.1
+Picked = tuple[IntArray, IntArray, FloatArray, FloatArray]
+"""Candidates: rows (k,), columns (k,), logits (k,) and codes (6, k), these as float32."""
 
 
 @lru_cache(maxsize=1)
@@ -36,7 +40,12 @@ def box_codes(box: FloatArray, xs: FloatArray, ys: FloatArray) -> FloatArray:
 
 
 def decode_boxes(logits: torch.Tensor, codes: torch.Tensor, score_threshold: float) -> FloatArray:
-    """Boxes of one ego.
+    """As `decode_all`, of one map: logits (64, 64) and codes (6, 64, 64)."""
+    return decode_all(logits[None], codes[None], score_threshold)[0]
+
+
+def decode_all(logits: torch.Tensor, codes: torch.Tensor, score_threshold: float) -> list[FloatArray]:
+    """Boxes of one ego, of each map.
 
     1. Candidates are the peaks of the heatmap (3 x 3 maxima) from the score threshold on, at most 200 of the best.
     2. Of their boxes those remain that are centred within the area and not on the ego itself.
@@ -44,25 +53,65 @@ def decode_boxes(logits: torch.Tensor, codes: torch.Tensor, score_threshold: flo
 
     Parameters
     ----------
-    logits : (64, 64) tensor
-    codes : (6, 64, 64) tensor
+    logits : (n, 64, 64) float32 tensor
+    codes : (n, 6, 64, 64) float32 tensor
     score_threshold : float
 
     Returns
     -------
-    (n, 6) float64 ndarray
+    list of (k, 6) float64 ndarray
         x, y, length, width, yaw, score; best first.
     """
-    peak = functional.max_pool2d(logits[None], 3, stride=1, padding=1)[0] == logits
     floor = float(np.log(score_threshold / (1 - score_threshold)))
-    candidate = (peak & (logits >= floor)).numpy()
+    pick = picked if logits.device == CPU else picked_there
+    return [_boxes(*candidates) for candidates in pick(logits, codes, floor)]
+
+
+def peaks(logits: torch.Tensor, floor: float) -> torch.Tensor:
+    """Which cells (n, 64, 64) are candidates."""
+    return (functional.max_pool2d(logits, 3, stride=1, padding=1) == logits) & (logits >= floor)
+
+
+def picked(logits: torch.Tensor, codes: torch.Tensor, floor: float) -> Iterator[Picked]:
+    """The candidates of each map, on the processor: `best_peaks` takes longer there."""
+    for candidate, value, code in zip(peaks(logits, floor).numpy(), logits.numpy(), codes.numpy(), strict=True):
+        row, column = np.nonzero(candidate)
+        if len(row) > MAX_PEAKS:
+            best = np.argpartition(-value[row, column].astype(np.float64), MAX_PEAKS)[:MAX_PEAKS]
+            row, column = row[best], column[best]
+        yield row, column, value[row, column], code[:, row, column]
+
+
+def picked_there(logits: torch.Tensor, codes: torch.Tensor, floor: float) -> Iterator[Picked]:
+    """The candidates of each map, on an accelerator: no others leave it."""
+    for value, index, code in zip(*(each.cpu().numpy() for each in best_peaks(logits, codes, floor)), strict=True):
+        ascending = np.argsort(index)
+        chosen = ascending[value[ascending] >= floor]
+        row, column = np.divmod(index[chosen], HEAD)
+        yield row, column, value[chosen], code[:, chosen]
+
+
+def best_peaks(
+    logits: torch.Tensor, codes: torch.Tensor, floor: float
+) -> tuple[torch.Tensor, torch.Tensor, torch.Tensor]:
+    """The best `MAX_PEAKS` cells of each map, whether they are candidates or not.
+
+    So the shapes do not depend on what is seen, and nothing has to wait for it.
+
+    Returns
+    -------
+    logits : (n, k) tensor
+        Minus infinity where a cell is no candidate.
+    index : (n, k) tensor
+    codes : (n, 6, k) tensor
+    """
+    best, index = torch.where(peaks(logits, floor), logits, -torch.inf).flatten(1).topk(MAX_PEAKS)
+    return best, index, codes.flatten(2).gather(2, index[:, None].expand(-1, codes.shape[1], -1))
+
+
+def _boxes(row: IntArray, column: IntArray, values: FloatArray, code: FloatArray) -> FloatArray:
+    values, code = values.astype(np.float64), code.astype(np.float64)
     xs, ys = cell_centres()
-    row, column = np.nonzero(candidate)
-    values = logits.numpy()[row, column].astype(np.float64)
-    if len(values) > MAX_PEAKS:
-        best = np.argpartition(-values, MAX_PEAKS)[:MAX_PEAKS]
-        row, column, values = row[best], column[best], values[best]
-    code = codes.numpy()[:, row, column].astype(np.float64)
     size = np.exp(np.clip(code[2:4], -2.0, 4.0))
     boxes = np.column_stack(
         [

@@ -21,8 +21,9 @@ from robosac.detectors.base import (
     in_precision,
     witness_beside,
 )
-from robosac.detectors.decoding import cell_centres, decode_boxes
-from robosac.detectors.map_fusion import FEATURES, Decode, Heads, MapFusionDetector, Maps
+from robosac.detectors.decoding import cell_centres, decode_all
+from robosac.detectors.device import CPU
+from robosac.detectors.map_fusion import FEATURES, Decode, Finder, Heads, MapFusionDetector, Maps
 from robosac.detectors.network import CHANNELS, MAP, MeanFusionNetwork, fold_batchnorm
 from robosac.detectors.voxels import AREA_M, occupancy
 from robosac.detectors.weights_file import WeightsError, read_weights
@@ -80,7 +81,8 @@ class EmbeddedDetector(MapFusionDetector):
         network.load_state_dict({name: tensor.float() for name, tensor in tensors.items()})
         fold_batchnorm(network.eval().requires_grad_(False))
         self._network = network.to(memory_format=torch.channels_last)  # type: ignore[call-overload]
-        self._dtype, self._decode = torch.float32, self._network.decode
+        self._dtype, self._narrow = torch.float32, self._network
+        self.place()
         self.recipe = recipe
         self._gain = _number(recipe, "feature_gain", np.inf)
         self._score_threshold = _number(recipe, "score_threshold", 1.0)
@@ -100,9 +102,14 @@ class EmbeddedDetector(MapFusionDetector):
         """As `robosac.detectors.base.Precise.in_precision`; messages stay as they are."""
         other = copy(self)
         other._dtype = getattr(torch, precision)
-        other._decode = deepcopy(self._network).to(other._dtype).decode
+        other._narrow = deepcopy(self._network).to(other._dtype)
         other.info = in_precision(self.info, precision)
+        other.place()
         return other
+
+    def place(self) -> None:
+        """As `MapFusionDetector.place`."""
+        self._placed = self._narrow if self.device == CPU else deepcopy(self._narrow).to(self.device)
 
     def encode(self, points: FloatArray, pose: FloatArray) -> Message:
         """As `robosac.detectors.base.Encoder.encode`; the z of the pose is the sensor's height above ground, metres."""
@@ -116,19 +123,27 @@ class EmbeddedDetector(MapFusionDetector):
         """Maps without the gain."""
         return sent / self._gain
 
+    def fused(self, maps: Maps) -> torch.Tensor:
+        """The maps' mean."""
+        return sum(maps[1:], maps[0]) / len(maps)
+
     def decoder(self, ego: Message, own: torch.Tensor) -> Decode:  # noqa: ARG002
-        """Logits (64, 64) and codes (6, 64, 64) of the maps' mean."""
+        """Logits (64, 64) and codes (6, 64, 64)."""
 
         def decode(maps: Maps) -> Heads:
-            fused = sum(maps[1:], maps[0]) / len(maps)
-            logits, codes = self._decode(fused[None].to(self._dtype))
+            logits, codes = self._narrow.decode(self.fused(maps)[None].to(self._dtype))
             return logits[0].float(), codes[0].float()
 
         return decode
 
-    def boxes(self, logits: torch.Tensor, codes: torch.Tensor) -> FloatArray:
-        """As `decode_boxes` makes them."""
-        return decode_boxes(logits, codes, self._score_threshold)
+    def finder(self, ego: Message, own: torch.Tensor) -> Finder:  # noqa: ARG002
+        """Boxes as `decode_all` makes them."""
+
+        def find(fused: torch.Tensor) -> list[FloatArray]:
+            logits, codes = self._placed.decode(fused.to(self._dtype))
+            return decode_all(logits.float(), codes.float(), self._score_threshold)
+
+        return find
 
     def places(self, codes: torch.Tensor) -> torch.Tensor:
         """Boxes (64, 64, 6) of all cells."""

@@ -9,7 +9,8 @@ from __future__ import annotations
 import os
 from pathlib import Path
 
-from robosac.detectors.base import Detector, Precise, Preparer, split_precision
+from robosac.detectors.base import Detector, Placeable, Precise, Preparer, split_precision
+from robosac.detectors.device import CPU, as_device
 from robosac.detectors.embedded import EmbeddedDetector
 from robosac.detectors.weights_file import WeightsError, read_weights
 from robosac.plugins import Kind, classes
@@ -23,7 +24,7 @@ def available() -> tuple[str, ...]:
     return tuple(DETECTORS.shipped)
 
 
-def load(detector: str | os.PathLike[str] = DEFAULT_DETECTOR) -> Detector:
+def load(detector: str | os.PathLike[str] = DEFAULT_DETECTOR, device: str = "cpu") -> Detector:
     """Load a detector.
 
     It is checked for what a gateway needs of it, `Preparer`. Whoever encodes scans or attacks asks
@@ -35,19 +36,31 @@ def load(detector: str | os.PathLike[str] = DEFAULT_DETECTOR) -> Detector:
         A name of `available`, the path of a weights file, an entry point of the group ``robosac.detectors``, or
         ``module:callable``, where the callable takes no arguments and returns a detector. After it ``@bfloat16`` may
         stand, or another precision in which the detector can decode.
+    device : str
+        Where it computes, by torch's name: ``cpu``, ``cuda``, ``cuda:1``.
 
     Raises
     ------
     WeightsError
         If the weights cannot be used.
     ValueError
-        If there is no such detector, it lacks what a gateway needs, or it cannot decode in that precision.
+        If there is no such detector, it lacks what a gateway needs, or it cannot decode in that precision or compute
+        on that device.
     """
-    detector = os.fspath(detector)
+    elsewhere = as_device(device) != CPU
+    loaded = _load(os.fspath(detector))
+    if not elsewhere:
+        return loaded
+    if not isinstance(loaded, Placeable):
+        raise ValueError(f"{detector} cannot compute on {device}: it has no method on_device")
+    return loaded.on_device(device)
+
+
+def _load(detector: str) -> Detector:
     plain, precision = split_precision(detector)
     there = os.path.exists(detector)  # noqa: PTH110 (Path raises for a long name)
     if plain != detector and not there:
-        loaded = load(plain)
+        loaded = _load(plain)
         if not isinstance(loaded, Precise):
             raise ValueError(f"{plain} cannot decode in {precision}: it has no method in_precision")
         return loaded.in_precision(precision)

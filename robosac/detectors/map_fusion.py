@@ -8,13 +8,15 @@ from __future__ import annotations
 
 from abc import ABC, abstractmethod
 from collections.abc import Callable, Collection, Mapping, Sequence
-from typing import ClassVar
+from copy import deepcopy
+from typing import ClassVar, Self
 
 import numpy as np
 import torch
 
 from robosac.boxes import FloatArray
 from robosac.detectors.base import DetectorInfo, Message
+from robosac.detectors.device import CPU, as_device, on_device, stacked
 from robosac.detectors.warp import sampling_matrix, warp
 
 FEATURES = "features"
@@ -24,8 +26,8 @@ Heads = tuple[torch.Tensor, torch.Tensor]
 """The class logit of each place where there might be a vehicle, and the codes of all boxes."""
 Decode = Callable[[Maps], Heads]
 """From maps to fuse, the ego's first and all in its frame."""
-Finder = Callable[[Maps], FloatArray]
-"""From such maps to boxes."""
+Finder = Callable[[torch.Tensor], list[FloatArray]]
+"""From fused maps (n, C, H, W) to the boxes of each."""
 
 
 class MapFusionDetector(ABC):
@@ -37,19 +39,38 @@ class MapFusionDetector(ABC):
     info: DetectorInfo
     mirrored: ClassVar[bool] = False
     """Whether columns of the maps run along minus x."""
+    device: torch.device = CPU
+    """Where frames are prepared and decoded."""
+
+    @abstractmethod
+    def fused(self, maps: Maps) -> torch.Tensor:
+        """Maps (C, H, W), all in the ego's frame and the ego's first, as one."""
 
     @abstractmethod
     def decoder(self, ego: Message, own: torch.Tensor) -> Decode:
-        """Do once what all fusions of a frame share. ``own`` (C, H, W) is the ego's map."""
+        """Do once what all fusions of a frame share. ``own`` (C, H, W) is the ego's map.
 
-    def finder(self, ego: Message, own: torch.Tensor) -> Finder:
-        """As `decoder`, but to the boxes of `robosac.detectors.base.PreparedFrame.detect`, and without gradients."""
-        decode = self.decoder(ego, own)
-        return lambda maps: self.boxes(*decode(maps))
+        It is for attackers: differentiable, and on the processor.
+        """
 
     @abstractmethod
-    def boxes(self, logits: torch.Tensor, codes: torch.Tensor) -> FloatArray:
-        """The boxes that `robosac.detectors.base.PreparedFrame.detect` returns."""
+    def finder(self, ego: Message, own: torch.Tensor) -> Finder:
+        """As `decoder`, but of fused maps, to the boxes of `robosac.detectors.base.PreparedFrame.detect`.
+
+        It is on the detector's device, and without gradients.
+        """
+
+    @abstractmethod
+    def place(self) -> None:
+        """Put what `finder` needs onto the detector's device."""
+
+    def on_device(self, device: str) -> Self:
+        """As `robosac.detectors.base.Placeable.on_device`."""
+        other = deepcopy(self)
+        other.device = as_device(device)
+        other.info = on_device(self.info, other.device)
+        other.place()
+        return other
 
     @abstractmethod
     def places(self, codes: torch.Tensor) -> torch.Tensor:
@@ -73,7 +94,8 @@ class MapFusionDetector(ABC):
 
     def laid(self, ego: Message, teammates: Collection[Message]) -> torch.Tensor:
         """Maps (n, C, H, W) of teammates as they lie in the ego's frame."""
-        return warp(self.unscaled(_sent(list(teammates))), self.matrices(ego, teammates))
+        sent = _sent(list(teammates), self.device)
+        return warp(self.unscaled(sent), self.matrices(ego, teammates).to(self.device))
 
     def attack_surface(self, ego: Message, teammates: Mapping[str, Message]) -> MapSurface:
         """Show a frame to an attacker."""
@@ -85,12 +107,9 @@ class MapFusionDetector(ABC):
         return Message(message.pose, {**message.tensors, FEATURES: tensor.detach().contiguous().numpy().astype(dtype)})
 
 
-def _sent(messages: Sequence[Message]) -> torch.Tensor:
-    """Maps (n, C, H, W) as float32 in C order, as warped ones are: to add maps of unlike layouts takes far longer.
-
-    Torch widens half floats several times faster than numpy.
-    """
-    return torch.from_numpy(np.stack([message.tensors[FEATURES] for message in messages])).float().contiguous()
+def _sent(messages: Sequence[Message], device: torch.device = CPU) -> torch.Tensor:
+    """Maps (n, C, H, W) as float32 in C order, as warped ones are."""
+    return stacked([message.tensors[FEATURES] for message in messages], device)
 
 
 class PreparedMaps:
@@ -100,7 +119,7 @@ class PreparedMaps:
         self._detector = detector
         self._ego = ego
         with torch.inference_mode():
-            self.own = detector.unscaled(_sent([ego]))[0]
+            self.own = detector.unscaled(_sent([ego], detector.device))[0]
             self._find = detector.finder(ego, self.own)
         self.warped: dict[str, torch.Tensor] = {}
 
@@ -114,7 +133,8 @@ class PreparedMaps:
     def detect(self, teammates: Collection[str] = ()) -> FloatArray:
         """Boxes (n, 6) of the ego fused with these teammates; with none, of the ego alone."""
         with torch.inference_mode():
-            return self._find([self.own, *(self.warped[name] for name in teammates)])
+            fused = self._detector.fused([self.own, *(self.warped[name] for name in teammates)])
+            return self._find(fused[None])[0]
 
 
 class MapSurface:

@@ -18,6 +18,7 @@ from torch import nn
 
 from robosac.boxes import BoolArray, FloatArray
 from robosac.detectors.base import DetectorInfo, Message
+from robosac.detectors.device import CPU, as_device, stacked
 from robosac.detectors.warp import warp
 from robosac.detectors.weights_file import WeightsError, read_weights, save_weights
 from robosac.steps import Steps, finished
@@ -120,11 +121,10 @@ class Layout:
         cell_m = 2 * self.half_extent_m / self.height
         return 1 << max(0, round(math.log2(cell_m / PLACE_M)))
 
-    def maps(self, messages: Sequence[Message]) -> torch.Tensor:
+    def maps(self, messages: Sequence[Message], device: torch.device = CPU) -> torch.Tensor:
         """The maps (n, C, H, W) of messages, float32."""
-        sent = np.stack([message.tensors[self.tensor] for message in messages])
         # one layout in memory, or rounding would differ between maps from an encoder, the wire and a file
-        return self.scaled(torch.from_numpy(np.ascontiguousarray(sent)).float())
+        return self.scaled(stacked([message.tensors[self.tensor] for message in messages], device))
 
     def scaled(self, sent: torch.Tensor) -> torch.Tensor:
         """What the network reads of maps (n, C, H, W) as they are sent: columns along +x, values about 1."""
@@ -142,17 +142,17 @@ class Layout:
         parts = [sent[:, y:below, x:right] for x, y, right, below in around.astype(int).tolist()]
         return np.array([bool((part == part[:, :1, :1]).all()) for part in parts], dtype=bool)
 
-    def geometry(self, heights: Sequence[float]) -> torch.Tensor:
+    def geometry(self, heights: Sequence[float], device: torch.device = CPU) -> torch.Tensor:
         """Where the cells of maps are whose sensors are so high, metres, as far as poses tell: (n, GEOMETRY, H, W)."""
         x, y = (
-            (torch.arange(size) + 0.5) * (2 * self.half_extent_m / size) - self.half_extent_m
+            (torch.arange(size, device=device) + 0.5) * (2 * self.half_extent_m / size) - self.half_extent_m
             for size in (self.width, self.height)
         )
         x, y = x.expand(self.height, -1), y[:, None].expand(-1, self.width)
         r = torch.hypot(x, y)
         fixed = torch.stack([x / 32, y / 32, r / 32, x / r, y / r, r.log() / 3])
         told = [min(height, HIGHEST_M) if 0.0 <= height <= MAST_M else USUAL_M for height in heights]
-        height = torch.tensor(told, dtype=torch.float32)[:, None, None, None] / 5
+        height = torch.tensor(told, dtype=torch.float32).to(device)[:, None, None, None] / 5
         return torch.cat([fixed.expand(len(heights), -1, -1, -1), height.expand(-1, 1, self.height, self.width)], 1)
 
 
@@ -162,12 +162,14 @@ class Witness:
     Parameters
     ----------
     network : WitnessNetwork
+        On the device where messages are to be read.
     layout : Layout
     """
 
     def __init__(self, network: WitnessNetwork, layout: Layout) -> None:
         self.network = network.eval().requires_grad_(False)
         self.layout = layout
+        self._device = next(network.parameters()).device
 
     def testify(
         self,
@@ -232,8 +234,9 @@ class Witness:
     def _read(self, messages: Sequence[Message]) -> Float16Array:
         """What some messages say: (n, LAYERS, H, W)."""
         with torch.inference_mode():
-            read = self.read(self.layout.maps(messages), [float(message.pose[2, 3]) for message in messages])
-            maps: Float16Array = torch.nan_to_num(read).clamp(-LARGEST, LARGEST).half().numpy()
+            sent = self.layout.maps(messages, self._device)
+            read = self.read(sent, [float(message.pose[2, 3]) for message in messages])
+            maps: Float16Array = torch.nan_to_num(read).clamp(-LARGEST, LARGEST).half().cpu().numpy()
         return maps
 
     def read(self, maps: torch.Tensor, heights: Sequence[float]) -> torch.Tensor:
@@ -241,7 +244,7 @@ class Witness:
 
         ``heights`` are those of the sensors above ground, metres.
         """
-        testimony: torch.Tensor = self.network(maps, self.layout.geometry(heights))
+        testimony: torch.Tensor = self.network(maps, self.layout.geometry(heights, maps.device))
         return testimony
 
     def write(self, path: Path, info: DetectorInfo, recipe: dict[str, Any]) -> None:
@@ -257,7 +260,7 @@ class Witness:
 
     @classmethod
     def open(cls, path: Path, info: DetectorInfo) -> Witness:
-        """Read what `write` wrote for this detector.
+        """Read what `write` wrote for this detector, to its device.
 
         Raises
         ------
@@ -276,7 +279,7 @@ class Witness:
             network.load_state_dict({name: tensor.float() for name, tensor in tensors.items()})
         except RuntimeError as error:
             raise WeightsError(f"{path} does not fit the messages of {info.name}: {error}") from error
-        return cls(network, layout)
+        return cls(network.to(as_device(info.device)), layout)
 
 
 def as_testimony(agents: tuple[str, ...], maps: Float16Array, from_ego: FloatArray, half_extent_m: float) -> Testimony:

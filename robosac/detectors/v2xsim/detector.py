@@ -13,7 +13,6 @@ from copy import copy
 from pathlib import Path
 from typing import Any, ClassVar, Self
 
-import numpy as np
 import torch
 
 from robosac.boxes import BoolArray, FloatArray, as_pose
@@ -26,8 +25,9 @@ from robosac.detectors.base import (
     in_precision,
     witness_beside,
 )
+from robosac.detectors.device import CPU, stacked
 from robosac.detectors.map_fusion import FEATURES, Decode, Finder, Heads, MapFusionDetector, Maps
-from robosac.detectors.v2xsim.anchors import SCORE_THRESHOLD, detections, geometry
+from robosac.detectors.v2xsim.anchors import SCORE_THRESHOLD, detections_of_each, geometry
 from robosac.detectors.v2xsim.fast import FastDecoder
 from robosac.detectors.v2xsim.network import CHANNELS, MAP, V2XSimNetwork, select_published
 from robosac.detectors.v2xsim.voxels import AREA_M, PACKED_SHAPE, occupancy, pack, unpack
@@ -106,7 +106,6 @@ class V2XSimDetector(MapFusionDetector):
             self._network = V2XSimNetwork(select_published(tensors))
         except WeightsError as error:
             raise WeightsError(f"{weights}: {error}") from error
-        self._fast = FastDecoder(self._network)
         self._fusion = FUSIONS[fusion]
         self._score_threshold = float(self.recipe.get("score_threshold", SCORE_THRESHOLD))
         features = TensorSpec("float32", (CHANNELS, MAP, MAP), ("float16", "int8"))
@@ -124,13 +123,18 @@ class V2XSimDetector(MapFusionDetector):
             witness=witness_beside(weights),
             mirrored=self.mirrored,
         )
+        self.place()
 
     def in_precision(self, precision: Precision) -> Self:
         """As `robosac.detectors.base.Precise.in_precision`; messages stay float32."""
         other = copy(self)
-        other._fast = FastDecoder(self._network, precision)
         other.info = in_precision(self.info, precision)
+        other.place()
         return other
+
+    def place(self) -> None:
+        """As `MapFusionDetector.place`."""
+        self._fast = FastDecoder(self._network, self.info.precision, self.device)
 
     def encode(self, points: FloatArray, pose: FloatArray) -> Message:
         """As `robosac.detectors.base.Encoder.encode`; returns from 3 m below to 2 m above the sensor count."""
@@ -142,40 +146,40 @@ class V2XSimDetector(MapFusionDetector):
             features = self._network.levels(_as_maps(grid))[-1][0].contiguous()
         return Message(as_pose(pose), {FEATURES: features.numpy(), _GRID: pack(grid)})
 
+    def fused(self, maps: Maps) -> torch.Tensor:
+        """By the recipe's fusion."""
+        return self._fusion(torch.stack(list(maps)), dim=0)
+
     def decoder(self, ego: Message, own: torch.Tensor) -> Decode:
         """Logits (393216,) and codes (393216, 6) of all anchors; the decoder's part that is the ego's own, once."""
         context = self._network.context(_grid(ego), own[None])
 
         def decode(maps: Maps) -> Heads:
-            logits, codes = self._network.decode(self._fusion(torch.stack(list(maps)), dim=0)[None], context)
+            logits, codes = self._network.decode(self.fused(maps)[None], context)
             return logits[:, 1] - logits[:, 0], codes
 
         return decode
 
     def finder(self, ego: Message, own: torch.Tensor) -> Finder:
         """Boxes by the fast decoder, in this detector's precision."""
-        context = self._fast.context(_grid(ego), own[None])
+        context = self._fast.context(_grid(ego, self.device), own[None])
 
-        def find(maps: Maps) -> FloatArray:
-            logits, codes = self._fast.decode(self._fusion(torch.stack(list(maps)), dim=0)[None], context)
-            return detections(logits, codes, self._score_threshold)[0]
+        def find(fused: torch.Tensor) -> list[FloatArray]:
+            logits, codes = self._fast.decode(fused, context)
+            return [boxes for boxes, _ in detections_of_each(logits, codes, self._score_threshold)]
 
         return find
-
-    def boxes(self, logits: torch.Tensor, codes: torch.Tensor) -> FloatArray:
-        """As `detections` makes them."""
-        return detections(logits, codes, self._score_threshold)[0]
 
     def places(self, codes: torch.Tensor) -> torch.Tensor:
         """Boxes (393216, 6) of all anchors."""
         return geometry(codes)
 
 
-def _grid(ego: Message) -> torch.Tensor:
+def _grid(ego: Message, device: torch.device = CPU) -> torch.Tensor:
     """The ego's occupancy, as the network takes it."""
-    return _as_maps(unpack(ego.tensors[_GRID]))
+    return _as_maps(unpack(ego.tensors[_GRID]), device)
 
 
-def _as_maps(grid: BoolArray) -> torch.Tensor:
+def _as_maps(grid: BoolArray, device: torch.device = CPU) -> torch.Tensor:
     """A grid (256, 256, 13) as the network takes it (1, 13, 256, 256)."""
-    return torch.from_numpy(grid.transpose(2, 0, 1)[None].astype(np.float32))
+    return stacked([grid], device).permute(0, 3, 1, 2)

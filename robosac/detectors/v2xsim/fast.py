@@ -16,6 +16,7 @@ import torch
 from torch.nn import functional
 
 from robosac.detectors.base import Precision
+from robosac.detectors.device import CPU
 from robosac.detectors.v2xsim.network import ANCHORS, CODE, Conv, V2XSimNetwork, channels_last
 
 _DOUBLED = torch.tensor([[0, 0, 1], [0, 1, 1], [1, 1, 0], [1, 0, 0]], dtype=torch.float64)
@@ -29,9 +30,9 @@ class _Up:
     weight: torch.Tensor
 
     @classmethod
-    def of(cls, conv: Conv, dtype: torch.dtype) -> _Up:
+    def of(cls, conv: Conv, dtype: torch.dtype, device: torch.device) -> _Up:
         weight = torch.einsum("tk,oikl,sl->iots", _DOUBLED, conv.weight.double(), _DOUBLED)
-        return cls(channels_last(weight.to(dtype)))
+        return cls(channels_last(weight.to(device, dtype)))
 
     def __call__(self, maps: torch.Tensor) -> torch.Tensor:
         return functional.conv_transpose2d(maps, self.weight, stride=2, padding=1)
@@ -45,18 +46,20 @@ class FastDecoder:
     network : V2XSimNetwork
     precision : str
         What maps and weights are rounded to. Sums are made in float32.
+    device : torch.device
+        Where it computes, whereas the network is on the processor.
     """
 
-    def __init__(self, network: V2XSimNetwork, precision: Precision = "float32") -> None:
+    def __init__(self, network: V2XSimNetwork, precision: Precision = "float32", device: torch.device = CPU) -> None:
         self._dtype = dtype = getattr(torch, precision)
-        self._encoder = tuple(tuple(conv.to(dtype) for conv in level) for level in network.encoder[:3])
-        self._deepest = tuple(conv.to(dtype) for conv in network.deepest_level)
-        self._ups = tuple(_Up.of(join.below, dtype) for join in network.joins)
-        self._skips = tuple(join.skip.to(dtype) for join in network.joins)
-        self._seconds = tuple(join.second.to(dtype) for join in network.joins)
+        self._encoder = tuple(tuple(conv.to(dtype, device) for conv in level) for level in network.encoder[:3])
+        self._deepest = tuple(conv.to(dtype, device) for conv in network.deepest_level)
+        self._ups = tuple(_Up.of(join.below, dtype, device) for join in network.joins)
+        self._skips = tuple(join.skip.to(dtype, device) for join in network.joins)
+        self._seconds = tuple(join.second.to(dtype, device) for join in network.joins)
         hidden, pairs = network.classes
-        self._classes = hidden.to(dtype), _difference(pairs).to(dtype)
-        hidden, codes = network.codes
+        self._classes = hidden.to(dtype, device), _difference(pairs).to(dtype, device)
+        hidden, codes = (conv.to(torch.float32, device) for conv in network.codes)
         self._codes_hidden = hidden.weight.permute(2, 3, 1, 0).reshape(-1, hidden.weight.shape[0]), hidden.bias
         self._codes = codes.weight[:, :, 0, 0].T, codes.bias
 
@@ -78,13 +81,13 @@ class FastDecoder:
 
         Parameters
         ----------
-        fused : (1, 256, 32, 32) tensor
+        fused : (n, 256, 32, 32) tensor
         context : tuple of tensors
             As `context` returns it.
 
         Returns
         -------
-        logits : (393216,) float32 tensor
+        logits : (n, 393216) float32 tensor
             Of the vehicle, less that of the background; anchors as `V2XSimNetwork.decode` counts them.
         codes : Codes
         """
@@ -93,8 +96,8 @@ class FastDecoder:
         for i, skip in enumerate(skips, 1):
             maps = self._join(i, self._ups[i](maps), skip)
         hidden, classes = self._classes
-        logits = classes(hidden(maps).relu_())[0].permute(1, 2, 0).reshape(-1).float()
-        return logits, Codes(maps[0].permute(1, 2, 0), self._codes_hidden, self._codes)
+        logits = classes(hidden(maps).relu_()).permute(0, 2, 3, 1).reshape(len(fused), -1).float()
+        return logits, Codes(maps.permute(0, 2, 3, 1), self._codes_hidden, self._codes)
 
     def _join(self, i: int, below: torch.Tensor, skip: torch.Tensor) -> torch.Tensor:
         return self._seconds[i](below.add_(skip).relu_() if i else (below + skip).relu_()).relu_()
@@ -105,28 +108,38 @@ class Codes:
     """Box codes, computed for the anchors that one asks for."""
 
     maps: torch.Tensor
-    """(256, 256, 32): the decoder's last."""
+    """(n, 256, 256, 32): the decoder's last."""
     hidden: tuple[torch.Tensor, torch.Tensor]
     """Weight (288, 32) and bias of the 3 x 3 convolution."""
     out: tuple[torch.Tensor, torch.Tensor]
     """Weight (32, 36) and bias of the 1 x 1 convolution."""
 
     def __getitem__(self, anchors: torch.Tensor) -> torch.Tensor:
-        """Codes (n, 6), float32, of anchors (n,)."""
-        cells, which = torch.unique(anchors // ANCHORS, return_inverse=True)
+        """Codes (k, 6), float32, of anchors (k,); those of the second map are counted on from those of the first."""
+        cells, which = _distinct(anchors // ANCHORS)
         around = self._around(cells).float()
         hidden = torch.addmm(self.hidden[1], around, self.hidden[0]).relu_()
         codes = torch.addmm(self.out[1], hidden, self.out[0]).reshape(-1, ANCHORS, CODE)
         return codes[which, anchors % ANCHORS]
 
     def _around(self, cells: torch.Tensor) -> torch.Tensor:
-        """What the 3 x 3 places around each cell hold (n, 288); beyond the map zero."""
-        edge = self.maps.shape[0]
-        steps = torch.arange(-1, 2)
-        rows, columns = (cells // edge)[:, None] + steps, (cells % edge)[:, None] + steps
+        """What the 3 x 3 places around each cell hold (k, 288); beyond the map zero."""
+        edge = self.maps.shape[1]
+        steps = torch.arange(-1, 2, device=cells.device)
+        which = cells // edge**2
+        rows, columns = (cells // edge % edge)[:, None] + steps, (cells % edge)[:, None] + steps
         inside = ((rows >= 0) & (rows < edge))[:, :, None] & ((columns >= 0) & (columns < edge))[:, None]
-        values = self.maps[rows.clamp(0, edge - 1)[:, :, None], columns.clamp(0, edge - 1)[:, None]]
+        rows, columns = rows.clamp(0, edge - 1), columns.clamp(0, edge - 1)
+        values = self.maps[which[:, None, None], rows[:, :, None], columns[:, None]]
         return (values * inside[..., None]).flatten(1)
+
+
+def _distinct(cells: torch.Tensor) -> tuple[torch.Tensor, torch.Tensor]:
+    """Each cell once, and which of them each is; on an accelerator all, as it would be waited for to count them."""
+    if cells.device != CPU:
+        return cells, torch.arange(len(cells), device=cells.device)
+    distinct, which = torch.unique(cells, return_inverse=True)
+    return distinct, which
 
 
 def _difference(pairs: Conv) -> Conv:

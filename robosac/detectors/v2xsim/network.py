@@ -150,9 +150,9 @@ class Conv:
         padding = self.weight.shape[-1] // 2
         return functional.conv2d(maps, self.weight, self.bias, stride=self.stride, padding=padding)
 
-    def to(self, dtype: torch.dtype) -> Conv:
-        """The same in other numbers."""
-        return Conv(channels_last(self.weight.to(dtype)), self.bias.to(dtype), self.stride)
+    def to(self, dtype: torch.dtype, device: torch.device) -> Conv:
+        """The same in other numbers, and on another device."""
+        return Conv(channels_last(self.weight.to(device, dtype)), self.bias.to(device, dtype), self.stride)
 
     def split(self, channels: int) -> tuple[Conv, Conv]:
         """The parts that act on the first ``channels`` and on the others; their sum is the whole."""

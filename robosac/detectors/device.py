@@ -1,0 +1,50 @@
+"""The device that a detector computes on: the processor, or an accelerator of torch's."""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from dataclasses import replace
+from typing import Any
+
+import numpy as np
+import torch
+
+from robosac.detectors.base import DetectorInfo
+
+CPU = torch.device("cpu")
+
+
+def as_device(device: str) -> torch.device:
+    """A device by torch's name for it, such as ``cpu``, ``cuda`` or ``cuda:1``.
+
+    Raises
+    ------
+    ValueError
+        If torch cannot compute there.
+    """
+    try:
+        chosen = torch.device(device)
+        torch.ones(1, device=chosen).sum().item()
+    except (AssertionError, ImportError, RuntimeError) as error:  # torch has no type of its own for it
+        reason = (str(error).splitlines() or [type(error).__name__])[0]
+        raise ValueError(f"torch cannot compute on the device {device!r} here: {reason}") from error
+    return CPU if chosen.type == "cpu" else chosen
+
+
+def on_device(info: DetectorInfo, device: torch.device) -> DetectorInfo:
+    """The face of the same detector on a device."""
+    return replace(info, device=str(device))
+
+
+def stacked(arrays: Sequence[np.ndarray[Any, np.dtype[Any]]], device: torch.device = CPU) -> torch.Tensor:
+    """Arrays of one shape and type together on a device, float32 and in C order.
+
+    They go up in their own type, at once, and are widened there. Torch widens half floats several times faster than
+    numpy. To add maps of unlike layouts takes far longer, hence the C order.
+    """
+    if device.type == "cuda":
+        dtype = torch.from_numpy(np.empty(0, arrays[0].dtype)).dtype
+        pinned = torch.empty((len(arrays), *arrays[0].shape), dtype=dtype, pin_memory=True)
+        np.stack(arrays, out=pinned.numpy())
+        return pinned.to(device, non_blocking=True).float()
+    return torch.from_numpy(np.stack(arrays)).to(device).float().contiguous()
