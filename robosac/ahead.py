@@ -8,13 +8,13 @@ meanwhile. After it only fusions and their comparison are left. The answer is th
 from __future__ import annotations
 
 import time
-from collections.abc import Collection, Mapping
+from collections.abc import Collection, Mapping, Sequence
 
 from robosac.boxes import FloatArray
 from robosac.calibrated import witness_of
 from robosac.defenses import EGO
 from robosac.detectors import DetectorInfo, Message, PreparedFrame, Preparer
-from robosac.detectors.base import Growing
+from robosac.detectors.base import Batching, Growing
 from robosac.detectors.witness import Float16Array
 
 
@@ -120,3 +120,17 @@ class _Seen:
         if self._alone is not None and not teammates:
             return self._alone
         return self._prepared.detect(teammates)
+
+    @property
+    def worth(self) -> int:
+        """As `robosac.detectors.base.Batching.worth`; 1 where the detector's frames have none."""
+        return self._prepared.worth if isinstance(self._prepared, Batching) else 1
+
+    def detect_all(self, subsets: Sequence[Collection[str]]) -> list[FloatArray]:
+        """As `robosac.detectors.base.Batching.detect_all`."""
+        unknown = [subset for subset in subsets if subset or self._alone is None]
+        if isinstance(self._prepared, Batching):
+            found = iter(self._prepared.detect_all(unknown) if unknown else ())
+        else:
+            found = (self._prepared.detect(subset) for subset in unknown)
+        return [self._alone if not subset and self._alone is not None else next(found) for subset in subsets]

@@ -7,7 +7,7 @@ costs one fusion and one decoder pass (`PreparedFrame.detect`).
 
 from __future__ import annotations
 
-from collections.abc import Collection, Mapping
+from collections.abc import Collection, Mapping, Sequence
 from dataclasses import dataclass, field, replace
 from pathlib import Path
 from typing import TYPE_CHECKING, Any, Literal, Protocol, Self, cast, get_args, runtime_checkable
@@ -173,6 +173,18 @@ class Growing(Protocol):
 
     def add(self, teammates: Mapping[str, Message]) -> None:
         """Do for these teammates what `Preparer.prepare` does, with the same result."""
+
+
+@runtime_checkable
+class Batching(Protocol):
+    """A prepared frame that can decode several subsets at once."""
+
+    @property
+    def worth(self) -> int:
+        """How many subsets are worth decoding at once; 1 where that takes as long as one after the other."""
+
+    def detect_all(self, subsets: Sequence[Collection[str]]) -> list[FloatArray]:
+        """What `PreparedFrame.detect` gives for each, but for rounding."""
 
 
 class Preparer(Protocol):

@@ -23,7 +23,7 @@ from robosac.detectors.base import (
 )
 from robosac.detectors.decoding import cell_centres, decode_all
 from robosac.detectors.device import CPU
-from robosac.detectors.map_fusion import FEATURES, Decode, Finder, Heads, MapFusionDetector, Maps
+from robosac.detectors.map_fusion import FEATURES, Decode, Finder, Heads, MapFusionDetector, Maps, combined
 from robosac.detectors.network import CHANNELS, MAP, MeanFusionNetwork, fold_batchnorm
 from robosac.detectors.voxels import AREA_M, occupancy
 from robosac.detectors.weights_file import WeightsError, read_weights
@@ -126,6 +126,10 @@ class EmbeddedDetector(MapFusionDetector):
     def fused(self, maps: Maps) -> torch.Tensor:
         """The maps' mean."""
         return sum(maps[1:], maps[0]) / len(maps)
+
+    def fused_of_each(self, maps: torch.Tensor, chosen: FloatArray) -> torch.Tensor:
+        """As `MapFusionDetector.fused_of_each`."""
+        return combined(maps, chosen / chosen.sum(axis=1, keepdims=True))
 
     def decoder(self, ego: Message, own: torch.Tensor) -> Decode:  # noqa: ARG002
         """Logits (64, 64) and codes (6, 64, 64)."""

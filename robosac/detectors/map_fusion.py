@@ -21,6 +21,8 @@ from robosac.detectors.warp import sampling_matrix, warp
 
 FEATURES = "features"
 """The tensor of a message that holds its map."""
+WORTH = 8
+"""Subsets that an accelerator decodes at once, unless told otherwise: the ego alone, and seven hypotheses."""
 Maps = Sequence[torch.Tensor]
 Heads = tuple[torch.Tensor, torch.Tensor]
 """The class logit of each place where there might be a vehicle, and the codes of all boxes."""
@@ -41,10 +43,19 @@ class MapFusionDetector(ABC):
     """Whether columns of the maps run along minus x."""
     device: torch.device = CPU
     """Where frames are prepared and decoded."""
+    worth: int = 1
+    """As `robosac.detectors.base.Batching.worth` of its frames."""
 
     @abstractmethod
     def fused(self, maps: Maps) -> torch.Tensor:
         """Maps (C, H, W), all in the ego's frame and the ego's first, as one."""
+
+    def fused_of_each(self, maps: torch.Tensor, chosen: FloatArray) -> torch.Tensor:
+        """As `fused`, (n, C, H, W), of those maps (m, C, H, W) that are 1 in each row of ``chosen`` (n, m), float32.
+
+        By default they are fused one after the other. Where `fused` is linear, `combined` does all at once.
+        """
+        return torch.stack([self.fused([maps[i] for i in np.flatnonzero(row).tolist()]) for row in chosen])
 
     @abstractmethod
     def decoder(self, ego: Message, own: torch.Tensor) -> Decode:
@@ -64,10 +75,15 @@ class MapFusionDetector(ABC):
     def place(self) -> None:
         """Put what `finder` needs onto the detector's device."""
 
-    def on_device(self, device: str) -> Self:
-        """As `robosac.detectors.base.Placeable.on_device`."""
+    def on_device(self, device: str, worth: int | None = None) -> Self:
+        """As `robosac.detectors.base.Placeable.on_device`.
+
+        ``worth`` is how many subsets its frames decode at once. By default it is 1 on the processor, and `WORTH` on
+        anything else.
+        """
         other = deepcopy(self)
         other.device = as_device(device)
+        other.worth = worth or (1 if other.device == CPU else WORTH)
         other.info = on_device(self.info, other.device)
         other.place()
         return other
@@ -112,8 +128,16 @@ def _sent(messages: Sequence[Message], device: torch.device = CPU) -> torch.Tens
     return stacked([message.tensors[FEATURES] for message in messages], device)
 
 
+def combined(maps: torch.Tensor, weights: FloatArray) -> torch.Tensor:
+    """Sums (n, C, H, W) of maps (m, C, H, W), each with its weight in a row of ``weights`` (n, m), float32."""
+    return (torch.from_numpy(weights).to(maps.device) @ maps.flatten(1)).reshape(-1, *maps.shape[1:])
+
+
 class PreparedMaps:
-    """A frame to be decoded for many subsets; see `robosac.detectors.base.PreparedFrame`, and `Growing` there."""
+    """A frame to be decoded for many subsets.
+
+    See `robosac.detectors.base.PreparedFrame`, and `Growing` and `Batching` there.
+    """
 
     def __init__(self, detector: MapFusionDetector, ego: Message) -> None:
         self._detector = detector
@@ -122,6 +146,12 @@ class PreparedMaps:
             self.own = detector.unscaled(_sent([ego], detector.device))[0]
             self._find = detector.finder(ego, self.own)
         self.warped: dict[str, torch.Tensor] = {}
+        self._together: torch.Tensor | None = None
+
+    @property
+    def worth(self) -> int:
+        """As the detector's."""
+        return self._detector.worth
 
     def add(self, teammates: Mapping[str, Message]) -> None:
         """Warp the maps of these teammates."""
@@ -129,12 +159,26 @@ class PreparedMaps:
             with torch.inference_mode():
                 warped = self._detector.laid(self._ego, teammates.values())
             self.warped.update(zip(teammates, warped, strict=True))
+            self._together = None
 
     def detect(self, teammates: Collection[str] = ()) -> FloatArray:
         """Boxes (n, 6) of the ego fused with these teammates; with none, of the ego alone."""
         with torch.inference_mode():
             fused = self._detector.fused([self.own, *(self.warped[name] for name in teammates)])
             return self._find(fused[None])[0]
+
+    def detect_all(self, subsets: Sequence[Collection[str]]) -> list[FloatArray]:
+        """Boxes (k, 6) of each subset, as `detect` gives them but for rounding."""
+        row = {name: i for i, name in enumerate(self.warped, 1)}
+        chosen = np.zeros((len(subsets), 1 + len(row)), dtype=np.float32)
+        chosen[:, 0] = 1.0
+        for i, subset in enumerate(subsets):
+            chosen[i, [row[name] for name in subset]] = 1.0
+        with torch.inference_mode():
+            if self._together is None:
+                # a map that overflowed is none of those that are fused without it, but infinity times 0 is no number
+                self._together = torch.nan_to_num(torch.stack([self.own, *self.warped.values()]))
+            return self._find(self._detector.fused_of_each(self._together, chosen))
 
 
 class MapSurface:

@@ -26,7 +26,7 @@ from robosac.detectors.base import (
     witness_beside,
 )
 from robosac.detectors.device import CPU, stacked
-from robosac.detectors.map_fusion import FEATURES, Decode, Finder, Heads, MapFusionDetector, Maps
+from robosac.detectors.map_fusion import FEATURES, Decode, Finder, Heads, MapFusionDetector, Maps, combined
 from robosac.detectors.v2xsim.anchors import SCORE_THRESHOLD, detections_of_each, geometry
 from robosac.detectors.v2xsim.fast import FastDecoder
 from robosac.detectors.v2xsim.network import CHANNELS, MAP, V2XSimNetwork, select_published
@@ -149,6 +149,12 @@ class V2XSimDetector(MapFusionDetector):
     def fused(self, maps: Maps) -> torch.Tensor:
         """By the recipe's fusion."""
         return self._fusion(torch.stack(list(maps)), dim=0)
+
+    def fused_of_each(self, maps: torch.Tensor, chosen: FloatArray) -> torch.Tensor:
+        """As `MapFusionDetector.fused_of_each`."""
+        if self._fusion is FUSIONS["max"]:
+            return super().fused_of_each(maps, chosen)
+        return combined(maps, chosen / chosen.sum(axis=1, keepdims=True) if self._fusion is FUSIONS["mean"] else chosen)
 
     def decoder(self, ego: Message, own: torch.Tensor) -> Decode:
         """Logits (393216,) and codes (393216, 6) of all anchors; the decoder's part that is the ego's own, once."""

@@ -3,10 +3,12 @@ import pytest
 import torch
 
 from robosac.detectors import load
+from robosac.detectors.map_fusion import WORTH
 from robosac.detectors.v2xsim import anchors, write_weights
 from tests.robosac.detectors.elsewhere import elsewhere
 
 ANCHORS = 256 * 256 * 6
+SUBSETS = [(), ("car-0", "car-2"), ("car-1",), ("car-0", "car-1", "car-2")]
 
 
 @pytest.mark.parametrize("fusion", ["mean", "max", "sum"])
@@ -19,11 +21,26 @@ def test_a_frame_is_prepared_and_decoded_there(fusion, published_state, tmp_path
         far = load(path, device=device)
         prepared = far.prepare(ego, others)
         assert {maps.device.type for maps in (prepared.own, *prepared.warped.values())} == {device}
-        found = [prepared.detect(subset) for subset in ((), ("car-0", "car-2"))]
-    assert far.info.device == device
-    for boxes, expected in zip(found, [here.detect(), here.detect(("car-0", "car-2"))], strict=True):
-        assert len(expected) > 0
-        np.testing.assert_allclose(boxes, expected, atol=1e-4)  # how many rows one multiplies changes how it rounds
+        found = [prepared.detect(subset) for subset in SUBSETS]
+        at_once = prepared.detect_all(SUBSETS)
+    assert (far.info.device, prepared.worth, here.worth) == (device, WORTH, 1)
+    expected = [here.detect(subset) for subset in SUBSETS]
+    assert min(map(len, expected)) > 0
+    # how many rows one multiplies, and in which order one sums, changes how it is rounded
+    for one, another, and_here, right in zip(found, at_once, here.detect_all(SUBSETS), expected, strict=True):
+        for boxes in (one, another, and_here):
+            np.testing.assert_allclose(boxes, right, atol=2e-4)
+
+
+@pytest.mark.parametrize("fusion", ["mean", "sum"])
+def test_what_overflows_in_one_message_spoils_no_fusion_without_it(fusion, published_state, tmp_path, team):
+    path = tmp_path / f"{fusion}.safetensors"
+    write_weights(published_state, fusion, path)
+    prepared = load(path).prepare(team[0], {f"car-{k}": message for k, message in enumerate(team[1:3])})
+    prepared.warped["car-0"] = torch.full_like(prepared.warped["car-0"], torch.inf)
+    spoilt, sound = prepared.detect_all([("car-0", "car-1"), ("car-1",)])
+    np.testing.assert_allclose(sound, prepared.detect(("car-1",)), atol=2e-4)
+    assert np.isfinite(spoilt).all()
 
 
 @pytest.mark.parametrize("candidates", [0, 40, 5000])
