@@ -56,11 +56,21 @@ class Deadline:
         yield
         self._paused_s += self.clock() - began
 
-    def another_fits(self) -> bool:
+    def another_fits(self, takes_a_pass: bool = True) -> bool:
         """Whether one more hypothesis may be tested: its pass is expected to end in time. It then counts as tested."""
-        fits = self._left > 0 and self.clock() + SAFETY * self._dearest_s <= self._end
+        fits = self._left > 0 and self.clock() + SAFETY * self._dearest_s * takes_a_pass <= self._end
         self._left -= fits
         return fits
+
+    def room(self, most: int) -> int:
+        """How many hypotheses, at most so many, may be decoded at once with another one.
+
+        All together may take as long as one after the other.
+        """
+        left_s, each_s = self._end - self.clock(), SAFETY * self._dearest_s
+        if left_s < (most + 1) * each_s:
+            most = int(left_s / each_s) - 1 if each_s > 0 else 0
+        return int(max(0, min(most, self._left)))
 
     def reading(self, share: float) -> Callable[[Collection[str]], bool]:
         """Whether there is time to read the messages of some agents, to be asked of one group after another just before

@@ -7,7 +7,7 @@ detector decodes them, the consensus test judges, and the defence learns, until 
 from __future__ import annotations
 
 import logging
-from collections.abc import Collection, Iterator, Mapping, Sequence
+from collections.abc import Collection, Iterable, Iterator, Mapping, Sequence
 from contextlib import contextmanager
 from dataclasses import dataclass, field, fields
 from typing import Any, TypeVar
@@ -34,9 +34,11 @@ from robosac.defenses import (
     shipped,
     trusted_in,
 )
-from robosac.detectors import Message, PreparedFrame, Preparer
+from robosac.defenses.batch import likely_after
+from robosac.detectors import Message, Preparer
 from robosac.detectors.base import Testifying
 from robosac.faults import describe
+from robosac.passes import Passes
 from robosac.previous import PreviousAnswer
 from robosac.provenance import UnverifiedAnswer, best_first, unfounded
 from robosac.result import FusionResult
@@ -144,12 +146,12 @@ class FrameRun:
                 screened = self._screen(self.screening, memory, teammates)
             passed = {name: teammates[name] for name in team if name not in screened.refused}
             yield
-            prepared = self._prepare(passed)
+            passes = self._prepare(passed)
             if getattr(self.defense, "asks_witnesses", False):
                 yield
                 yield from self._hear(passed, trusted_in(state))
-            decision = yield from self._converse(prepared, list(passed), state, rng)
-            answered = yield from self._assemble(prepared, decision)
+            decision = yield from self._converse(passes, list(passed), state, rng)
+            answered = yield from self._assemble(passes, decision)
         except Exception as error:
             logger.exception("fusion failed; answering with the ego's own perception")
             self.fault = describe(error)
@@ -178,9 +180,9 @@ class FrameRun:
         with self._spending("screening"):
             return tests.screen(memory, self.frame, self.ego, teammates)
 
-    def _prepare(self, teammates: Mapping[str, Message]) -> PreparedFrame:
+    def _prepare(self, teammates: Mapping[str, Message]) -> Passes:
         with self._spending("prepare"):
-            return self.detector.prepare(self.ego, teammates)
+            return Passes(self.detector.prepare(self.ego, teammates), self.deadline, self.boxes)
 
     def _hear(self, teammates: Mapping[str, Message], trusted: Collection[str]) -> Steps[None]:
         """Ask the witness what each message says by itself, of as many as there is time for: the ego's first, then
@@ -210,14 +212,12 @@ class FrameRun:
             with self.deadline.pause():
                 yield
 
-    def _converse(
-        self, prepared: PreparedFrame, team: list[str], state: State, rng: np.random.Generator
-    ) -> Steps[Decision]:
+    def _converse(self, passes: Passes, team: list[str], state: State, rng: np.random.Generator) -> Steps[Decision]:
         conversation = self.defense.converse(team, state, rng)
         try:
             batch = next(conversation)
             while True:
-                batch = conversation.send((yield from self._test(prepared, batch)))
+                batch = conversation.send((yield from self._test(passes, batch)))
         except StopIteration as stop:
             decision: Decision = stop.value
         self._check(decision, team, state)
@@ -245,24 +245,24 @@ class FrameRun:
         if self.defense.kind not in shipped():  # those that ship are known to keep JSON, and theirs may be long
             rfc8785.dumps(dict(decision.state))
 
-    def _assemble(self, prepared: PreparedFrame, decision: Decision) -> Steps[dict[str, Any]]:
+    def _assemble(self, passes: Passes, decision: Decision) -> Steps[dict[str, Any]]:
         """The fields of the result that hold boxes, and whose they are; judged ones are checked by now."""
         if decision.objects is None:
-            return {"boxes": (yield from self._decode(prepared, decision.accepted))}
+            return {"boxes": (yield from self._decode(passes, decision.accepted))}
         objects, boxes = best_first(decision.objects, self.boxes)
         contradicted, left_out = best_first(decision.contradicted, self.boxes)
         return {"objects": objects, "boxes": boxes, "contradicted": contradicted, "contradicted_boxes": left_out}
 
-    def _test(self, prepared: PreparedFrame, batch: Sequence[Hypothesis]) -> Steps[list[Outcome]]:
+    def _test(self, passes: Passes, batch: Sequence[Hypothesis]) -> Steps[list[Outcome]]:
         tested: list[Outcome] = []
-        for subset in batch:
-            reference = yield from self._reference(prepared)
-            if subset not in self.boxes:
+        for i, subset in enumerate(batch):
+            reference = yield from self._reference(passes, likely_after(batch, i))
+            if takes := passes.takes(subset):
                 yield
-            if not self.deadline.another_fits():
+            if not self.deadline.another_fits(takes):
                 self.out_of_time = True
                 break
-            boxes = self._decoded(prepared, subset)
+            boxes = self._decoded(passes, subset, likely_after(batch, i))
             with self._spending("consensus"):
                 comparison = compare(reference, self._confident(boxes), self.defense.consensus_threshold)
             index, verdict = comparison.jaccard_index, comparison.verdict
@@ -271,23 +271,20 @@ class FrameRun:
             self.outcomes.append(tested[-1])
         return tested
 
-    def _reference(self, prepared: PreparedFrame) -> Steps[FloatArray]:
+    def _reference(self, passes: Passes, likely: Iterable[Hypothesis]) -> Steps[FloatArray]:
         before = self.previous
         if self.defense.reference is Reference.PREVIOUS and before is not None and before.frame == self.frame - 1:
             return self._confident(before.expected_at(self.ego.pose))
-        return self._confident((yield from self._decode(prepared, ())))
+        return self._confident((yield from self._decode(passes, (), likely)))
 
-    def _decode(self, prepared: PreparedFrame, subset: Hypothesis) -> Steps[FloatArray]:
-        if subset not in self.boxes:
+    def _decode(self, passes: Passes, subset: Hypothesis, likely: Iterable[Hypothesis] = ()) -> Steps[FloatArray]:
+        if passes.takes(subset):
             yield
-        return self._decoded(prepared, subset)
+        return self._decoded(passes, subset, likely)
 
-    def _decoded(self, prepared: PreparedFrame, subset: Hypothesis) -> FloatArray:
-        """Boxes of a subset; each is decoded once a frame."""
-        if subset not in self.boxes:
-            with self._spending("hypotheses" if subset else "ego_only"), self.deadline.a_pass():
-                self.boxes[subset] = prepared.detect(subset)
-        return self.boxes[subset]
+    def _decoded(self, passes: Passes, subset: Hypothesis, likely: Iterable[Hypothesis]) -> FloatArray:
+        with self._spending("hypotheses" if subset else "ego_only"):
+            return passes.decode(subset, likely)
 
     def _confident(self, boxes: FloatArray) -> FloatArray:
         return at_least(boxes, self.detector.info.consensus_score)

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 from robosac.answers import Distrust, Reason, Source, Standing, Support, Verdict
 from robosac.defenses.a2cp import A2CP
+from robosac.defenses.batch import Batch
 from robosac.defenses.conformal import Conformal
 from robosac.defenses.group_testing import GroupTesting
 from robosac.defenses.halving import Halving
@@ -34,6 +35,7 @@ from robosac.defenses.undefended import Undefended
 
 __all__ = [
     "A2CP",
+    "Batch",
     "Conformal",
     "ConsensusSettings",
     "Conversation",

@@ -2,7 +2,10 @@
 
 from __future__ import annotations
 
-from collections.abc import Sequence
+from collections.abc import Iterator, Sequence
+from copy import deepcopy
+from functools import partial
+from itertools import islice
 from math import comb
 from typing import ClassVar, Literal
 
@@ -11,6 +14,7 @@ from pydantic import Field
 
 from robosac.answers import Verdict
 from robosac.budget import DEFAULT_CONFIDENCE, DomainError, eq2_budget
+from robosac.defenses.batch import Batch
 from robosac.defenses.protocol import Asking, Conversation, Hypothesis, Outcome, State, conclude
 from robosac.defenses.sampling import Budget, Confidence, draw, search
 from robosac.defenses.settings import ConsensusSettings
@@ -100,24 +104,20 @@ class A2CP(ConsensusSettings):
         """Steps 1 and 2; returns the counters and the estimate, if there is a new one."""
         attempts, bounds = list(state["attempts"]), list(state["bounds"])
         estimate: float | None = None
-        while len(outcomes) < self.sampling_budget:
-            before = len(outcomes)
-            for k, ratio in enumerate(state["ratios"]):
-                s = round(state["team_size"] * (1 - ratio))
-                if len(outcomes) == self.sampling_budget or attempts[k] >= bounds[k] or s > len(team):
-                    continue
-                tested = yield [draw(team, s, rng)]
-                if not tested:
-                    return attempts, estimate
-                outcomes.extend(tested)
-                if tested[0].verdict is Verdict.CONSENSUS:
-                    estimate = ratio
-                    attempts[k:] = bounds[k:]
-                    break
-                if tested[0].verdict is Verdict.DISSENSUS:
-                    attempts[k] += 1
-            if len(outcomes) == before:
+        visits = _visits(state, attempts, len(team))
+        for left in range(self.sampling_budget - 1, -1, -1):
+            k, s = next(visits, (None, 0))
+            if k is None:
                 break
+            tested = yield Batch([draw(team, s, rng)], partial(_next_probes, team, state, rng, attempts, k, left))
+            if not tested:
+                break
+            outcomes.extend(tested)
+            if tested[0].verdict is Verdict.CONSENSUS:
+                estimate = state["ratios"][k]
+                attempts[k:] = bounds[k:]
+            elif tested[0].verdict is Verdict.DISSENSUS:
+                attempts[k] += 1
         return attempts, estimate
 
     def _settled(
@@ -142,3 +142,30 @@ class A2CP(ConsensusSettings):
                 raise DomainError(f"ratio {ratio} does not mean a whole number of attackers in a team of {team_size}")
             benign.append(round(s))
         return benign if team_size else []
+
+
+def _visits(state: State, attempts: Sequence[int], present: int, first: int = 0) -> Iterator[tuple[int, int]]:
+    """Each k to be tried next, and its number of teammates, in rounds as long as one is tried.
+
+    The first round begins with k = ``first``. It is looked at what ``attempts`` holds at each step.
+    """
+    tried = True
+    while tried:
+        tried = first > 0
+        for k in range(first, len(attempts)):
+            s = round(state["team_size"] * (1 - state["ratios"][k]))
+            if attempts[k] < state["bounds"][k] and s <= present:
+                tried = True
+                yield k, s
+        first = 0
+
+
+def _next_probes(
+    team: Sequence[str], state: State, rng: np.random.Generator, attempts: Sequence[int], k: int, left: int
+) -> Iterator[Hypothesis]:
+    """What is probed after k while all are in dissensus."""
+    attempts, rng = list(attempts), deepcopy(rng)
+    attempts[k] += 1
+    for following, s in islice(_visits(state, attempts, len(team), k + 1), left):
+        yield draw(team, s, rng)
+        attempts[following] += 1

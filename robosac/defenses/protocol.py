@@ -2,7 +2,8 @@
 
 A defence is a conversation: a generator that yields a batch of hypotheses (subsets of the team), is sent an `Outcome`
 for each that was tested, and returns a `Decision`. It knows nothing of detectors or clocks. If it is sent fewer
-outcomes than it proposed hypotheses, the time is up: it must return its decision from what it knows.
+outcomes than it proposed hypotheses, the time is up: it must return its decision from what it knows. A
+`robosac.defenses.Batch` also tells what it is likely to propose later.
 
 What a defence remembers between frames is its *state*, a plain dict of JSON values that the caller keeps per session.
 Most of it only the defence reads. Others read whom it trusts, names and suspects: `remembered` writes that, and

@@ -2,7 +2,9 @@
 
 from __future__ import annotations
 
-from collections.abc import Sequence
+from collections.abc import Iterator, Sequence
+from copy import deepcopy
+from functools import partial
 from math import comb
 from typing import Annotated, Any, ClassVar, Self
 
@@ -17,6 +19,7 @@ from robosac.budget import (
     exact_budget,
     exact_collaborators,
 )
+from robosac.defenses.batch import Batch
 from robosac.defenses.memoryless import Memoryless
 from robosac.defenses.protocol import Asking, Hypothesis, Outcome
 
@@ -116,20 +119,37 @@ def search(
     tuple of str
         The subset in consensus; empty if there is none.
     """
-    (s, left), seen = plan, set[Hypothesis]()
-    while left > 0:
-        subset = draw(team, s, rng)
-        if distinct and subset in seen:  # so that large teams cost no memory
-            continue
-        seen.add(subset)
-        left -= 1
-        tested = yield [subset]
+    (s, n), seen = plan, set[Hypothesis]() if distinct else None
+    for tries, subset in enumerate(_draws(team, plan, rng, seen), 1):
+        tested = yield Batch([subset], partial(_next_draws, team, (s, n - tries), rng, seen))
         outcomes.extend(tested)
         if not tested:
             break
         if tested[0].verdict is Verdict.CONSENSUS:
             return subset
     return ()
+
+
+def _draws(
+    team: Sequence[str], plan: tuple[int, int], rng: np.random.Generator, seen: set[Hypothesis] | None
+) -> Iterator[Hypothesis]:
+    """Random subsets by a plan as `search` takes it; none of those ``seen``, if it is said which."""
+    s, left = plan
+    while left > 0:
+        subset = draw(team, s, rng)
+        if seen is not None:
+            if subset in seen:  # so that large teams cost no memory
+                continue
+            seen.add(subset)
+        left -= 1
+        yield subset
+
+
+def _next_draws(
+    team: Sequence[str], plan: tuple[int, int], rng: np.random.Generator, seen: set[Hypothesis] | None
+) -> Iterator[Hypothesis]:
+    """What `_draws` will give."""
+    return _draws(team, plan, deepcopy(rng), None if seen is None else set(seen))
 
 
 def draw(team: Sequence[str], s: int, rng: np.random.Generator) -> Hypothesis:

@@ -92,3 +92,34 @@ def test_nothing_is_read_once_it_is_late():
 def test_a_recorded_one_reads_what_was_read():
     fits = Recorded(None, ["c"]).reading(0.5)
     assert [fits(group) for group in (["a", "b"], ["c", "d"])] == [True, False]
+
+
+def test_there_is_room_for_as_many_as_would_fit_one_after_the_other():
+    clock = Clock()
+    deadline = Deadline(10.0, clock=clock)
+    assert deadline.room(7) == 7  # nothing is known of what a pass takes
+    deadline.expect(1.0)
+    assert [deadline.room(most) for most in (20, 7, 3)] == [int(10.0 / SAFETY) - 1, 7, 3]
+    clock.now = 10.0 - SAFETY * 1.5
+    assert deadline.room(7) == 0
+    clock.now = 10.1
+    assert deadline.room(7) == 0
+    assert Deadline(0.0, clock=clock).room(7) == 0
+    assert Deadline().room(7) == 7
+
+
+def test_there_is_room_for_no_more_than_may_be_tested():
+    deadline = Deadline(hypotheses=3)
+    assert deadline.room(7) == 3
+    assert deadline.another_fits()
+    assert deadline.room(7) == 2
+
+
+def test_what_takes_no_pass_fits_until_the_end():
+    clock = Clock()
+    deadline = Deadline(10.0, clock=clock, hypotheses=1)
+    deadline.expect(5.0)
+    clock.now = 9.0
+    assert not deadline.another_fits()
+    assert deadline.another_fits(takes_a_pass=False)
+    assert not deadline.another_fits(takes_a_pass=False)  # it counts, too

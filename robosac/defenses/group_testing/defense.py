@@ -2,14 +2,16 @@
 
 from __future__ import annotations
 
-from collections.abc import Sequence
+from collections.abc import Iterator, Sequence
 from dataclasses import dataclass, field
+from functools import partial
 from typing import ClassVar, Literal, Self
 
 import numpy as np
 from pydantic import Field
 
 from robosac.consensus import DEFAULT_THRESHOLD
+from robosac.defenses.batch import Batch
 from robosac.defenses.group_testing.calibration import Calibration
 from robosac.defenses.group_testing.candidates import unresolved
 from robosac.defenses.group_testing.evidence import Evidence
@@ -20,7 +22,7 @@ from robosac.defenses.group_testing.knowledge import Knowledge, remember
 from robosac.defenses.group_testing.memory import Memory
 from robosac.defenses.group_testing.model import LIE, CalibrationError, EvidenceModel
 from robosac.defenses.group_testing.posterior import Hazards, Posterior
-from robosac.defenses.protocol import Conversation, Reference, State, named_in, trusted_in
+from robosac.defenses.protocol import Conversation, Hypothesis, Reference, State, named_in, trusted_in
 from robosac.defenses.sampling import MAX_BUDGET
 from robosac.defenses.settings import LEAST, DefenseSettings
 
@@ -218,7 +220,7 @@ class GroupTesting:
                 subset = inspection.next_test(judged.best_answer()) if inspections >= 0 else None
             if subset is None:
                 break
-            tested = yield [subset]
+            tested = yield Batch([subset], partial(_likely, subset, tuple(team), judged, known))
             if not tested:
                 break
             evidence.learn(tested[0], inspection.learn(tested[0]))
@@ -240,3 +242,14 @@ class GroupTesting:
         for name in sorted(set(team) - set(posterior.members)):
             prior = self.settings.attack_prior * self.settings.attacker_prior
             posterior.add(name, memory.welcome(name, prior))
+
+
+def _likely(subset: Hypothesis, team: Hypothesis, judged: JudgedFrame, known: Knowledge) -> Iterator[Hypothesis]:
+    """What may be asked for next: a subset, what would be answered now, and the team; each also without one of them,
+    the most suspected first.
+    """
+    suspicion = known.suspicion()
+    for whole in (subset, judged.best_answer(), team):
+        yield whole
+        for left_out in sorted(whole, key=lambda name: -suspicion[name]):
+            yield tuple(name for name in whole if name != left_out)
