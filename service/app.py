@@ -142,7 +142,7 @@ class _App(FastAPI):
 def _built(
     settings: Settings, api_keys: ApiKeys, tokens: Tokens, seeds: Callable[[], str], tracing: Tracing
 ) -> Gateway:
-    engine, metrics = Engine(settings.torch_threads, settings.extra_detectors), Metrics()
+    engine, metrics = Engine(settings.torch_threads, settings.extra_detectors, settings.device), Metrics()
     admission = Admission(settings.max_hypotheses, engine)
     store = Store(
         settings.database_url,
@@ -181,6 +181,7 @@ async def _running(gateway: Gateway, settings: Settings, tokens: Tokens, tracing
     """Start what a gateway needs, and stop it after the block or when the start fails."""
     store, engine = gateway.store, gateway.engine
     try:
+        await blamed_on("ROBOSAC_DEVICE", engine.find_device())
         await asyncio.gather(
             blamed_on("ROBOSAC_DATABASE_URL", store.start()),
             blamed_on("ROBOSAC_EXTRA_DETECTORS", engine.start()),
@@ -199,6 +200,7 @@ async def _running(gateway: Gateway, settings: Settings, tokens: Tokens, tracing
             "gateway ready",
             version=version("robosac"),
             detectors=list(engine.detectors),
+            device=settings.device,
             gateway=gateway.sessions.moving.name,
         )
         try:

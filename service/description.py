@@ -54,6 +54,7 @@ _DETECTOR = {
     "cell_m": 2.0,
     "weights_digest": _HASH,
     "precision": "float32",
+    "device": "cpu",
     "consensus_score": 0.3,
     "calibration": {"kinds": ["pgd", "erase", "open"], "pose_errors_m": [0.0, 0.2], "digest": _HASH},
 }

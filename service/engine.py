@@ -21,7 +21,9 @@ import torch
 from robosac.ahead import Ahead
 from robosac.deadline import Deadline
 from robosac.defenses import EGO
-from robosac.detectors import Detector, Message, Preparer, available, blank, load
+from robosac.detectors import Detector, Message, Preparer, available, load
+from robosac.detectors.device import as_device
+from robosac.detectors.loading import warm_up
 from robosac.fusion import FusionResult
 from robosac.session import Session
 from robosac.steps import Steps
@@ -145,10 +147,13 @@ class Engine:
         Torch threads of one pass.
     extra_detectors : sequence of str
         Beside those that ship, or in the place of one of the same name: weights files or ``module:callable``.
+    device : str
+        Where detectors compute, see `robosac.detectors.device.as_device`.
     """
 
-    def __init__(self, threads: int, extra_detectors: Sequence[str] = ()) -> None:
+    def __init__(self, threads: int, extra_detectors: Sequence[str] = (), device: str = "cpu") -> None:
         self._extra = extra_detectors
+        self._device = device
         self._executor = ThreadPoolExecutor(1, "fusion", initializer=torch.set_num_threads, initargs=(threads,))
         self._lock = threading.Lock()
         self._turns = Turns()
@@ -162,6 +167,10 @@ class Engine:
         """Loaded detectors by name; empty before `start`."""
         return self._detectors
 
+    async def find_device(self) -> None:
+        """Raise `ValueError` if torch cannot compute on the device."""
+        await self._submit(partial(as_device, self._device))
+
     async def start(self) -> None:
         """Load every detector and run one frame through each, so that the first answer is as fast as the next.
 
@@ -170,14 +179,16 @@ class Engine:
         ValueError
             If a detector cannot be loaded, or two extra ones have the same name.
         """
-        extra = [await self._submit(partial(load, detector)) for detector in self._extra]
+        extra = [await self._submit(partial(load, detector, self._device)) for detector in self._extra]
         own = {detector.info.name: detector for detector in extra}
         if len(own) < len(extra):
             raise ValueError(f"two of the extra detectors have the same name: {[d.info.name for d in extra]}")
-        shipped = {name: await self._submit(partial(load, name)) for name in available() if name not in own}
+        shipped = {
+            name: await self._submit(partial(load, name, self._device)) for name in available() if name not in own
+        }
         self._detectors = shipped | own
         for detector in self._detectors.values():
-            await self._submit(partial(_warm_up, detector))
+            await self._submit(partial(warm_up, detector))
         self.ready = True
 
     def check_ready(self) -> None:
@@ -284,11 +295,3 @@ class Engine:
 
     async def _submit(self, work: Callable[[], T]) -> T:
         return await asyncio.get_running_loop().run_in_executor(self._executor, work)
-
-
-def _warm_up(detector: Detector) -> None:
-    ego, teammate = blank(detector.info, "ego"), blank(detector.info, "teammate")
-    for _ in range(2):
-        prepared = detector.prepare(ego, {"a": teammate, "b": teammate})
-        prepared.detect()
-        prepared.detect(["a", "b"])

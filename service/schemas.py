@@ -188,6 +188,7 @@ class DetectorEntry(_Shown):
     cell_m: float
     weights_digest: str = Field(description="SHA-256 of the weights file")
     precision: str = Field(description="numbers in which fused maps are decoded")
+    device: str = Field(description="where it computes, by torch's name")
     consensus_score: float = Field(description="boxes from this score on take part in the consensus test")
     calibration: CalibrationEntry | None
 

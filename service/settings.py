@@ -155,6 +155,7 @@ class Settings(BaseSettings):
     )
     log_level: Literal["debug", "info", "warning", "error"] = Field("info", description="Least of what is logged.")
     log_format: Literal["json", "console"] = Field("json", description="One JSON object a line, or for the eye.")
+    device: str = Field("cpu", description="Where detectors compute, by torch's name: cpu, cuda, cuda:1.")
     torch_threads: int = Field(
         1, ge=1, le=1024, description="Threads of one detector pass; at this size one is fastest."
     )

@@ -9,7 +9,7 @@ from __future__ import annotations
 import os
 from pathlib import Path
 
-from robosac.detectors.base import Detector, Placeable, Precise, Preparer, split_precision
+from robosac.detectors.base import Batching, Detector, Placeable, Precise, Preparer, blank, split_precision
 from robosac.detectors.device import CPU, as_device
 from robosac.detectors.embedded import EmbeddedDetector
 from robosac.detectors.weights_file import WeightsError, read_weights
@@ -54,6 +54,17 @@ def load(detector: str | os.PathLike[str] = DEFAULT_DETECTOR, device: str = "cpu
     if not isinstance(loaded, Placeable):
         raise ValueError(f"{detector} cannot compute on {device}: it has no method on_device")
     return loaded.on_device(device)
+
+
+def warm_up(detector: Preparer) -> None:
+    """Run frames of zeros through a detector, so that the first one is as fast as the next."""
+    ego, teammate = blank(detector.info, "ego"), blank(detector.info, "teammate")
+    for _ in range(2):
+        prepared = detector.prepare(ego, {"a": teammate, "b": teammate})
+        prepared.detect()
+        prepared.detect(["a", "b"])
+        if isinstance(prepared, Batching) and prepared.worth > 1:
+            prepared.detect_all([["a", "b"]] * prepared.worth)
 
 
 def _load(detector: str) -> Detector:

@@ -21,6 +21,7 @@ async def test_the_detectors_say_what_to_send(served, detector):
     assert entry["narrower"] == {"features": ["int8"]}
     assert entry["area_m"] == [-32, -32, 32, 32]
     assert entry["weights_digest"] == detector.info.weights_digest
+    assert entry["device"] == "cpu"
 
 
 async def test_a_session_answers_with_everything_its_vehicles_need(served):

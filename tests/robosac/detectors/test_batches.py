@@ -1,4 +1,5 @@
 from itertools import chain, combinations
+from types import SimpleNamespace
 
 import numpy as np
 import pytest
@@ -6,6 +7,7 @@ import torch
 
 from robosac.detectors import load
 from robosac.detectors.base import Batching
+from robosac.detectors.loading import warm_up
 from robosac.detectors.map_fusion import WORTH
 from tests.robosac.detectors.elsewhere import elsewhere
 
@@ -65,3 +67,11 @@ def test_an_unknown_teammate_is_an_error(detector, ego_message, benign):
 @pytest.mark.parametrize(("worth", "expected"), [(None, 1), (5, 5)])
 def test_how_many_are_worth_it_can_be_chosen(worth, expected, detector, ego_message):
     assert detector.on_device("cpu", worth).prepare(ego_message, {}).worth == expected
+
+
+@pytest.mark.parametrize("worth", [1, 5])
+def test_a_warm_detector_has_decoded_as_many_at_once_as_it_will(worth, detector):
+    decoded = []
+    frame = SimpleNamespace(worth=worth, detect=lambda subset=(): None, detect_all=decoded.append)
+    warm_up(SimpleNamespace(info=detector.info, prepare=lambda ego, others: frame))
+    assert {len(subsets) for subsets in decoded} == ({5} if worth == 5 else set())
