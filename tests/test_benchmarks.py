@@ -33,3 +33,20 @@ def test_an_unknown_part_is_named():
     done = run("--only", "nonsense")
     assert done.returncode == 2
     assert "nonsense: not one of once, v2xsim" in " ".join(done.stderr.split())
+
+
+def test_a_device_is_measured_and_one_that_is_not_there_is_refused():
+    command = [sys.executable, str(ROOT / "benchmarks" / "device.py"), "--turns", "1", "--device"]
+    env = os.environ | {"COLUMNS": "200"}
+    done, refused = (
+        subprocess.run([*command, device], capture_output=True, text=True, env=env, check=False)
+        for device in ("cpu", "nonsense")
+    )
+    assert done.returncode == 0, done.stderr
+    assert "intersection-mean on cpu, 5 teammates" in done.stdout
+    cells = [[cell.strip() for cell in line.split("│")[1:-1]] for line in done.stdout.splitlines() if "│" in line]
+    assert [row[0] for row in cells[:2]] == ["one by one", "8 at once"]
+    assert [row[0] for row in cells[2:8]] == ["1", "2", "4", "8", "16", "32"]
+    assert all(float(cell) > 0 for row in cells for cell in row[1:])
+    assert refused.returncode == 2
+    assert "torch cannot compute on the device 'nonsense' here" in refused.stderr

@@ -8,19 +8,15 @@ from robosac.defenses.protocol import Hypothesis
 
 
 class Batch(tuple[Hypothesis, ...]):
-    """Hypotheses to be tested, with others that are likely to be asked for after them.
+    """Hypotheses to be tested, with others that are likely to be asked for after them: ``Batch(asked, offered)``.
 
     Where several are decoded at once, the others are decoded too, as far as there is room. No outcome depends on it.
-
-    Parameters
-    ----------
-    asked : iterable of Hypothesis
-    offered : callable
-        Gives the others, the likeliest first. It is called, if at all, before outcomes are sent, perhaps several times.
-        It must change nothing: what it draws comes from a copy of the generator.
     """
 
     offered: Callable[[], Iterable[Hypothesis]]
+    """Gives the others, the likeliest first. It is called, if at all, before outcomes are sent, perhaps several times.
+    It must change nothing: what it draws comes from a copy of the generator.
+    """
 
     def __new__(cls, asked: Iterable[Hypothesis], offered: Callable[[], Iterable[Hypothesis]]) -> Batch:
         batch = super().__new__(cls, asked)

@@ -1,0 +1,84 @@
+"""What a frame takes on a device: seven hypotheses one by one and in one batch, and batches of several sizes.
+
+A frame of ROBOSAC's sampling is one in which nothing is in consensus, so that all seven hypotheses are tested. Its
+messages begin and its boxes end on the processor. Times are wall-clock, taken turn by turn.
+"""
+
+import time
+from collections.abc import Callable, Mapping
+from itertools import chain, combinations, cycle, islice
+from typing import Annotated
+
+import numpy as np
+import torch
+import typer
+from rich.console import Console
+from rich.table import Table
+
+from robosac import SampleConsensus, fuse
+from robosac.detectors import DEFAULT_DETECTOR, load
+from robosac.detectors.device import as_device
+from robosac.detectors.loading import warm_up
+from robosac.scenes import IntersectionScene
+
+SIZES = (1, 2, 4, 8, 16, 32)
+DEFENSE = SampleConsensus(sampling_budget=7, collaborators=3, consensus_threshold=1.0)
+AT_ONCE = 8
+"""The ego alone, and seven hypotheses."""
+
+
+def in_turns(work: Mapping[str, Callable[[], object]], turns: int) -> dict[str, float]:
+    """Median milliseconds of each, after one turn that does not count."""
+    times: dict[str, list[float]] = {name: [] for name in work}
+    for _ in range(turns + 1):
+        for name, function in work.items():
+            began = time.perf_counter()
+            function()
+            times[name].append(1e3 * (time.perf_counter() - began))
+    return {name: float(np.median(of[1:])) for name, of in times.items()}
+
+
+def main(
+    device: Annotated[str, typer.Option(help="By torch's name: cpu, cuda, cuda:1.")] = "cpu",
+    detector: str = DEFAULT_DETECTOR,
+    turns: Annotated[int, typer.Option(min=1)] = 30,
+    threads: Annotated[int, typer.Option(min=1, help="Of torch, on the processor.")] = 1,
+) -> None:
+    torch.set_num_threads(threads)
+    try:
+        as_device(device)
+        loaded = load(detector)
+    except ValueError as error:
+        raise typer.BadParameter(str(error)) from error
+    if not hasattr(loaded, "encode") or not hasattr(loaded, "worth"):
+        raise typer.BadParameter(f"{detector} makes no messages, or its frames decode one subset at a time")
+    messages = {name: loaded.encode(v.points, v.pose) for name, v in IntersectionScene(3).frame(0).views.items()}
+    ego = messages.pop("car-1")
+    placed = {worth: loaded.on_device(device, worth) for worth in (1, AT_ONCE)}
+    for each in placed.values():
+        warm_up(each)
+
+    def frame(worth: int) -> None:
+        fuse(placed[worth], DEFENSE, ego, messages, rng=np.random.default_rng(0))
+
+    prepared = placed[1].prepare(ego, messages)
+    every = list(chain.from_iterable(combinations(messages, size) for size in range(len(messages) + 1)))
+    batches = {str(size): list(islice(cycle(every), size)) for size in SIZES}
+    frames = in_turns({"one by one": lambda: frame(1), f"{AT_ONCE} at once": lambda: frame(AT_ONCE)}, turns)
+    decodes = in_turns({name: lambda s=subsets: prepared.detect_all(s) for name, subsets in batches.items()}, turns)
+    decodes |= in_turns({"1, not as a batch": lambda: prepared.detect(every[-1])}, turns)
+
+    console, face = Console(), placed[1].info
+    console.print(f"{face.name} on {face.device}, {len(messages)} teammates, torch threads: {threads}")
+    table = Table("a frame with seven hypotheses", "ms", "frames a second")
+    for name, ms in frames.items():
+        table.add_row(name, f"{ms:.2f}", f"{1e3 / ms:.1f}")
+    console.print(table)
+    table = Table("subsets decoded at once", "ms", "ms a subset")
+    for name, ms in decodes.items():
+        table.add_row(name, f"{ms:.2f}", f"{ms / int(name.partition(',')[0]):.2f}")
+    console.print(table)
+
+
+if __name__ == "__main__":
+    typer.run(main)
