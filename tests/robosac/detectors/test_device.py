@@ -6,6 +6,7 @@ import pytest
 import torch
 
 from robosac.attacks import PGD
+from robosac.attacks.hearing import Hearing
 from robosac.calibrated import witness_of
 from robosac.defenses import EGO
 from robosac.detectors import decoding, load
@@ -104,6 +105,13 @@ def test_attackers_compute_on_the_processor(far, detector, ego_message, benign):
     made, expected = (PGD(steps=1).run(surface, ["rsu"], np.random.default_rng(0))["rsu"] for surface in surfaces)
     assert torch.equal(made, expected)
     assert far.perturbed(benign["rsu"], made).tensors["features"].dtype == np.float16
+
+
+def test_they_hear_there_what_is_said_here(far, detector, ego_message, benign):
+    poses = {name: message.pose for name, message in benign.items()}
+    messages = detector.attack_surface(ego_message, benign).messages
+    there, here = (Hearing.of(info, ego_message, messages, poses) for info in (far.info, detector.info))
+    assert torch.equal(there.hear(messages)._maps, here.hear(messages)._maps)
 
 
 @pytest.mark.parametrize("kind", [np.float16, np.float32, np.uint8])
