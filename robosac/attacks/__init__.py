@@ -19,7 +19,7 @@ from robosac.attacks.objects import OnObjects
 from robosac.attacks.replays import Copy, Elsewhere, Frozen, Replay, Stale
 from robosac.attacks.situation import Foreign, Lie, Past, Situation
 from robosac.attacks.still import EraseStill, InventStill, ShiftStill
-from robosac.attacks.vehicles import Dim, Displace, GhostBeside, Jump, OnVehicles, Remove, RemoveMany
+from robosac.attacks.vehicles import Dim, Displace, GhostBeside, Jump, OnVehicles, Remove, RemoveMany, Stretch, Turn
 from robosac.plugins import Kind
 
 KIND: Kind[Attack] = Kind("attack", __name__, Attack)
@@ -118,7 +118,9 @@ __all__ = [
     "ShiftStill",
     "Situation",
     "Stale",
+    "Stretch",
     "Swarm",
+    "Turn",
     "lacking",
     "load",
     "load_campaign",

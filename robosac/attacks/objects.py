@@ -1,4 +1,4 @@
-"""Attacks on single objects: cars that do not exist, cars that vanish, cars that stand elsewhere.
+"""Attacks on single objects: cars that do not exist, vanish, stand elsewhere, or look otherwise.
 
 They all share one loss, made of what they say that they lie about (`robosac.attacks.situation.Lie`). So an attack only
 says in each frame what its lies are, and a lie that is held in the world is held by saying it again.
@@ -108,6 +108,7 @@ class OnObjects(IterativeAttack):
     - *dimmed*: as erased, but down to `FAINT`, and no farther;
     - *moved*: how far the centres of the boxes that show it are from where they should be; if that is farther away than
       `FAR_M`, it is a ghost there, and erased where it is;
+    - *reshaped*: how far the boxes that show it are from what they should be, by all six numbers;
     - cross-entropy between all other class scores and the benign ones, `balanced`, and `displacement` of all other
       certain boxes.
 
@@ -141,7 +142,7 @@ class OnObjects(IterativeAttack):
         losses = [_loss(lie, honest) for lie in situation.lies]
         held = torch.ones_like(honest.scores, dtype=torch.bool)
         for lie in situation.lies:
-            if lie.kind != "moved" or _is_far(lie):
+            if lie.kind not in ("moved", "reshaped") or _is_far(lie):
                 held &= _apart(honest.geometry, lie.box) > NEAR_M
             if lie.truth is not None and _is_far(lie):
                 held &= _apart(honest.geometry, lie.truth) > NEAR_M
@@ -208,6 +209,15 @@ class _Moved:
         return average((boxes[..., :2] - self._wanted).abs().sum(dim=-1), self._shows)
 
 
+class _Reshaped:
+    def __init__(self, lie: Lie, honest: Perception) -> None:
+        self._wanted = codes(lie.box)
+        self._shows = (_apart(honest.geometry, lie.box) <= NEAR_M) & (honest.scores >= SEEN)
+
+    def __call__(self, logits: torch.Tensor, boxes: torch.Tensor) -> torch.Tensor:  # noqa: ARG002
+        return average((boxes - self._wanted).abs().sum(dim=-1), self._shows)
+
+
 class _Carried:
     def __init__(self, lie: Lie, honest: Perception) -> None:
         self._ghost, self._lie = _Ghost(lie, honest), lie.box
@@ -232,9 +242,10 @@ def _loss(lie: Lie, honest: Perception) -> Callable[[torch.Tensor, torch.Tensor]
     return _Carried(lie, honest) if _is_far(lie) else _LOSSES[lie.kind](lie, honest)
 
 
-_LOSSES: Mapping[str, type[_Ghost] | type[_Erased] | type[_Moved]] = {
+_LOSSES: Mapping[str, type[_Ghost] | type[_Erased] | type[_Moved] | type[_Reshaped]] = {
     "ghost": _Ghost,
     "erased": _Erased,
     "dimmed": _Dimmed,
     "moved": _Moved,
+    "reshaped": _Reshaped,
 }

@@ -13,9 +13,9 @@ from robosac.attacks.hearing import Hearing
 from robosac.boxes import FloatArray, from_world, to_world
 from robosac.detectors.base import Message
 
-LieKind = Literal["ghost", "erased", "dimmed", "moved"]
+LieKind = Literal["ghost", "erased", "dimmed", "moved", "reshaped"]
 """An object that does not exist; one that exists and should not be seen; one that should be seen too faintly to count;
-and one that should be seen elsewhere.
+one that should be seen elsewhere; and one that should be seen with another heading or size.
 """
 Foreign = Callable[[str, int], Message | None]
 """Of an agent and the number of a frame, what it senses in another scene; None if nothing."""
@@ -29,13 +29,13 @@ class Lie:
 
     kind: LieKind
     box: FloatArray
-    """(5,), ego frame: where the ghost stands, where the erased or dimmed vehicle is, or where the moved one should be
-    seen.
+    """(5,), ego frame: where the ghost stands, where the erased or dimmed vehicle is, or how the moved or reshaped one
+    should be seen.
     """
     number: int = 0
     """Which of the attack's objects this is; the same one has the same number from frame to frame."""
     truth: FloatArray | None = None
-    """(5,), ego frame: where a moved vehicle really is."""
+    """(5,), ego frame: how a moved or reshaped vehicle really is."""
 
 
 @dataclass(frozen=True, eq=False)

@@ -1,4 +1,4 @@
-"""Attacks on cars that exist: erased, shown elsewhere, or shown twice."""
+"""Attacks on cars that exist: erased, shown elsewhere or otherwise, or shown twice."""
 
 from __future__ import annotations
 
@@ -164,6 +164,46 @@ class Jump(Displace):
     def way(self, yaw: float) -> FloatArray:
         """Ahead."""
         return np.array([np.cos(yaw), np.sin(yaw)])
+
+
+@dataclass(frozen=True)
+class Turn(OnVehicles):
+    """Show one car that the ego alone does not see with another heading.
+
+    Parameters
+    ----------
+    angle : float
+        By how much, to the left; radians.
+    """
+
+    name: ClassVar[str] = "turn"
+
+    angle: float = np.pi / 4
+
+    def lie(self, box: FloatArray, number: int) -> Lie:
+        """That it heads there."""
+        turned = np.array(box)
+        turned[4] += self.angle
+        return Lie("reshaped", turned, number, box)
+
+
+@dataclass(frozen=True)
+class Stretch(OnVehicles):
+    """Show one car that the ego alone does not see larger than it is.
+
+    Parameters
+    ----------
+    times : float
+        Its sides.
+    """
+
+    name: ClassVar[str] = "stretch"
+
+    times: float = 1.7
+
+    def lie(self, box: FloatArray, number: int) -> Lie:
+        """That it is so large."""
+        return Lie("reshaped", box * [1.0, 1.0, self.times, self.times, 1.0], number, box)
 
 
 @dataclass(frozen=True)

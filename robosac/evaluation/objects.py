@@ -71,6 +71,7 @@ def judge(lies: Sequence[Lie], shown: Shown, truth: FloatArray, ideal: FloatArra
     - An *erased* vehicle, or a *dimmed* one, is missing if no box with score >= .3 has an IoU >= .3 with it. Where the
       ideal fusion does not find it either, there is nothing to judge.
     - A *moved* one holds if the nearest box within 2 m of the lie or of the truth, score >= .3, is nearer to the lie.
+    - A *reshaped* one holds if the box, score >= .3, that overlaps the lie or the truth most overlaps the lie more.
 
     Parameters
     ----------
@@ -89,6 +90,8 @@ def judge(lies: Sequence[Lie], shown: Shown, truth: FloatArray, ideal: FloatArra
             found.append(_ghost(lie, shown, truth))
         elif lie.kind == "moved":
             found.append(_moved(lie, shown))
+        elif lie.kind == "reshaped":
+            found.append(_reshaped(lie, shown))
         elif _overlap(lie.box, ideal).max(initial=0.0) >= MATCH_IOU:
             found.append(_erased(lie, shown))
     return tuple(found)
@@ -111,6 +114,14 @@ def _moved(lie: Lie, shown: Shown) -> Judged:
         at is not None and shown.standing is not None and shown.standing[at] == REPAIRED
     )
     return _with_standing(lie, shown, [at] if at is not None and to_lie[at] < to_truth[at] else [], flagged)
+
+
+def _reshaped(lie: Lie, shown: Shown) -> Judged:
+    like_lie, like_truth = (_overlap(lie.box if box is None else box, shown.boxes) for box in (lie.box, lie.truth))
+    best = np.maximum(like_lie, like_truth)
+    at = int(best.argmax()) if best.max(initial=0.0) > 0.0 else None
+    flagged = at is not None and shown.standing is not None and shown.standing[at] == REPAIRED
+    return _with_standing(lie, shown, [at] if at is not None and like_lie[at] > like_truth[at] else [], flagged)
 
 
 def _erased(lie: Lie, shown: Shown) -> Judged:

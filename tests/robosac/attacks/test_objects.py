@@ -154,6 +154,24 @@ def test_a_car_that_is_moved_far_is_gone_where_it_is(attack, detector):
     assert boxes[from_lie < 1.0, 5].max(initial=0.0) > 0.5
 
 
+@pytest.mark.parametrize(
+    ("attack", "shape"),
+    [("turn", lambda box: box + [0, 0, 0, 0, np.pi / 4]), ("stretch", lambda box: box * [1, 1, 1.7, 1.7, 1])],
+)
+def test_a_car_is_shown_with_another_heading_or_size_where_it_is(attack, shape, detector):
+    for met in Encounters(detector, IntersectionScene(2)).sequence(2, attack, ["car-3", "rsu"]):
+        (lie,) = met.lies
+        assert lie.kind == "reshaped"
+        np.testing.assert_allclose(lie.box, shape(lie.truth))
+        boxes = met.prepare(met.ego, met.teammates).detect(met.team)
+        like_lie, like_truth = pairwise_iou(np.array([lie.box, lie.truth]), boxes)
+        assert like_lie.max() > like_truth.max() > 0.2
+        rest = [box for box in met.truth if np.hypot(*(box[:2] - lie.truth[:2])) > 3.0]
+        honest = met.prepare(met.ego, met.benign).detect(met.team)
+        seen = pairwise_iou(np.array(rest), honest).max(axis=1) > 0.5
+        assert (pairwise_iou(np.array(rest), boxes).max(axis=1) > 0.5)[seen].mean() > 0.8
+
+
 def test_a_car_that_the_ego_sees_is_left_alone(surface):
     surface.ego[1, 0] = surface.ego[2, 2] = 5.0
     met = Situation(truth=street(surface))

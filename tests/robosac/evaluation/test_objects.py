@@ -10,6 +10,7 @@ TRUTH = np.array([[0.0, 0.0, 4.5, 1.9, 0.0], [10.0, 0.0, 4.5, 1.9, 0.0]])
 GHOST = Lie("ghost", np.array([20.0, 0.0, 4.5, 1.9, 0.0]))
 ERASED = Lie("erased", TRUTH[1])
 MOVED = Lie("moved", TRUTH[1] + [0, 1.2, 0, 0, 0], truth=TRUTH[1])
+TURNED = TRUTH[1] + [0, 0, 0, 0, np.pi / 4]
 
 
 def boxes(*rows):
@@ -51,6 +52,27 @@ def test_a_vehicle_is_moved_where_its_box_is_nearer_to_the_lie():
     assert not holds(MOVED, (10.0, 0.7, 0.2))
     assert not holds(MOVED, (0.0, 0.0, 0.9))
     assert not holds(MOVED, (10.0, 1.9, 0.9), (10.0, 0.1, 0.5))  # the nearest one counts
+
+
+@pytest.mark.parametrize(
+    "lie", [Lie("reshaped", TRUTH[1] * [1, 1, 2, 2, 1], truth=TRUTH[1]), Lie("reshaped", TURNED, truth=TRUTH[1])]
+)
+def test_a_vehicle_is_reshaped_where_its_box_is_more_like_the_lie(lie):
+    def seen(box, score=0.9, other=()):
+        (judged,) = judge([lie], Shown(np.array([[*box, score], *other]).reshape(-1, 6)), TRUTH, IDEAL)
+        return judged.holds
+
+    assert seen(lie.box)
+    assert not seen(TRUTH[1])
+    assert not seen(lie.box, score=0.29)
+    assert not seen(TRUTH[0])
+    assert not seen(lie.box + [0.3, 0.3, 0, 0, 0.05], other=[[*TRUTH[1], 0.4]])  # the most alike counts
+    (none,) = judge([lie], Shown(boxes()), TRUTH, IDEAL)
+    assert none == Judged(0, False)
+    (repaired,) = judge([lie], Shown.of(answer(np.array([[*TRUTH[1], 0.9]]), ["repaired"])), TRUTH, IDEAL)
+    assert repaired == Judged(0, False, True, "")
+    (told,) = judge([lie], Shown.of(answer(np.array([[*lie.box, 0.9]]), ["confirmed"])), TRUTH, IDEAL)
+    assert told == Judged(0, True, False, "confirmed")
 
 
 def answer(shown, standing, contradicted=()):
