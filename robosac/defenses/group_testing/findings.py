@@ -133,7 +133,7 @@ class Findings:
         memory, now = self.known.memory, self.senders
         before = memory.shown.get(self.known.key(fused), max(memory.shown.values(), key=len, default=NOTHING))
         shown = self.shown.get(fused) or self._of_ego
-        if shown is None or not len(before) or not {sender, EGO} <= memory.senders.keys() & now.keys():
+        if shown is None or not {sender, EGO} <= memory.senders.keys() & now.keys():
             return False
         others = shown.everybody.without({sender}).supporting.any(axis=0)
         rows = followed(shown.boxes[others & (shown.boxes[:, 5] >= WITNESS_SCORE)], self.pose)

@@ -15,9 +15,11 @@ VEHICLES = np.array([[x, y, 4.0, 2.0, yaw] for x in (3.0, 13.0, 23.4) for y in (
 class Linear:
     """An ego that adds up all messages: a cell's sum is its class logit, and half of it moves the next cell's box in y.
 
-    Boxes stand 10 m apart, 4 m long, 2 m wide, along +x. A tenth of it lengthens the box after the next, by its
-    logarithm, and turns the one after that.
+    Boxes stand 10 m apart, 4 m long, 2 m wide, along +x. Where it `bends`, a sum lengthens the box after the next by so
+    much (its logarithm), and turns the one after that.
     """
+
+    bends = 0.0
 
     def __init__(self, shape=(3, 4), seed=0):
         generator = torch.Generator().manual_seed(seed)
@@ -33,7 +35,7 @@ class Linear:
     def perceive(self, messages):
         total = self.class_logits(messages)
         y, x = torch.meshgrid(*(10.0 * torch.arange(n) for n in total.shape), indexing="ij")
-        moved, longer, turned = (factor * total.roll(n) for n, factor in enumerate((0.5, 0.1, 0.1), 1))
+        moved, longer, turned = (factor * total.roll(n) for n, factor in enumerate((0.5, self.bends, self.bends), 1))
         width, cos = torch.full_like(total, 0.7), torch.ones_like(total)
         return total, torch.stack([x, y + moved, 1.4 + longer, width, cos, turned], dim=-1)
 

@@ -9,6 +9,7 @@ from tests.robosac.attacks.linear import Linear, after_another_frame, situation
 @pytest.fixture
 def surface():
     linear = Linear()
+    linear.bends = 0.02
     linear.messages["c"].flatten()[linear.ego.argmin()] = 12.0  # what only a teammate sees
     return linear
 

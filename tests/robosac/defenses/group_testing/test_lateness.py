@@ -56,14 +56,23 @@ def test_where_nothing_moves_nobody_is_late():
     assert told(PLACES + [-3.0, 0.0], centres=PLACES[:0]) is False
 
 
-@pytest.mark.parametrize(("vehicles", "firmly", "is_late"), [(1, YES, False), (2, YES, True), (2, 2.5, False)])
+@pytest.mark.parametrize(("vehicles", "firmly", "is_late"), [(1, 7.0, False), (2, YES, True), (2, 2.5, False)])
 def test_a_message_is_late_by_two_vehicles_at_least_of_which_it_is_sure(vehicles, firmly, is_late):
-    true = PLACES[:vehicles]
-    heard = saying({EGO: [], "d": [(*place, firmly) for place in true - SPEED]})
-    assert late(heard, "d", STILL, true, np.broadcast_to(SPEED, true.shape)) == is_late
+    heard = saying({EGO: [], "d": [(*place, firmly) for place in PLACES[:vehicles] - SPEED]})
+    assert late(heard, "d", STILL, PLACES, np.broadcast_to(SPEED, PLACES.shape)) == is_late
 
 
-@pytest.mark.parametrize(("moved", "is_late"), [(1, False), (2, False), (4, True), (5, True), (6, True)])
+def test_who_sees_something_everywhere_is_not_late():
+    heard = saying({EGO: [], "d": [(*place, YES - off) for off in (0, 1) for place in PLACES - (1 - off) * SPEED]})
+    assert not late(heard, "d", STILL, PLACES, np.broadcast_to(SPEED, PLACES.shape))
+
+
+@pytest.mark.parametrize(("speed", "is_late"), [(0.95, False), (1.05, True)])
+def test_slow_vehicles_tell_nothing(speed, is_late):
+    assert told(PLACES - [2.5 * 1.05, 0.0], speeds=np.array([speed, 0.0])) == is_late
+
+
+@pytest.mark.parametrize(("moved", "is_late"), [(1, False), (2, False), (3, False), (4, True), (5, True), (6, True)])
 def test_a_lie_about_some_vehicles_does_not_excuse_itself(moved, is_late):
     true = np.vstack([PLACES, PLACES[:2] + [20.0, 0.0]])
     places = np.where(np.arange(6)[:, None] < moved, true - 2 * SPEED, true)
@@ -80,10 +89,10 @@ def test_senders_are_where_their_poses_say():
 
 def test_vehicles_are_followed_along_themselves():
     before = np.array([[0.0, 0.0, 0.0, 0.9], [8.0, 0.0, 0.0, 0.9], [20.0, 1.0, 1.5, 0.4]])
-    now = np.array([[3.0, 0.1, 0.0, 0.9], [5.5, 0.9, 0.0, 0.9], [10.0, 0.0, np.pi, 0.9], [20.0, 3.0, -1.6, 0.9]])
-    found = motions(now, before)
-    assert found[[0, 2, 3]] == pytest.approx(np.array([[3.0, 0.1], [2.0, 0.0], [0.0, 2.0]]))
-    assert np.isnan(found[1]).all()  # in no lane of those before
+    now = np.array([[3.0, 0.1, 0.0, 0.9], [10.0, 0.0, np.pi, 0.9], [20.0, 3.0, -1.6, 0.9]])
+    assert motions(now, before) == pytest.approx(np.array([[3.0, 0.1], [2.0, 0.0], [0.0, 2.0]]))
+    elsewhere = np.array([[5.5, 0.9, 0.0, 0.9], [-4.6, 0.0, 0.0, 0.9], [8.0, 0.0, 0.5, 0.9]])
+    assert np.isnan(motions(elsewhere, before)).all()  # beside the lane, too far, or another heading
     assert np.isnan(motions(now, before[:0])).all()
     assert motions(now[:0], before).shape == (0, 2)
 
@@ -92,17 +101,21 @@ def cars(centres):
     return np.column_stack([centres, np.tile([4.5, 1.9, 0.0, 0.9], (len(centres), 1))])
 
 
-def drive(frames, delay):
-    """Decisions in traffic, where one teammate's message is so many frames old."""
+def drive(frames, delay, shown=False):
+    """Decisions in traffic, where one teammate's message is so many frames old, and shown or not where it is fused."""
     state, rng, found = DEFENSE.initial_state(TEAM), np.random.default_rng(0), []
     for frame in range(frames):
         true = PLACES + frame * SPEED
-        old = shown_at(true - min(delay, frame) * SPEED, true)
-        heard, boxes = saying({**dict.fromkeys((EGO, *TEAM), shown_at(true, true)), LIAR: old}), cars(true)
+        old = true - min(delay, frame) * SPEED
+        honest = [(*place, NO) for place in old if delay] + [(*place, YES) for place in true]
+        heard = saying({**dict.fromkeys((EGO, *TEAM), honest), LIAR: shown_at(old, true)})
 
-        def judge(subset, _, number, boxes=boxes, heard=heard):
-            told = {"testimony": heard, "alone": boxes}
-            return Outcome(subset, 0.93, Verdict.CONSENSUS, boxes, boxes, np.eye(4), number, **told)
+        def judge(subset, _, number, true=true, old=old, heard=heard):
+            more = old if shown and number and LIAR in subset else old[:0]
+            told = {"testimony": heard, "alone": cars(true)}
+            return Outcome(
+                subset, 0.93, Verdict.CONSENSUS, cars(np.vstack([true, more])), cars(true), np.eye(4), number, **told
+            )
 
         decision, _ = run_frame(DEFENSE, state, TEAM, [], rng, judge=judge)
         state = json.loads(json.dumps(decision.state))
@@ -110,13 +123,15 @@ def drive(frames, delay):
     return found
 
 
+@pytest.mark.parametrize("shown", [False, True])
 @pytest.mark.parametrize(("delay", "names"), [(0, set()), (1, set()), (2, set()), (5, {LIAR})])
-def test_who_is_late_is_not_named_and_who_replays_is(delay, names):
-    found = drive(10, delay)
+def test_who_is_late_is_not_named_and_who_replays_is(delay, names, shown):
+    found = drive(10, delay, shown and delay > 0)
     assert {name for decision in found for name in decision.named} == names
     levels = found[-1].state["memory"]["lies"]["levels"].get(LIAR, {})
     assert ("late" in levels) == (0 < delay < 5)
     assert ("conflict" in levels) == (delay == 5)
+    assert ("ghost" in levels) == (delay == 5 and shown)
 
 
 def test_where_senders_were_is_known_for_one_frame():
@@ -124,21 +139,63 @@ def test_where_senders_were_is_known_for_one_frame():
     assert state["memory"]["senders"] == {name: [0.0, 0.0] for name in (EGO, *TEAM)}
 
 
-@pytest.mark.parametrize("asked", ["fused", "alone", "nowhere"])
-@pytest.mark.parametrize("missing", [None, "shown", EGO, LIAR])
-def test_who_is_late_is_told_by_what_others_see_or_by_what_the_ego_sees_alone(asked, missing):
-    """Where all others are late, too, their boxes are not where vehicles are."""
-    rest = tuple(name for name in TEAM if name != LIAR)
-    memory = Memory(senders=dict.fromkeys((EGO, *TEAM), (0.0, 0.0)))
+POSE = pose_matrix(100.0, -50.0, 1.8, 1.2)
+REST = tuple(name for name in TEAM if name != LIAR)
+
+
+def asked(true, late, fused, alone, ego_moved=STILL, forget=None, beside=()):
+    """Findings of a frame: what is true, and what the liar's message shows; boxes of the team's rest, and of the ego.
+
+    Everybody stands where the ego does. Before that the ego was elsewhere by what it has moved.
+    """
+    turn, origin = POSE[:2, :2], POSE[:2, 3]
+    memory = Memory(senders=dict.fromkeys(TEAM, tuple(origin)) | {EGO: tuple(origin - turn @ ego_moved)})
     known = Knowledge(MODEL, Posterior(len(MODEL.kinds), 0.5, 0.25, TEAM), memory)
-    memory.shown = {known.key(subset): followed(cars(PLACES - SPEED), np.eye(4)) for subset in ((), rest)}
-    if missing == "shown":
-        memory.shown = {}
-    memory.senders.pop(missing, None)
-    known_by = {EGO: shown_at(PLACES), "car-2": shown_at(PLACES), LIAR: shown_at(PLACES - SPEED)}
-    boxes = {name: cars(PLACES if name == asked else PLACES + [20.0, 0.0]) for name in ("fused", "alone")}
+    before = followed(cars(true - SPEED), POSE)
+    memory.shown = {} if forget == "shown" else {known.key(subset): before for subset in ((), REST, tuple(TEAM))}
+    memory.senders.pop(forget, None)
+    own = [(*-ego_moved, YES)] if np.any(ego_moved) else []
+    said = {EGO: shown_at(true, true), "car-2": shown_at(true, true), LIAR: [*shown_at(late, true), *own]}
     found = Findings(known, Lies(), TEAM, ())
-    told = {"testimony": saying({**dict.fromkeys(TEAM, ()), **known_by}), "alone": boxes["alone"]}
-    found.learn(Outcome(rest, 0.9, Verdict.CONSENSUS, boxes["fused"], boxes["alone"], np.eye(4), 1, **told))
-    assert found.late(LIAR) == (asked != "nowhere" and missing is None)
+    told = {"testimony": saying({**dict.fromkeys(TEAM, ()), **said}), "alone": alone}
+    for subset, boxes in ((REST, fused), *beside):
+        found.learn(Outcome(subset, 0.9, Verdict.CONSENSUS, boxes, alone, POSE, 1, **told))
+    return found
+
+
+@pytest.mark.parametrize("by", ["fused", "alone", "nobody"])
+@pytest.mark.parametrize("forget", [None, "shown", EGO, LIAR])
+def test_who_is_late_is_told_by_what_others_see_or_by_what_the_ego_sees_alone(by, forget):
+    """Where all others are late, too, their boxes are not where vehicles are."""
+    boxes = {name: cars(PLACES if name == by else PLACES + [20.0, 0.0]) for name in ("fused", "alone")}
+    found = asked(PLACES, PLACES - SPEED, **boxes, forget=forget)
+    assert found.late(LIAR) == (by != "nobody" and forget is None)
     assert not found.late("car-2")
+
+
+def test_the_ego_is_a_vehicle_that_a_late_message_shows():
+    one = PLACES[:1]
+    for ego_moved, is_late in ((SPEED, True), (STILL, False)):
+        assert asked(one, one - SPEED, cars(one), cars(one), ego_moved).late(LIAR) == is_late
+
+
+def test_of_fusions_with_the_sender_in_it_nothing_is_told():
+    nothing = cars(PLACES + [20.0, 0.0])
+    found = asked(PLACES, PLACES - SPEED, cars(PLACES), nothing, beside=[(tuple(TEAM), nothing)])
+    assert found.late(LIAR)
+
+
+@pytest.mark.parametrize(("said_by", "score", "is_late"), [(LIAR, 0.9, True), ("all", 0.45, True), ("all", 0.9, False)])
+def test_boxes_that_nobody_else_supports_or_that_are_faint_tell_nothing(said_by, score, is_late):
+    """The sender sees three more a little ahead of where they are."""
+    more = PLACES[:3] + [20.0, 0.0]
+    everything = np.vstack([PLACES, more])
+    late = np.vstack([PLACES - SPEED, more + SPEED / 2])
+    boxes = cars(everything)
+    boxes[4:, 5] = score
+    found = asked(everything, late, boxes, cars(PLACES + [0.0, 30.0]))
+    if said_by == LIAR:
+        words, found.hearing = {EGO: shown_at(PLACES, PLACES), LIAR: shown_at(late, everything)}, None
+        told = {"testimony": saying({**dict.fromkeys(TEAM, ()), **words}), "alone": boxes[:0]}
+        found.learn(Outcome(REST, 0.9, Verdict.CONSENSUS, boxes, boxes[:0], POSE, 1, **told))
+    assert found.late(LIAR) == is_late
