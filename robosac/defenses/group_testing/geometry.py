@@ -7,7 +7,7 @@ from dataclasses import dataclass, field
 
 import numpy as np
 
-from robosac.boxes import BoolArray, FloatArray, pairwise_iou, to_world
+from robosac.boxes import BoolArray, FloatArray, IntArray, pairwise_iou, to_world
 
 WITNESS_SCORE = 0.5
 """Boxes of the smaller fusion from this score on must survive in the larger one."""
@@ -157,13 +157,20 @@ def come_and_gone(
     return came[counts[: len(came)]], gone[counts[len(came) :]]
 
 
-def _nowhere(boxes: FloatArray, others: FloatArray) -> FloatArray:
-    """Those boxes that are none of the others."""
+def same_vehicles(boxes: FloatArray, others: FloatArray) -> tuple[IntArray, IntArray]:
+    """Pairs (k,) of boxes (n, 4) and others (m, 4), by their places, of which one is where the other can get in a
+    frame.
+    """
     x, y = boxes[:, :1] - others[:, 0], boxes[:, 1:2] - others[:, 1]
     cos, sin = np.cos(boxes[:, 2:3]), np.sin(boxes[:, 2:3])
     one, other = np.nonzero((np.abs(cos * x + sin * y) < ALONG_M) & (np.abs(cos * y - sin * x) < ACROSS_M))
-    turned = np.abs((boxes[one, 2] - others[other, 2] + np.pi / 2) % np.pi - np.pi / 2)
+    turned = np.abs((boxes[one, 2] - others[other, 2] + np.pi / 2) % np.pi - np.pi / 2) < TURN_RAD
+    return one[turned], other[turned]
+
+
+def _nowhere(boxes: FloatArray, others: FloatArray) -> FloatArray:
+    """Those boxes that are none of the others."""
     alone = np.ones(len(boxes), dtype=bool)
-    alone[one[turned < TURN_RAD]] = False
+    alone[same_vehicles(boxes, others)[0]] = False
     nowhere: FloatArray = boxes[alone]
     return nowhere

@@ -11,7 +11,7 @@ from __future__ import annotations
 import numpy as np
 
 from robosac.boxes import FloatArray
-from robosac.defenses.group_testing.geometry import ACROSS_M, ALONG_M, TURN_RAD
+from robosac.defenses.group_testing.geometry import same_vehicles
 from robosac.testimony import Testimony
 
 DELAYS = np.array([0.0, 0.5, 1.0, 1.5, 2.0, 2.5, 3.0, 4.0, 5.0, 6.0])
@@ -74,14 +74,10 @@ def motions(now: FloatArray, before: FloatArray) -> FloatArray:
     """How far (n, 2) each of some boxes (n, 4) has moved since the frame before, in which there were others (m, 4), as
     `geometry.followed` gives them; not a number for what was not there.
     """
+    one, other = same_vehicles(now, before)
+    moved = now[one, :2] - before[other, :2]
+    nearest_last = np.argsort(-np.hypot(*moved.T), kind="stable")
     found = np.full((len(now), 2), np.nan)
-    if not len(now) or not len(before):
-        return found
-    x, y = now[:, :1] - before[:, 0], now[:, 1:2] - before[:, 1]
-    cos, sin = np.cos(now[:, 2:3]), np.sin(now[:, 2:3])
-    turned = np.abs((now[:, 2:3] - before[:, 2] + np.pi / 2) % np.pi - np.pi / 2)
-    same = (np.abs(cos * x + sin * y) < ALONG_M) & (np.abs(cos * y - sin * x) < ACROSS_M) & (turned < TURN_RAD)
-    apart = np.where(same, np.hypot(x, y), np.inf)
-    nearest, known = apart.argmin(axis=1), same.any(axis=1)
-    found[known] = (now[:, :2] - before[nearest, :2])[known]
+    for pair in nearest_last.tolist():
+        found[one[pair]] = moved[pair]
     return found

@@ -53,7 +53,9 @@ class Lie:
     vehicle that it removes is there.
     """
     along: bool = False
-    """Whether a vehicle is moved along itself only, or many are a little, as by a message that is late."""
+    """Whether a message that is late may be behind it: a vehicle is moved along itself only, many are a little, or the
+    message is known to be late.
+    """
     alone: bool = False
     """Whether a single witness supports the vehicle that is gone: one word against one."""
     said: bool = False
