@@ -163,6 +163,16 @@ def pairwise_iou(a: FloatArray, b: FloatArray) -> FloatArray:
     return iou
 
 
+def laid_iou(a: FloatArray, b: FloatArray) -> FloatArray:
+    """Intersection over union (n,) of boxes a and b, (n, 5+) each, laid on one another pair by pair: centre on centre.
+
+    It is 1 where they have the same shape: the same length and width, and the same heading but for half a turn.
+    """
+    laid = np.array(b)
+    laid[:, :2] = a[:, :2]
+    return _paired_iou(a, laid)
+
+
 def _paired_iou(a: FloatArray, b: FloatArray) -> FloatArray:
     """IoU (n,) of boxes (n, 5+) with as many others, pair by pair."""
     c, s = np.cos(b[:, 4]), np.sin(b[:, 4])

@@ -58,9 +58,10 @@ MARKS: Mapping[str, tuple[str, str, str]] = {
     "invented": ("*", VERMILLION, "invented"),
     "removed": ("X", VERMILLION, "removed"),
     "displaced": ("s", VERMILLION, "displaced"),
+    "reshaped": ("h", VERMILLION, "reshaped"),
 }
 """Marker, colour and label of evidence on a box, by what happened there. Open markers, but those of objects."""
-BLAMED = ("invented", "removed", "displaced")
+BLAMED = ("invented", "removed", "displaced", "reshaped")
 
 
 def prepare(axes: Axes, moment: Moment, *, true: bool = True) -> None:

@@ -27,6 +27,7 @@ LIES = {
     "ghost": ("vehicle invented", "vehicles invented"),
     "gone": ("vehicle removed", "vehicles removed"),
     "moved": ("vehicle moved", "vehicles moved"),
+    "reshaped": ("vehicle turned or resized", "vehicles turned or resized"),
     "late": ("vehicle moved along itself", "vehicles moved along themselves"),
     "veiled": ("change that its own message denies", "changes that its own message denies"),
     "alone": ("vehicle removed that one other sees", "vehicles removed that one other sees"),

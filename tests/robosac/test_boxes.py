@@ -4,7 +4,7 @@ import shapely
 from hypothesis import given
 from hypothesis import strategies as st
 
-from robosac.boxes import corners, from_world, in_units, nms, pairwise_iou, pose_fault, pose_matrix, to_world
+from robosac.boxes import corners, from_world, in_units, laid_iou, nms, pairwise_iou, pose_fault, pose_matrix, to_world
 from tests.robosac.rectangles import from_corners
 
 coordinate = st.floats(-20, 20)
@@ -42,6 +42,14 @@ def test_iou_of_nothing_and_of_flat_boxes():
     flat = np.array([[0.0, 0.0, 4.0, 0.0, 0.2]])
     assert pairwise_iou(np.empty((0, 5)), flat).shape == (0, 1)
     assert pairwise_iou(flat, flat).tolist() == [[0.0]]
+
+
+@given(st.lists(st.tuples(box, box), max_size=8))
+def test_boxes_laid_on_one_another_overlap_by_their_shapes(pairs):
+    a, b = (np.array(boxes).reshape(-1, 5) for boxes in (list(zip(*pairs, strict=True)) or [(), ()]))
+    laid = b.copy()
+    laid[:, :2] = a[:, :2]
+    np.testing.assert_allclose(laid_iou(a, b), np.diag(pairwise_iou(a, laid)), atol=1e-12)
 
 
 @given(box)

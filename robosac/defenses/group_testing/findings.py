@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Collection, Iterable, Mapping, Sequence
+from collections.abc import Collection, Iterable, Iterator, Mapping, Sequence
 from functools import cached_property
 
 import numpy as np
@@ -16,12 +16,13 @@ from robosac.defenses.group_testing.knowledge import Knowledge
 from robosac.defenses.group_testing.lateness import Place, late, motions, senders
 from robosac.defenses.group_testing.lies import Lies
 from robosac.defenses.group_testing.objects import Lie, Shown
+from robosac.defenses.group_testing.shapes import BLAMING, agreeing, reshaped, to_ask
 from robosac.defenses.protocol import EGO, Difference, Hypothesis, Outcome
 from robosac.testimony import Testimony
 
 CALM = 0.5
 """From here on the ego counts as steady."""
-DONE = {"ghost": "invented", "gone": "removed", "moved": "displaced"}
+DONE = {"ghost": "invented", "gone": "removed", "moved": "displaced", "reshaped": "reshaped"}
 """What was done to an object, by the kind of a lie."""
 NOTHING = np.zeros((0, 4))
 UNHEARD = 0.9
@@ -70,6 +71,7 @@ class Findings:
         self._gone: dict[tuple[Hypothesis, Hypothesis], FloatArray] = {}
         self._late: dict[str, bool] = {}
         self._effects: dict[tuple[Hypothesis, Hypothesis, Hypothesis], list[Lie]] = {}
+        self._shapes: dict[tuple[Hypothesis, Hypothesis, Hypothesis], list[list[int]]] = {}
 
     def learn(self, outcome: Outcome) -> Shown | None:
         """Take in a decoded subset; what it shows is given back, checked, if there is testimony to check it by."""
@@ -110,7 +112,41 @@ class Findings:
         asked = joined, without, suspects
         if asked not in self._effects:
             self._effects[asked] = effects(self.shown[joined], self.shown[without], suspects)
-        return self._effects[asked]
+        boxes = self.shown[joined].boxes
+        # not kept, as others may be asked for the shapes later
+        return self._effects[asked] + [
+            Lie("reshaped", boxes[index, :2], by=by)
+            for index, _, by in self.reshaped(joined, without, suspects)
+            if len(by) >= BLAMING
+            and all(np.hypot(*(lie.place - boxes[index, :2])) > SAME_LIE_M for lie in self._effects[asked])
+        ]
+
+    def reshaped(
+        self, joined: Hypothesis, without: Hypothesis, suspects: Hypothesis
+    ) -> list[tuple[int, int, Hypothesis]]:
+        """Vehicles that have another shape in a fusion than without the suspects, and the other one by the word of
+        some: their boxes in both, and who they are.
+        """
+        found = []
+        for index, at in self._other_shapes(joined, without, suspects):
+            now, before = self.shown[joined].boxes[index], self.shown[without].boxes[at]
+            alone = {name: self.shown[(name,)].boxes for name in without if (name,) in self.shown}
+            if by := agreeing(now, before, alone if self._alone is None else {EGO: self._alone, **alone}):
+                found.append((index, at, by))
+        return found
+
+    def to_ask(self, answer: Hypothesis) -> Iterator[str]:
+        """Who is to be asked alone for the shape of a vehicle that has another one without one of those fused."""
+        for name, without in one_out(answer, self.shown).items():
+            for _, at in self._other_shapes(answer, without, (name,)):
+                yield from to_ask(self.shown[without], at)
+
+    def _other_shapes(self, joined: Hypothesis, without: Hypothesis, suspects: Hypothesis) -> list[list[int]]:
+        """Boxes of two decoded fusions that show one vehicle in different shapes: pairs of their places."""
+        asked = joined, without, suspects
+        if asked not in self._shapes:
+            self._shapes[asked] = reshaped(self.shown[joined], self.shown[without], suspects).T.tolist()
+        return self._shapes[asked]
 
     @cached_property
     def senders(self) -> dict[str, Place]:

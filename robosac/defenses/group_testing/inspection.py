@@ -50,14 +50,15 @@ class Inspection:
         return next((subset for subset in self._questions(answer) if subset and subset not in decoded), None)
 
     def _questions(self, answer: Hypothesis) -> Iterator[Hypothesis]:
-        """What is worth decoding, in this order: those to be asked again; whether what is missing is real; the answer
-        without all that vouch for a lie, if they are several; without each, the likeliest first; without those who may
-        stray, and those whose turn it is.
+        """What is worth decoding, in this order: those to be asked again; each alone who knows a vehicle's shape;
+        whether what is missing is real; the answer without all that vouch for a lie, if they are several; without each,
+        the likeliest first; without those who may stray, and those whose turn it is.
         """
         yield from self._again(answer)
         if answer not in self._found.shown:
             return
         yield from (self._without(answer, name) for name in answer if self._found.lies.worst(name))
+        yield from ((name,) for name in self._found.to_ask(answer))
         lies = self._found.unexplained(answer) or self._hardly_explained(answer)
         lies = [lie for lie in lies if lie.kind != "gone" or self._found.supporters(answer, lie)]
         holes = [lie for lie in lies if lie.kind == "gone"]
@@ -83,7 +84,13 @@ class Inspection:
         """How each box of an answer stands; None where nothing is known of objects."""
         if answer not in self._found.shown:
             return None
-        objects, contradicted = judge(self._found.shown[answer], list(self._found.shown.values()))
+        found = self._found
+        shapes = [
+            (index, found.shown[without], at)
+            for name, without in one_out(answer, found.shown).items()
+            for index, at, _ in found.reshaped(answer, without, (name,))
+        ]
+        objects, contradicted = judge(found.shown[answer], list(found.shown.values()), shapes)
         return ((*objects, *contradicted), ()) if self._keep_contradicted else (objects, contradicted)
 
     def _again(self, answer: Hypothesis) -> list[Hypothesis]:

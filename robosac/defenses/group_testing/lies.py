@@ -48,6 +48,7 @@ RULES: Mapping[str, Rule] = {
     "ghost": Rule(1.5, 1, 0.5, 3.0, ((1.0, 5.0), (2.0, 2.0), (3.0, 3.0))),
     "gone": Rule(1.5, 1, 0.5, 3.0, ((1.0, 2.5), (2.0, 3.0), (3.0, 4.0)), times=2),
     "moved": Rule(1.0, 1, 0.3, 2.0, ((0.7, 2.0), (1.4, 3.0), (2.1, 4.0)), times=2),
+    "reshaped": Rule(1.0, 1, 0.3, 2.0, (), malice=False),
     "late": Rule(1.0, 1, 0.3, 2.0, ((0.7, 2.0), (1.4, 3.0), (2.1, 4.0)), malice=False),
     "alone": Rule(1.0, 1, 0.3, 2.0, ((0.7, 2.0), (1.4, 3.0), (2.1, 4.0)), malice=False),
     "veiled": Rule(1.25, 1, 0.5, 3.0, ((0.75, 2.5), (1.5, 2.5), (2.25, 4.0)), times=2),
@@ -97,7 +98,7 @@ class Lies:
     audited: dict[str, int] = field(default_factory=dict)
     """By teammate: the frame in which it was last left out of a fusion of enough others to tell what it does."""
     accusers: dict[str, dict[str, int]] = field(default_factory=dict)
-    """By teammate: who said that it moves vehicles, and how often."""
+    """By teammate: who said that it moves or reshapes vehicles, and how often."""
 
     def recently_left_out(self, teammate: str, frame: int) -> bool:
         """Whether it was left out in this frame or one just before."""

@@ -45,7 +45,7 @@ class Lie:
     """Something wrong with one object in a fusion."""
 
     kind: str
-    """``ghost``, ``gone`` or ``moved``."""
+    """``ghost``, ``gone``, ``moved`` or ``reshaped``."""
     place: FloatArray
     """(2,): ego frame, metres."""
     veiled: bool = False
@@ -61,7 +61,7 @@ class Lie:
     said: bool = False
     """Whether the message of whoever is behind it says so, too: that a vehicle that it removes is not there."""
     by: Hypothesis = ()
-    """Who says that a vehicle is moved."""
+    """Who says that a vehicle is moved or reshaped."""
 
     @property
     def counts_as(self) -> str:

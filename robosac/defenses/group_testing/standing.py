@@ -26,12 +26,13 @@ Judged = tuple[tuple[JudgedBox, ...], tuple[JudgedBox, ...]]
 """Boxes of an answer, and those that are contradicted."""
 
 
-def judge(answer: Shown, decoded: Sequence[Shown]) -> Judged:
+def judge(answer: Shown, decoded: Sequence[Shown], reshaped: Sequence[tuple[int, Shown, int]] = ()) -> Judged:
     """Judge the boxes of an answer.
 
     1. A contradicted box is left out.
     2. A box that is out of place is taken from the part of the answer that has it nearest to its place; one that was
-       carried off (`differences.carried`), from the part that has it where others say.
+       carried off (`differences.carried`), from the part that has it where others say; and one that is ``reshaped``,
+       from the part that has it in the shape that others show.
     3. A vehicle that a part of the answer shows, and the answer has lost although it stands by testimony, is taken from
        there. Of the answer without one teammate the word of one witness is enough, if nobody else denies it. No vehicle
        is there twice by it.
@@ -45,6 +46,8 @@ def judge(answer: Shown, decoded: Sequence[Shown]) -> Judged:
     answer : Shown
     decoded : sequence of Shown
         All that was decoded in the frame.
+    reshaped : sequence of tuple
+        Of boxes of the answer that have a false shape: which, a part, and which box of that.
     """
     parts = [shown for shown in decoded if shown.teammates and set(shown.teammates) < set(answer.teammates)]
     away, contradicted, displaced = answer.away(), answer.contradicted, answer.displaced
@@ -54,6 +57,10 @@ def judge(answer: Shown, decoded: Sequence[Shown]) -> Judged:
         if better is not None:
             kept[index] = False
             repairs.append(better)
+    for index, part, at in reshaped:
+        if kept[index]:
+            kept[index] = False
+            repairs.append((part, at))
     for part in parts:
         left = [name for name in answer.teammates if name not in part.teammates]
         alone: list[int] = gone_alone(answer, part, left).tolist() if len(left) == 1 else []
