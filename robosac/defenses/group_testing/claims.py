@@ -22,7 +22,11 @@ NEARLY_SUPPORTS = 2.5
 DENIES = -3.0
 """An agent denies a place from this L on downwards."""
 EGO_KNOWS = -6.75
-"""Where the ego's own L is so low, whoever supports a vehicle is wrong: nobody else has a part in what the ego saw."""
+"""Where the ego's own L is so low, whoever supports a vehicle is wrong: nobody else has a part in what the ego saw. But
+right behind another vehicle it sees nothing, and its L there may be as low.
+"""
+HIDING_M = 0.5
+"""A vehicle hides what is behind it and so much to its sides."""
 WEIGHTY = 6.0
 """Testimony of several agents decides from this sum of L on, in either direction."""
 BLAMED_SUM, BLAMED_BESIDE = 8.0, 4.0
@@ -42,6 +46,7 @@ NOT_TOGETHER = 3
 LEANS = -1.0
 """All others lean against a box if the sum of L without those who vouch for it is so low."""
 _SAME_M = 1e-3
+_PARALLEL = 1e-9
 _STEPS = np.array([[0.0, 0.0], [1.0, 0.0], [-1.0, 0.0], [0.0, 1.0], [0.0, -1.0]])
 
 
@@ -137,9 +142,9 @@ class Claims:
     def contradicted(self) -> BoolArray:
         """Which boxes (n,) are contradicted, whoever supports them.
 
-        Those with an L of -6.75 or less by the ego are. So are those that are denied for certain
-        (`denied_for_certain`), if the sum of L without the teammate who supports a box most is at most -6. What the ego
-        itself supports is not contradicted.
+        Those with an L of -6.75 or less by the ego are, but for what is behind a vehicle that it sees. So are those
+        that are denied for certain (`denied_for_certain`), if the sum of L without the teammate who supports a box most
+        is at most -6. What the ego itself supports is not contradicted.
         """
         return self._contradicted(self.beside <= -WEIGHTY, len(self.witnesses) - 2)
 
@@ -159,8 +164,26 @@ class Claims:
     def _contradicted(self, enough: BoolArray, others: int) -> BoolArray:
         """Which boxes (n,) are contradicted where it is ``enough`` (n,), by so many ``others`` besides the ego."""
         denied = enough & self.denied_for_certain(others) & ~self.supporting[0]
-        known: BoolArray = denied | (self.likelihood[0] <= EGO_KNOWS)
+        sure: BoolArray = self.likelihood[0] <= EGO_KNOWS
+        if sure.any():  # seldom
+            sure &= ~self._behind_another()
+        known: BoolArray = denied | sure
         return known
+
+    def _behind_another(self) -> BoolArray:
+        """Which boxes (n,) the ego can only look at through another one, which it supports."""
+        others = self.boxes[self.supporting[0]]
+        to, cos, sin = self.boxes[:, None, :2], np.cos(others[:, 4]), np.sin(others[:, 4])
+        half = others[:, 2:4].T + 2 * HIDING_M
+        near, far = np.zeros((len(to), len(others))), np.ones((len(to), len(others)))
+        for side, ahead, left in ((half[0] / 2, cos, sin), (half[1] / 2, -sin, cos)):
+            start = -(others[:, 0] * ahead + others[:, 1] * left)
+            way = to[..., 0] * ahead + to[..., 1] * left
+            way = np.where(np.abs(way) < _PARALLEL, _PARALLEL, way)
+            one, other = (-side - start) / way, (side - start) / way
+            near, far = np.maximum(near, np.minimum(one, other)), np.minimum(far, np.maximum(one, other))
+        behind: BoolArray = ((near < far) & (far < 1.0)).any(axis=1)
+        return behind
 
 
 def _nearer_to_another(around: FloatArray, shown: FloatArray) -> BoolArray:

@@ -43,6 +43,32 @@ def test_a_box_is_contradicted_by_the_ego_or_by_two(said, contradicted):
     assert claim(*said).contradicted().tolist() == [contradicted]
 
 
+@pytest.mark.parametrize(
+    ("other", "sees", "hidden"),
+    [
+        ((5.0, 2.0, 4.5, 1.9, 0.0), YES, True),
+        ((5.0, 2.0, 4.5, 1.9, 0.0), 0.0, False),  # the ego does not know it
+        ((5.0, 2.0, 4.5, 1.9, 0.0), NO, False),
+        ((5.0, 2.0, 1.9, 4.5, np.pi / 2), YES, True),
+        ((5.0, 3.6, 4.5, 1.9, 0.0), YES, True),  # beside the line of sight, but near
+        ((5.0, 4.6, 4.5, 1.9, 0.0), YES, False),
+        ((5.0, 4.6, 4.5, 1.9, 1.2), YES, True),  # it lies across
+        ((0.0, 6.0, 4.5, 1.9, 0.0), YES, False),
+        ((15.0, 6.0, 4.5, 1.9, 0.0), YES, False),  # behind it
+        ((-5.0, -2.0, 4.5, 1.9, 0.0), YES, False),
+    ],
+)
+@pytest.mark.parametrize("turned", [0.0, np.arctan2(PLACE[1], PLACE[0]), 2.0])
+def test_what_is_behind_a_vehicle_that_the_ego_sees_it_does_not_know(other, sees, hidden, turned):
+    cos, sin = np.cos(turned), np.sin(turned)
+    boxes = np.array([*BOX, [*other, 0.9]])
+    boxes[:, :2], boxes[:, 4] = boxes[:, :2] @ [[cos, -sin], [sin, cos]], boxes[:, 4] - turned
+    said = np.array([[NO, sees], [YES, 0.0], [YES, 0.0]])
+    assert Claims(boxes, ("", "a", "b"), said).contradicted().tolist() == [not hidden, sees == NO]
+    alone = Claims(boxes, ("", "a", "b"), said * [[1], [1], [0]])
+    assert alone.contradicted()[0]  # by the ego's word against one
+
+
 def test_a_suspects_own_word_is_left_out_whatever_it_is():
     liar_denies = claim(0.0, NO, NO, 0.0)
     assert liar_denies.contradicted().tolist() == [True]
