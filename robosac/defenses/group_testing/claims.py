@@ -182,7 +182,7 @@ class Claims:
             way = np.where(np.abs(way) < _PARALLEL, _PARALLEL, way)
             one, other = (-side - start) / way, (side - start) / way
             near, far = np.maximum(near, np.minimum(one, other)), np.minimum(far, np.maximum(one, other))
-        behind: BoolArray = ((near < far) & (far < 1.0)).any(axis=1)
+        behind: BoolArray = np.logical_or.reduce((near < far) & (far < 1.0), axis=1)
         return behind
 
 
