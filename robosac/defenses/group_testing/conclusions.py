@@ -60,7 +60,7 @@ def conclude(found: Findings, answer: Hypothesis) -> None:
     conflicts = _conflicts(found, answer)
     straying = _straying(found, asked)
     _leave_alone(found, answer)
-    _clear(found)
+    _clear(found, comparisons)
     for name in found.team:
         counts, lies = dict(conflicts.get(name, {})), blamed[name]
         if lies and found.late(name):
@@ -216,14 +216,17 @@ def _worth(found: Findings) -> float:
     return max(LEAST_CALM, found.known.memory.steadiness.calm)
 
 
-def _clear(found: Findings) -> None:
+def _clear(found: Findings, comparisons: Mapping[tuple[Hypothesis, Hypothesis], str]) -> None:
     """Where nothing is wrong with any object, whoever is fused is less likely to lie: the most of them that were
-    fused so. Holes count only where vehicles were taken away.
+    fused so. Where something is, so is whoever has no part in it (`_harmless`). Holes count only where vehicles were
+    taken away.
     """
     largest_first = sorted(found.shown, key=len, reverse=True)
     best = next((subset for subset in largest_first if not _wrong(found, subset)), ())
+    harmless = _harmless(found, comparisons)
     straying = found.known.memory.straying
-    cleared = tuple(name for name in best if not found.lies.worst(name) and not straying.rising(name))
+    unsuspicious = [name for name in found.team if name in best or name in harmless]
+    cleared = tuple(name for name in unsuspicious if not found.lies.worst(name) and not straying.rising(name))
     if not cleared:
         return
     model = found.known.model
@@ -233,6 +236,18 @@ def _clear(found: Findings) -> None:
     log_likelihood[first : first + CELLS] = -CLEARING
     nobody, all_of_them = found.known.rows([(), cleared])
     found.known.posterior.update(nobody, all_of_them, log_likelihood)
+
+
+def _harmless(found: Findings, comparisons: Mapping[tuple[Hypothesis, Hypothesis], str]) -> set[str]:
+    """Who was left out of fusions of enough others without putting anything right, and does not say what is wrong
+    there: of two that lie together, leaving out one does not help.
+    """
+    harmless, has_a_part = set[str](), set[str]()
+    for (joined, without), suspect in comparisons.items():
+        if len(without) >= FEWEST_BESIDE:
+            says_so = any(found.shown[joined].goes_with(suspect, lie) for lie in found.lies_in(joined))
+            (has_a_part if says_so or found.effects(joined, without, (suspect,)) else harmless).add(suspect)
+    return harmless - has_a_part
 
 
 def _wrong(found: Findings, fused: Hypothesis) -> bool:

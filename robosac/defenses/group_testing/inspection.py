@@ -6,6 +6,7 @@ from collections.abc import Collection, Iterator, Sequence
 
 import numpy as np
 
+from robosac.answers import Verdict
 from robosac.defenses.group_testing.candidates import UNRESOLVED
 from robosac.defenses.group_testing.conclusions import conclude
 from robosac.defenses.group_testing.findings import Findings, one_out
@@ -34,6 +35,7 @@ class Inspection:
         self._found = found
         self._keep_contradicted = keep_contradicted
         self._whole: Hypothesis | None = None
+        self._agreeing: list[Hypothesis] = []
 
     @property
     def differences(self) -> list[Difference]:
@@ -42,6 +44,8 @@ class Inspection:
 
     def learn(self, outcome: Outcome) -> Shown | None:
         """Take in a decoded subset; what it shows is given back, checked, if there is testimony to check it by."""
+        if outcome.verdict is Verdict.CONSENSUS:
+            self._agreeing.append(outcome.teammates)
         return self._found.learn(outcome)
 
     def next_test(self, answer: Hypothesis) -> Hypothesis | None:
@@ -57,8 +61,10 @@ class Inspection:
         yield from self._again(answer)
         if answer not in self._found.shown:
             return
+        # the answer may change within a frame, and nobody would be left out of the same one
+        self._whole = self._to_be_audited(answer) if self._whole is None else self._whole
         yield from (self._without(answer, name) for name in answer if self._found.lies.worst(name))
-        yield from ((name,) for name in self._found.to_ask(answer))
+        yield from ((name,) for name in self._found.to_ask(self._whole))
         lies = self._found.unexplained(answer) or self._hardly_explained(answer)
         lies = [lie for lie in lies if lie.kind != "gone" or self._found.supporters(answer, lie)]
         holes = [lie for lie in lies if lie.kind == "gone"]
@@ -70,8 +76,6 @@ class Inspection:
             groups = [self._found.vouching(answer, lie) for lie in lies]
             for group in (*filter(None, groups), *((name,) for name in self._candidates(answer, lies))):
                 yield self._without(answer, *group)
-        # the answer may change within a frame, and nobody would be left out of the same one
-        self._whole = answer if self._whole is None else self._whole
         again = (*self._straying(self._whole), *self._due(self._whole))
         yield from (self._without(self._whole, name) for name in again)
 
@@ -126,6 +130,12 @@ class Inspection:
     @staticmethod
     def _without(answer: Hypothesis, *group: str) -> Hypothesis:
         return tuple(name for name in answer if name not in group)
+
+    def _to_be_audited(self, answer: Hypothesis) -> Hypothesis:
+        """The answer; in the first frame the largest fusion in consensus: once nothing is found wrong it may be the
+        answer.
+        """
+        return max(self._agreeing, key=len, default=answer) if self._found.known.memory.frame == 0 else answer
 
     def _straying(self, whole: Hypothesis) -> list[str]:
         """Who may stray: in larger teams, where all take too many passes, those against whom there is something."""

@@ -56,6 +56,7 @@ def test_a_box_is_contradicted_by_the_ego_or_by_two(said, contradicted):
         ((0.0, 6.0, 4.5, 1.9, 0.0), YES, False),
         ((15.0, 6.0, 4.5, 1.9, 0.0), YES, False),  # behind it
         ((-5.0, -2.0, 4.5, 1.9, 0.0), YES, False),
+        ((9.5, 3.8, 4.5, 1.9, 0.0), YES, False),  # around it
     ],
 )
 @pytest.mark.parametrize("turned", [0.0, np.arctan2(PLACE[1], PLACE[0]), 2.0])

@@ -175,6 +175,46 @@ def test_a_hole_that_nothing_fills_keeps_nobody_from_being_cleared():
     assert after < before
 
 
+@pytest.mark.parametrize(("says", "cleared"), [(0.0, True), (NO, True), (4.0, False)])
+@pytest.mark.parametrize("others", [3, 2])
+def test_where_something_is_wrong_that_one_has_no_part_in_it_is_cleared(says, cleared, others):
+    """A ghost stays without it, and its own message does not vouch for that; beside few others that tells nothing."""
+    world = World({EGO: -2.0, "car-2": NO, "car-3": NO, "rsu": NO, "car-5": NO, LIAR: says}, lambda _: CAR)
+    without = ("car-2", "car-3", "rsu")[:others]
+    found = Findings(knowledge(), Lies(), tuple(TEAM), ())
+    before = found.known.suspicion()[LIAR]
+    for subset in (tuple(name for name in TEAM if name in (*without, LIAR)), without):
+        found.learn(world.judge(subset, None, 0))
+    conclude(found, without)
+    assert found.lies_in(without)
+    assert found.lies.levels == {}
+    fallen = before - found.known.suspicion()[LIAR]
+    assert fallen == pytest.approx(0.0, abs=1e-9) if not cleared or others < 3 else fallen > 0.01
+
+
+def test_whoever_tells_a_lie_is_not_cleared_by_another_one_that_it_has_no_part_in():
+    """It puts one of two ghosts right to leave it out."""
+    elsewhere = CAR - [25.0, 0, 0, 0, 0, 0]
+    shows = with_liar(np.vstack([CAR, elsewhere]), elsewhere)
+    denied = [(*PLACE, NO), (*elsewhere[0, :2], NO)]
+    world = World({}, shows)
+    world.testimony = saying({EGO: [], **{name: [] if name == LIAR else denied for name in TEAM}})
+    found = Findings(knowledge(), Lies(), tuple(TEAM), ())
+    before = found.known.suspicion()[LIAR]
+    without = tuple(name for name in TEAM if name != LIAR)
+    for subset in (tuple(TEAM), without):
+        found.learn(world.judge(subset, None, 0))
+    more = Findings(knowledge(), Lies(), tuple(TEAM), ())
+    for subset in (tuple(TEAM), without, ("car-2", "car-3", LIAR, "rsu"), ("car-2", "car-3", "rsu")):
+        boxes = np.vstack([SEEN, elsewhere if subset == without else shows((LIAR,))])
+        more.learn(replace(world.judge(subset, None, 0), boxes=boxes))
+    for each in (found, more):
+        conclude(each, without)
+        assert each.lies.levels.keys() == {LIAR}
+        assert each.known.suspicion()[LIAR] > before
+    assert more.known.suspicion()[LIAR] == pytest.approx(found.known.suspicion()[LIAR], abs=0.001)
+
+
 def test_a_hole_may_be_somebodys_doing_though_the_ego_misses_the_vehicle_too():
     assert [lie.kind for lie in concluded(ERASED, ("car-2", "car-3", LIAR)).lies_in(("car-2", "car-3", LIAR))] == [
         "gone"

@@ -1,8 +1,11 @@
 """Who is asked about the objects of a frame, how often, and what is told of it."""
 
+from dataclasses import replace
+
 import numpy as np
 import pytest
 
+from robosac.answers import Verdict
 from robosac.defenses import EGO
 from robosac.defenses.group_testing import GroupTesting, GroupTestingSettings
 from robosac.defenses.group_testing.findings import Findings
@@ -112,6 +115,24 @@ def test_inspections_are_bounded(inspections):
     assert len(first) <= settings.first_budget + inspections
     assert all(len(tested) <= settings.budget + inspections for _, tested in later)
     assert (LIAR in later[-1][0].named) == (inspections > 1)
+
+
+@pytest.mark.parametrize(
+    ("frame", "verdict", "audited"), [(0, "consensus", TEAM), (0, "dissensus", TEAM[:3]), (1, "consensus", TEAM[:3])]
+)
+def test_in_the_first_frame_the_largest_fusion_in_consensus_is_audited(frame, verdict, audited):
+    """It may become the answer once nothing is found wrong."""
+    team = tuple(TEAM)
+    found = Findings(
+        Knowledge(MODEL, Posterior(len(MODEL.kinds), 1e-3, 0.25, team), Memory(frame=frame)), Lies(), team, ()
+    )
+    inspection = Inspection(found, keep_contradicted=False)
+    for subset, said in ((team, verdict), (team[:3], "consensus")):
+        inspection.learn(replace(HONEST.judge(subset, None, frame), verdict=Verdict(said)))
+    asked = list(inspection._questions(team[:3]))
+    assert {subset for subset in asked if len(subset) == len(audited) - 1} == {
+        tuple(other for other in audited if other != name) for name in audited
+    }
 
 
 def test_everybody_is_left_out_once_although_nothing_is_wrong():

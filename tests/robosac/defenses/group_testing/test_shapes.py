@@ -6,8 +6,13 @@ import pytest
 from robosac.answers import Standing
 from robosac.defenses import EGO
 from robosac.defenses.group_testing import GroupTesting, GroupTestingSettings
+from robosac.defenses.group_testing.findings import Findings
 from robosac.defenses.group_testing.hearing import Hearing
+from robosac.defenses.group_testing.knowledge import Knowledge
+from robosac.defenses.group_testing.lies import Lies
+from robosac.defenses.group_testing.memory import Memory
 from robosac.defenses.group_testing.objects import Shown
+from robosac.defenses.group_testing.posterior import Posterior
 from robosac.defenses.group_testing.shapes import agreeing, reshaped, to_ask
 from tests.robosac.defenses.group_testing.one_place import CAR, LIAR, MODEL, PLACE, SEEN, YES, World, there, with_liar
 from tests.robosac.testifying import saying
@@ -56,6 +61,18 @@ def test_an_honest_teammate_that_puts_a_shape_right_is_not_blamed():
         np.testing.assert_array_equal(row, CAR[0])
         assert "rsu" not in decision.state["memory"]["lies"]["levels"]
     assert len(decision.state["memory"]["lies"]["audited"]) == len(TEAM) + 1
+
+
+@pytest.mark.parametrize(("ego", "by"), [(CAR, (EGO,)), (TURNED, ()), (CAR[:0], ())])
+def test_the_ego_is_believed_without_asking_anybody(ego, by):
+    world = World({**SEE_IT, EGO: YES}, with_liar(TURNED, CAR))
+    world.alone = np.vstack([SEEN, ego])
+    known = Knowledge(MODEL, Posterior(len(MODEL.kinds), 0.5, 0.25, TEAM), Memory())
+    found = Findings(known, Lies(), TEAM, ())
+    for team in (TEAM, OTHERS):
+        found.learn(world.judge(team, None, 0))
+    assert [words for *_, words in found.reshaped(TEAM, OTHERS, (LIAR,))] == ([by] if by else [])
+    assert found.effects(TEAM, OTHERS, (LIAR,)) == []  # one alone blames nobody
 
 
 def test_where_nobody_else_is_asked_the_shape_stays_as_it_is_fused():
@@ -117,6 +134,7 @@ def test_those_are_asked_who_support_it_most():
         ({"a": CAR, "b": CAR + [2, 0, 0, 0, 0, 0]}, ()),
         ({"a": CAR, "b": CAR[:0]}, ()),
         ({"a": CAR, "b": CAR + [0, 0, 0, 0, np.pi / 8, 0]}, ()),
+        ({"a": CAR, "b": CAR - [0, 0, 0, 0, np.pi / 8, 0]}, ()),
     ],
 )
 def test_the_word_of_the_ego_or_of_two_counts_and_of_more_than_say_the_contrary(alone, by):
