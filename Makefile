@@ -2,16 +2,18 @@ PYTHON ?= $(shell command -v python3.11 || command -v python3)
 VENV := .venv
 BIN := $(VENV)/bin
 OUT ?= out
+# nothing is compiled before it is first used: most of what torch brings never is
+INSTALL := $(BIN)/pip install --quiet --no-compile --constraint constraints.txt
 HOST ?= 127.0.0.1
 PORT ?= 8000
 
 # tests that start several processes, a browser, a cluster or a database server: they come after the others
 SEVERAL := $(addprefix tests/,$(addsuffix .py,clients/test_crash_test service/test_cluster service/test_live_page \
-	clients/test_fleet service/test_behind_a_proxy clients/test_trial))
+	clients/test_fleet service/test_behind_a_proxy clients/test_trial clients/test_load_test service/test_alone))
 # tests that take time themselves: nothing else should run beside them
-ALONE := $(addprefix tests/service/test_,$(addsuffix .py,adversary alone connections deadlines fair_shares gathering \
+ALONE := $(addprefix tests/service/test_,$(addsuffix .py,adversary connections deadlines fair_shares gathering \
 	overload shared_database stalls turns)) tests/service/store/test_faults.py \
-	$(addprefix tests/clients/test_,$(addsuffix .py,adversary flood load_test overload))
+	$(addprefix tests/clients/test_,$(addsuffix .py,adversary flood overload))
 
 IN_TWO := -n 2 --dist loadfile --no-loadscope-reorder
 
@@ -62,15 +64,15 @@ $(VENV)/.created:
 	touch $@
 
 $(VENV)/.installed: $(VENV)/.created pyproject.toml constraints.txt
-	$(BIN)/pip install --quiet --constraint constraints.txt --editable '.[plots,postgresql,recordings]'
+	$(INSTALL) --editable '.[plots,postgresql,recordings]'
 	touch $@
 
 $(VENV)/.installed-dev: $(VENV)/.installed
-	$(BIN)/pip install --quiet --constraint constraints.txt --editable '.[dev]'
+	$(INSTALL) --editable '.[dev]'
 	touch $@
 
 $(VENV)/.installed-docs: $(VENV)/.installed
-	$(BIN)/pip install --quiet --constraint constraints.txt --editable '.[docs]'
+	$(INSTALL) --editable '.[docs]'
 	touch $@
 
 clean:

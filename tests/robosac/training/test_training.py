@@ -27,14 +27,21 @@ class Stop(Exception):
     pass
 
 
-def test_training_learns_and_resumes_where_it_stopped(tmp_path):
-    losses = []
+@pytest.fixture(scope="module")
+def trained(tmp_path_factory):
+    """A network, its checkpoint, and the losses on the way."""
+    checkpoint, losses = tmp_path_factory.mktemp("trained") / "whole.pt", []
 
     def note(stage, done, total, remark):
+        silent(stage, done, total, remark)
         if stage == "train":
             losses.append(float(remark.split()[-1]))
 
-    whole = train_network(TINY, tmp_path / "whole.pt", note)
+    return train_network(TINY, checkpoint, note), checkpoint, losses
+
+
+def test_training_learns_and_resumes_where_it_stopped(trained, tmp_path):
+    whole, _, losses = trained
     assert np.mean(losses[-5:]) < 0.9 * np.mean(losses[:5])
 
     def interrupt(stage, done, total, remark):
@@ -52,14 +59,14 @@ def test_training_learns_and_resumes_where_it_stopped(tmp_path):
         torch.testing.assert_close(resumed.state_dict()[name], tensor)
 
 
-def test_a_checkpoint_of_another_run_is_refused(tmp_path):
-    train_network(TINY, tmp_path / "c.pt", silent)
+def test_a_checkpoint_of_another_run_is_refused(trained):
+    _, checkpoint, _ = trained
     with pytest.raises(ValueError, match="another configuration"):
-        train_network(replace(TINY, seed=2), tmp_path / "c.pt", silent)
+        train_network(replace(TINY, seed=2), checkpoint, silent)
 
 
-def test_exported_weights_load_with_their_recipe(tmp_path):
-    network = train_network(TINY, tmp_path / "c.pt", silent)
+def test_exported_weights_load_with_their_recipe(trained, tmp_path):
+    network, _, _ = trained
     point = OperatingPoint(0.5, 0.1, 0.3, {"ego_only_ap50": 0.1})
     path = tmp_path / "weights.safetensors"
     recipe = export_weights(network, TINY, point, "robosac train --out DIR", path)
