@@ -174,11 +174,10 @@ class Claims:
         """Which boxes (n,) the ego can only look at through another one, which it supports."""
         others = self.boxes[self.supporting[0]]
         to, cos, sin = self.boxes[:, None, :2], np.cos(others[:, 4]), np.sin(others[:, 4])
-        half = others[:, 2:4].T + 2 * HIDING_M
+        length, width = others[:, 2:4].T / 2 + HIDING_M
         near, far = np.zeros((len(to), len(others))), np.ones((len(to), len(others)))
-        for side, ahead, left in ((half[0] / 2, cos, sin), (half[1] / 2, -sin, cos)):
-            start = -(others[:, 0] * ahead + others[:, 1] * left)
-            way = to[..., 0] * ahead + to[..., 1] * left
+        for side, x, y in ((length, cos, sin), (width, -sin, cos)):  # a line is inside a box between two pairs of sides
+            start, way = -(others[:, 0] * x + others[:, 1] * y), to[..., 0] * x + to[..., 1] * y
             way = np.where(np.abs(way) < _PARALLEL, _PARALLEL, way)
             one, other = (-side - start) / way, (side - start) / way
             near, far = np.maximum(near, np.minimum(one, other)), np.minimum(far, np.maximum(one, other))
