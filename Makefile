@@ -2,7 +2,8 @@ PYTHON ?= $(shell command -v python3.11 || command -v python3)
 VENV := .venv
 BIN := $(VENV)/bin
 OUT ?= out
-# nothing is compiled before it is first used: most of what torch brings never is
+# what is compiled is kept, as tests start hundreds of processes; but nothing is compiled before it is first used
+export PYTHONDONTWRITEBYTECODE :=
 INSTALL := $(BIN)/pip install --quiet --no-compile --constraint constraints.txt
 HOST ?= 127.0.0.1
 PORT ?= 8000
