@@ -90,11 +90,6 @@ class Claims:
         """Who (witnesses, n) supports which box."""
         return self.likelihood >= SUPPORTS
 
-    @cached_property
-    def by_box(self) -> tuple[list[list[bool]], list[list[float]]]:
-        """Of each box, who (witnesses,) supports it, and L (witnesses,): plain numbers, to go through one by one."""
-        return self.supporting.T.tolist(), self.likelihood.T.tolist()
-
     @property
     def denying(self) -> BoolArray:
         """Who (witnesses, n) denies which box."""

@@ -56,7 +56,7 @@ def effects(joined: Shown, without: Shown, suspects: Sequence[str]) -> list[Lie]
     found += _taken(joined, without, suspects)
     found += [Lie("gone", without.boxes[i, :2], alone=True) for i in gone_alone(joined, without, suspects)]
     away, aside, other = joined.away(suspects), joined.away(suspects, across=True), without.away(suspects)
-    farther: dict[int, int] = dict(_farther(joined, without).T.tolist())
+    farther: dict[int, int] = dict(joined.beside(without, _farther).T.tolist())
     for index in np.flatnonzero((away >= AWAY) & (joined.boxes[:, 5] >= PLACED_SCORE) & ~ghosts).tolist():
         same = _at(without, joined.boxes[index])
         same = farther.get(index) if same is None else same
@@ -149,7 +149,7 @@ def carried(joined: Shown, without: Shown, suspects: Collection[str]) -> IntArra
     The ego or two others support the second; the sum of their L is greater by 6 there. A witness that is asked of a
     place beside a vehicle sees it nearer to that place than it is, so `Shown.away` does not always tell.
     """
-    found = _farther(joined, without)
+    found = joined.beside(without, _farther)
     others = np.array([name not in suspects for name in joined.claims.witnesses])
     there, here = (shown.claims.likelihood[others][:, at] for shown, at in zip((joined, without), found, strict=True))
     return found[:, two_witnesses(here >= SUPPORTS) & (here.sum(axis=0) - there.sum(axis=0) >= WEIGHTY)]
@@ -184,7 +184,7 @@ def gone(joined: Shown, without: Shown, suspects: Collection[str] = ()) -> IntAr
     others = np.array([name not in suspects for name in claims.witnesses])
     supported = two_witnesses(claims.supporting & others[:, None])
     supported &= claims.likelihood[others].sum(axis=0) >= WEIGHTY
-    lost, rise = _lost(joined, without)
+    lost, rise = joined.beside(without, _lost)
     found: IntArray = np.flatnonzero(supported & lost & (without.boxes[:, 5] >= SHOWN_SCORE) & (rise >= EFFECT))
     return found
 
@@ -197,7 +197,7 @@ def gone_alone(joined: Shown, without: Shown, suspects: Collection[str]) -> IntA
         return np.zeros(0, dtype=np.int64)
     claims = without.claims.without(suspects)
     supported = (claims.likelihood.max(axis=0) >= CERTAIN) & ~two_witnesses(claims.supporting)
-    lost, rise = _lost(joined, without)
+    lost, rise = joined.beside(without, _lost)
     crisp = (without.boxes[:, 5] >= CRISP_SCORE) & (rise >= GONE_EFFECT)
     found: IntArray = np.flatnonzero(supported & ~claims.denying.any(axis=0) & lost & crisp)
     return found
@@ -207,8 +207,8 @@ def _lost(joined: Shown, without: Shown) -> tuple[BoolArray, FloatArray]:
     """Which boxes (n,) of the second fusion nothing in the first one shows, and by how much (n,) the logarithm of
     their odds is higher there. None is the ego itself, as others see it.
     """
-    shown = joined.boxes[joined.boxes[:, 5] >= SHOWN_SCORE]
-    lost: BoolArray = pairwise_iou(without.boxes, shown).max(axis=1, initial=0.0) < SHOWN_IOU
+    shown = joined.boxes[:, 5] >= SHOWN_SCORE
+    lost: BoolArray = joined.overlap(without)[shown].max(axis=0, initial=0.0) < SHOWN_IOU
     lost &= np.hypot(*without.boxes[:, :2].T) > OWN_M
     return lost, without.odds_at(without.boxes[:, :2]) - joined.odds_at(without.boxes[:, :2])
 

@@ -110,7 +110,7 @@ class Evidence:
         if outcome.reference is not None and outcome.boxes is not None:
             if self._alone is None and shown is not None:
                 self._alone = shown.of_ego(outcome.reference)
-            pair = self.measure(outcome.reference, outcome.boxes, _said(self._alone, shown, outcome.teammates))
+            pair = self.measure(outcome.reference, outcome.boxes, *_said(self._alone, shown, outcome.teammates))
             self.ego_witnesses = pair is not None
             if pair is not None:
                 values = {"jaccard_index": round(outcome.jaccard_index, 4)}
@@ -162,7 +162,7 @@ class Evidence:
             if small.boxes is None or large.boxes is None:
                 continue
             part, whole = self._checked[small.teammates], self._checked[large.teammates]
-            pair = self.measure(small.boxes, large.boxes, _said(part, whole, joining))
+            pair = self.measure(small.boxes, large.boxes, *_said(part, whole, joining))
             if pair is not None:
                 off = 0.0 if part is None or whole is None else misplaced(whole, part, joining)
                 found.append((small.teammates, joining, pair, off))
@@ -270,11 +270,14 @@ class Evidence:
                 memory.add_evidence(name, item)
 
 
-def _said(smaller: Shown | None, larger: Shown | None, joining: Hypothesis) -> Said | None:
-    """What others than the joining say of the boxes of two fusions; None where there is no testimony."""
+def _said(smaller: Shown | None, larger: Shown | None, joining: Hypothesis) -> tuple[Said, FloatArray] | tuple[()]:
+    """What others than the joining say of the boxes of two fusions, and their overlap; nothing where there is no
+    testimony.
+    """
     if smaller is None or larger is None:
-        return None
-    return Said(smaller.vouched(joining), larger.vouched(joining), larger.in_place(joining))
+        return ()
+    said = Said(smaller.vouched(joining), larger.vouched(joining), larger.in_place(joining))
+    return said, larger.overlap(smaller)
 
 
 def _in_frame(rows: FloatArray, pose: FloatArray) -> FloatArray:

@@ -18,7 +18,6 @@ from robosac.defenses.group_testing.lies import Lies
 from robosac.defenses.group_testing.objects import Lie, Shown
 from robosac.defenses.group_testing.shapes import BLAMING, agreeing, reshaped, to_ask
 from robosac.defenses.protocol import EGO, Difference, Hypothesis, Outcome
-from robosac.testimony import Testimony
 
 CALM = 0.5
 """From here on the ego counts as steady."""
@@ -179,7 +178,7 @@ class Findings:
         centres = np.concatenate([rows[known, :2], [now[EGO]]]) - now[EGO]
         moved = np.concatenate([moved[known], [since[EGO]]])  # the ego is a vehicle, too
         turn = self.pose[:2, :2]
-        return late(self.said(), sender, since[sender] @ turn, centres @ turn, moved @ turn)
+        return late(self.heard().everybody, sender, since[sender] @ turn, centres @ turn, moved @ turn)
 
     def note(self, joined: Hypothesis, without: Hypothesis, lies: Sequence[Lie]) -> None:
         """Note for whoever looks on what is wrong in a fusion by the fault of those whom the other one does without."""
@@ -203,8 +202,10 @@ class Findings:
 
     def vouching(self, fused: Hypothesis, lie: Lie) -> Hypothesis:
         """Those fused whose own messages go with a ghost or a hole, if they are several and not all."""
-        shown = self.shown[fused]
-        group = tuple(name for name in fused if lie.kind != "moved" and shown.goes_with(name, lie))
+        if lie.kind == "moved":
+            return ()
+        going = set(self.shown[fused].going_with(lie))
+        group = tuple([name for name in fused if name in going])
         return group if 2 <= len(group) < len(fused) else ()
 
     def lies_in(self, fused: Hypothesis) -> list[Lie]:
@@ -232,8 +233,7 @@ class Findings:
 
     def supporters(self, answer: Hypothesis, hole: Lie) -> Hypothesis:
         """The two of those fused who support a vehicle in a hole most, in the order of the team."""
-        testimony = self.said()
-        said = dict(zip(testimony.agents, testimony.likelihood(hole.place[None])[:, 0].tolist(), strict=True))
+        said = self.heard().said(hole.place)
         most = sorted((name for name in answer if said[name] >= SUPPORTS), key=lambda name: -said[name])[:2]
         return tuple(name for name in answer if name in most)
 
@@ -244,11 +244,11 @@ class Findings:
         found = self.gone(answer, witnesses)
         return bool(len(found)) and bool(np.hypot(*(found[:, :2] - hole.place).T).min() <= REACH_M)
 
-    def said(self) -> Testimony:
-        """What everybody says."""
+    def heard(self) -> Hearing:
+        """What all messages say."""
         if self.hearing is None:
             raise RuntimeError("there is no testimony yet")
-        return self.hearing.everybody
+        return self.hearing
 
     def placed(self, place: FloatArray) -> FloatArray:
         """A place (2,) of the ego's frame in the world."""

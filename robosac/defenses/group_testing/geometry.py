@@ -76,8 +76,11 @@ class Said:
     """(m,): the vehicle is where the box is."""
 
 
-def measure(smaller: FloatArray, larger: FloatArray, said: Said | None = None) -> PairMeasure | None:
-    """Compare the boxes (n, 6) of a fusion with those (m, 6) of the same fusion and more messages.
+def measure(
+    smaller: FloatArray, larger: FloatArray, said: Said | None = None, overlap: FloatArray | None = None
+) -> PairMeasure | None:
+    """Compare the boxes (n, 6) of a fusion with those (m, 6) of the same fusion and more messages, whose ``overlap``
+    (m, n) with the former may be known.
 
     ``g = 1 - mean over boxes b of the smaller, score >= .5, of max IoU(b, boxes of the larger, score >= .15)``: honest
     messages leave others' boxes where they are. ``v`` counts boxes of the larger, score >= .3, that touch no box of the
@@ -92,20 +95,20 @@ def measure(smaller: FloatArray, larger: FloatArray, said: Said | None = None) -
     PairMeasure or None
         None if the smaller has fewer than two boxes to survive.
     """
-    witnesses = smaller[(smaller[:, 5] >= WITNESS_SCORE) & (True if said is None else said.real)]
-    if len(witnesses) < MIN_WITNESSES:
+    witnesses = (smaller[:, 5] >= WITNESS_SCORE) & (True if said is None else said.real)
+    if np.count_nonzero(witnesses) < MIN_WITNESSES:
         return None
+    overlap = pairwise_iou(larger, smaller) if overlap is None else overlap
     surviving = larger[:, 5] >= SURVIVOR_SCORE
-    overlap = pairwise_iou(witnesses, larger[surviving])
-    lost = 1.0 - overlap.max(axis=1, initial=0.0)
-    if said is not None and surviving.any():
-        same = said.in_place[surviving][overlap.argmax(axis=1)] & (lost <= 1.0 - SAME_IOU)
+    kept = overlap[surviving][:, witnesses]
+    lost = 1.0 - kept.max(axis=0, initial=0.0)
+    if said is not None and len(kept):
+        same = said.in_place[surviving][kept.argmax(axis=0)] & (lost <= 1.0 - SAME_IOU)
         lost = np.where(same, np.minimum(lost, SAME_LOSS), lost)
-    claimed = larger[(larger[:, 5] >= NEW_SCORE) & (True if said is None else ~said.vouched)]
-    known = smaller[smaller[:, 5] >= KNOWN_SCORE]
-    overlap = pairwise_iou(claimed, known).max(axis=1, initial=0.0)
-    added = claimed[overlap == 0.0]
-    return PairMeasure(float(lost.mean()), len(added), Compared(witnesses, lost, added))
+    claimed = (larger[:, 5] >= NEW_SCORE) & (True if said is None else ~said.vouched)
+    known = smaller[:, 5] >= KNOWN_SCORE
+    added = larger[claimed & (overlap[:, known].max(axis=1, initial=0.0) == 0.0)]
+    return PairMeasure(float(lost.mean()), len(added), Compared(smaller[witnesses], lost, added))
 
 
 def followed(boxes: FloatArray, pose: FloatArray) -> FloatArray:

@@ -38,14 +38,20 @@ class Hearing:
     def __init__(self, testimony: Testimony, unheard: Collection[str]) -> None:
         self.everybody = testimony
         self.heard = testimony.of([name for name in testimony.agents if name not in unheard])
-        self._said: dict[bytes, FloatArray] = {}
+        self._said: dict[bytes, dict[str, float]] = {}
 
-    def said(self, place: FloatArray) -> FloatArray:
-        """What everybody says of a place (2,), heard or not: (agents,)."""
+    def said(self, place: FloatArray) -> dict[str, float]:
+        """What everybody says of a place (2,), heard or not: L by agent."""
         asked = place.tobytes()
         if asked not in self._said:
-            self._said[asked] = self.everybody.likelihood(place[None])[:, 0]
+            self.ask(place[None])
         return self._said[asked]
+
+    def ask(self, places: FloatArray) -> None:
+        """Look up at once what everybody says of places (n, 2)."""
+        said = self.everybody.likelihood(places).T.tolist()
+        for place, by_agent in zip(places, said, strict=True):
+            self._said[place.tobytes()] = dict(zip(self.everybody.agents, by_agent, strict=True))
 
     def alone(self, agent: str, unheard: Collection[str]) -> int:
         """In how many places, `APART_M` apart, an agent sees a vehicle against the word of all who are heard."""

@@ -166,7 +166,7 @@ class Inspection:
         """Who may be behind them, the likeliest first: those suspected already, and those whose own testimony goes with
         the lie. Who was left out lately comes after the others.
         """
-        testimony = self._found.said()
+        testimony = self._found.heard().everybody
         said = testimony.likelihood(np.stack([lie.place for lie in lies]))
         sign = np.array([-1.0 if lie.kind == "gone" else 1.0 for lie in lies])
         suspicion = self._found.known.suspicion()

@@ -170,7 +170,8 @@ class Lies:
 
     def worst(self, teammate: str) -> float:
         """The level of the kind nearest to being named for, as a share, whether or not somebody is named for it."""
-        return max((level / RULES[k].names for k, (level, _) in self.levels.get(teammate, {}).items()), default=0.0)
+        known = self.levels.get(teammate)
+        return max(level / RULES[k].names for k, (level, _) in known.items()) if known else 0.0
 
     def guilt(self, teammate: str) -> float:
         """The same of the kinds that somebody is named for: at 1 it is."""

@@ -8,13 +8,15 @@ witnesses and an effect.
 
 from __future__ import annotations
 
-from collections.abc import Collection, Sequence
+from collections.abc import Callable, Collection, Sequence
 from dataclasses import dataclass
 from functools import cached_property
+from typing import Any, TypeVar
+from weakref import WeakKeyDictionary
 
 import numpy as np
 
-from robosac.boxes import BoolArray, FloatArray, IntArray
+from robosac.boxes import BoolArray, FloatArray, IntArray, pairwise_iou
 from robosac.defenses.group_testing.claims import DENIES, SUPPORTS, Claims, two_witnesses, vouched
 from robosac.defenses.group_testing.hearing import REACH_M, Hearing
 from robosac.defenses.protocol import Hypothesis
@@ -38,6 +40,7 @@ SLACK_ALONG_M = 0.25
 SLACK_ACROSS_M = 0.2
 """Added to what a witness says it may err: senders are not quite where they say, nor are boxes where all is honest."""
 _LOWEST = 0.05
+T = TypeVar("T")
 
 
 @dataclass(frozen=True)
@@ -94,10 +97,24 @@ class Shown:
         self.everybody = Claims.of(boxes, hearing.everybody, boxes[boxes[:, 5] >= SHOWN_SCORE])
         """What everybody says of the boxes, heard or not."""
         self.claims = self.everybody.without(set(hearing.everybody.agents) - set(hearing.heard.agents))
+        self._beside: WeakKeyDictionary[Shown, dict[Any, Any]] = WeakKeyDictionary()
+        self._medians: dict[tuple[frozenset[str], bool], tuple[FloatArray, IntArray]] = {}
 
     def of_ego(self, boxes: FloatArray) -> Shown:
         """What the ego alone shows in the same frame, checked."""
         return Shown((), boxes, self._hearing)
+
+    def beside(self, other: Shown, compare: Callable[[Shown, Shown], T]) -> T:
+        """What comes of comparing this fusion with another one; it is worked out once. It must not hold the other."""
+        known = self._beside.setdefault(other, {})
+        if compare not in known:
+            known[compare] = compare(self, other)
+        found: T = known[compare]
+        return found
+
+    def overlap(self, other: Shown) -> FloatArray:
+        """IoU (n, m) of the boxes with those of another fusion; nobody may write to it."""
+        return self.beside(other, _overlap)
 
     @cached_property
     def seen(self) -> Sighting:
@@ -119,7 +136,7 @@ class Shown:
         """How far (n,) each box is from where witnesses see it, in either direction or ``across`` itself, the lower
         median of at least two; 0 with fewer. The suspects are no witnesses.
         """
-        middle, seeing = self._median_away(suspects, self._away[1:] if across else self._away)
+        middle, seeing = self._median_away(suspects, across=across)
         return np.where(seeing >= 2, middle, 0.0)
 
     def accusers(self, index: int, suspects: Collection[str]) -> Hypothesis:
@@ -130,20 +147,23 @@ class Shown:
 
     def in_place(self, joining: Collection[str]) -> BoolArray:
         """Which boxes (n,) stand where those who are not among the joining see a vehicle, by their lower median."""
-        middle, _ = self._median_away(joining, self._away)
+        middle, _ = self._median_away(joining)
         placed: BoolArray = middle <= IN_PLACE
         return placed
 
-    def _median_away(self, suspects: Collection[str], away: FloatArray) -> tuple[FloatArray, IntArray]:
+    def _median_away(self, suspects: Collection[str], *, across: bool = False) -> tuple[FloatArray, IntArray]:
         """The lower median (n,) of all but the suspects of how far away each box is, infinite where none of them sees
         it; and how many (n,) do.
         """
-        others = np.array([name not in suspects for name in self.claims.witnesses])
-        away = away[:, others].max(axis=0)
-        away = np.sort(np.where(np.isnan(away), np.inf, away), axis=0)
-        seeing: IntArray = np.isfinite(away).sum(axis=0)
-        middle: FloatArray = away[np.maximum(seeing - 1, 0) // 2, np.arange(len(self.boxes))]
-        return middle, seeing
+        asked = frozenset(suspects), across
+        if asked not in self._medians:
+            others = np.array([name not in suspects for name in self.claims.witnesses])
+            away = self._away[1:, others] if across else self._away[:, others]
+            away = np.sort(away.max(axis=0), axis=0)  # what is not a number comes last
+            seeing: IntArray = (~np.isnan(away)).sum(axis=0)
+            middle: FloatArray = away[np.maximum(seeing - 1, 0) // 2, np.arange(len(self.boxes))]
+            self._medians[asked] = np.where(seeing > 0, middle, np.inf), seeing
+        return self._medians[asked]
 
     def own(self, suspects: Sequence[str]) -> FloatArray:
         """What the suspects' own messages say of each box: (suspects, n)."""
@@ -152,9 +172,14 @@ class Shown:
 
     def goes_with(self, suspect: str, lie: Lie) -> bool:
         """Whether a suspect's own message says what a lie says."""
-        everybody = self._hearing.everybody
-        said = self._hearing.said(lie.place)[everybody.agents.index(suspect)]
-        return bool(said <= DENIES if lie.kind == "gone" else said >= SUPPORTS)
+        return suspect in self.going_with(lie)
+
+    def going_with(self, lie: Lie) -> Hypothesis:
+        """Those whose own messages say what a lie says."""
+        said = self._hearing.said(lie.place).items()
+        if lie.kind == "gone":
+            return tuple([name for name, at in said if at <= DENIES])
+        return tuple([name for name, at in said if at >= SUPPORTS])
 
     @cached_property
     def on_nobodys_word(self) -> BoolArray:
@@ -204,6 +229,8 @@ class Shown:
         """All that somebody may be to blame for."""
         ghosts = [Lie("ghost", box[:2]) for box in self.boxes[self.ghosts] if box[5] >= CRISP_SCORE]
         moved = [Lie("moved", box[:2]) for box in self.boxes[self.displaced]]
+        if len(self.holes):
+            self._hearing.ask(self.holes)
         return ghosts + moved + [Lie("gone", place) for place in self.holes]
 
     def odds_at(self, places: FloatArray) -> FloatArray:
@@ -229,3 +256,7 @@ class Shown:
         inside = (np.abs(along) <= length) & (np.abs(across) <= boxes[:, 3] / 2 + RIM_M)
         covered: BoolArray = np.atleast_1d(inside.any(axis=1))
         return covered
+
+
+def _overlap(one: Shown, other: Shown) -> FloatArray:
+    return pairwise_iou(one.boxes, other.boxes)

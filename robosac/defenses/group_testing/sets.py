@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import math
 from collections.abc import Sequence
-from functools import lru_cache
+from functools import lru_cache, reduce
 
 import numpy as np
 
@@ -16,6 +16,8 @@ PLAIN, COMPLEMENTARY, ATTACKS = range(3)
 BENIGN = COMPLEMENTARY
 """No state of a benign teammate is above."""
 STATES = 3
+_UP_TO = (1.0, 1.0, 1.0, 0.0, 1.0, 1.0, 0.0, 0.0, 1.0)
+"""From state (rows) to all that are not below it."""
 COMPLEMENTARY_TEAMS = 0.4
 COMPLEMENTARY_MEMBERS = 0.3
 """Share of teams some of whose views complement the others', and of such members among the benign of those teams."""
@@ -105,22 +107,38 @@ def through(table: FloatArray, kernel: FloatArray, sizes: IntArray | None = None
 
     Of each block only the first members do, as many as its size (B,) says; by default all.
     """
-    n, table = members(table), table.copy()
-    for member in range(n):
-        moving = slice(None) if sizes is None else np.flatnonzero(sizes > member)
-        view = table[moving].reshape(-1, STATES, STATES**member)
-        table[moving] = (kernel.T @ view).reshape(-1, *table.shape[1:])
-    return table
+    n = members(table)
+    moving = (n,) if sizes is None else tuple(sizes.tolist())
+    return _each(table, *_halves(tuple(kernel.ravel().tolist()), n, moving))
 
 
 def at_most(table: FloatArray) -> FloatArray:
-    """Tables (..., 3 ** n) of the probability that no member's state is above its state in the entry."""
-    total = table.copy()
-    for member in range(members(table)):
-        view = total.reshape(-1, STATES, STATES**member)
-        view[:, 1] += view[:, 0]
-        view[:, 2] += view[:, 1]
-    return total
+    """Tables (B, K, 3 ** n) of the probability that no member's state is above its state in the entry."""
+    n = members(table)
+    return _each(table, *_halves(_UP_TO, n, (n,)))
+
+
+def _each(table: FloatArray, first: FloatArray, last: FloatArray) -> FloatArray:
+    """Tables (B, K, 3 ** n) after a matrix was applied to each member, given as `_halves` gives it."""
+    split = table.reshape(*table.shape[:-1], last.shape[-1], first.shape[-1])
+    through_all: FloatArray = (last @ (split @ first)).reshape(table.shape)
+    return through_all
+
+
+@lru_cache(maxsize=256)
+def _halves(matrix: tuple[float, ...], n: int, moving: tuple[int, ...]) -> tuple[FloatArray, FloatArray]:
+    """A matrix (3, 3) for each of the first ``moving`` (B,) of n members, as one matrix (B, 1, 3 ** m, 3 ** m) for the
+    states of the first half of the members, and one, to be applied from the left, for those of the others: two products
+    of some size take far less time than n small ones.
+    """
+    half, one = (n + 1) // 2, np.reshape(matrix, (STATES, STATES))
+    first, last = [], []
+    for count in moving:
+        of_each = [one if member < count else np.eye(STATES) for member in range(n)]
+        low, high = (reduce(lambda m, k: np.kron(k, m), part, np.eye(1)) for part in (of_each[:half], of_each[half:]))
+        first.append(low)
+        last.append(high.T)
+    return np.stack(first)[:, None], np.stack(last)[:, None]
 
 
 def joint(low: FloatArray, high: FloatArray) -> FloatArray:

@@ -8,7 +8,7 @@ from itertools import compress
 import numpy as np
 
 from robosac.answers import Standing, Support
-from robosac.boxes import BoolArray, FloatArray, pairwise_iou
+from robosac.boxes import BoolArray, FloatArray, IntArray, pairwise_iou
 from robosac.defenses.group_testing.claims import DENIES, LEANS, NEARLY_SUPPORTS, SUPPORTS, two_witnesses
 from robosac.defenses.group_testing.differences import AWAY_EFFECT, carried, gone, gone_alone
 from robosac.defenses.group_testing.objects import SHOWN_SCORE, Shown
@@ -73,10 +73,10 @@ def judge(answer: Shown, decoded: Sequence[Shown], reshaped: Sequence[tuple[int,
                 kept[index] = False
                 repairs.append((part, at))
     repairs, kept = _each_once(repairs, answer, kept)
-    objects = [_judged(answer, index, None) for index in np.flatnonzero(kept).tolist()]
-    objects += [_judged(part, at, Standing.REPAIRED) for part, at in repairs]
-    left_out = [_judged(answer, index, Standing.CONTRADICTED) for index in np.flatnonzero(contradicted).tolist()]
-    return tuple(objects), tuple(left_out)
+    objects = _judged(answer, np.flatnonzero(kept))
+    for part, at in repairs:
+        objects += _judged(part, np.array([at]), Standing.REPAIRED)
+    return tuple(objects), tuple(_judged(answer, np.flatnonzero(contradicted), Standing.CONTRADICTED))
 
 
 def _each_once(repairs: Sequence[Repair], answer: Shown, kept: BoolArray) -> tuple[list[Repair], BoolArray]:
@@ -98,20 +98,23 @@ def _each_once(repairs: Sequence[Repair], answer: Shown, kept: BoolArray) -> tup
     return chosen, kept
 
 
-def _judged(shown: Shown, index: int, status: Standing | None) -> JudgedBox:
-    claims = shown.claims
-    supporting, said = claims.by_box[0][index], claims.by_box[1][index]
-    witnesses = tuple(compress(claims.witnesses, supporting))
-    ego, backed = supporting[0], claims.beside[index] >= SUPPORTS
-    leaning = not backed if ego else claims.rest[index] <= LEANS
-    least = max(LEANS, min(said)) if leaning else DENIES
-    deniers = tuple(compress(claims.witnesses, map(least.__ge__, said)))
-    if status is None:
-        several = len(witnesses) >= 2 or (witnesses and backed and sorted(said)[-2:][0] >= NEARLY_SUPPORTS)
-        known = backed if ego else several and not deniers
+def _judged(shown: Shown, which: IntArray, status: Standing | None = None) -> list[JudgedBox]:
+    """Some of the boxes of a fusion, by their places (n,); they stand as the fourth step says, or as is known."""
+    claims, found = shown.claims, list[JudgedBox]()
+    said, supporting = claims.likelihood[:, which], claims.supporting[:, which]
+    ego, backed = supporting[0], claims.beside[which] >= SUPPORTS
+    leaning = np.where(ego, ~backed, claims.rest[which] <= LEANS)
+    denying = said <= np.where(leaning, np.maximum(LEANS, said.min(axis=0, initial=np.inf)), DENIES)
+    second = backed & supporting.any(axis=0) & ((said >= NEARLY_SUPPORTS).sum(axis=0) >= 2)
+    several = (supporting.sum(axis=0) >= 2) | second
+    known = np.where(ego, backed, several & ~denying.any(axis=0)).tolist()
+    by_box = zip(which.tolist(), supporting.T.tolist(), denying.T.tolist(), known, strict=True)
+    for index, supports, denies, confirmed in by_box:
+        witnesses, deniers = tuple(compress(claims.witnesses, supports)), tuple(compress(claims.witnesses, denies))
         unknown = Standing.DISPUTED if deniers else Standing.SINGLE_WITNESS
-        status = Standing.CONFIRMED if known else unknown
-    return JudgedBox(shown.teammates, index, Support(status=status, witnesses=witnesses, deniers=deniers))
+        stands = status or (Standing.CONFIRMED if confirmed else unknown)
+        found.append(JudgedBox(shown.teammates, index, Support(status=stands, witnesses=witnesses, deniers=deniers)))
+    return found
 
 
 def _in_place(box: FloatArray, away: float, parts: Sequence[Shown]) -> Repair | None:

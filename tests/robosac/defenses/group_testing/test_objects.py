@@ -142,3 +142,17 @@ def test_who_sees_a_vehicle_beside_a_box_does_not_speak_for_that_box(score, vouc
     boxes = np.array([[10.0, 0.0, 4.5, 1.9, 0.0, 0.9], [10.0, 3.0, 4.5, 1.9, 0.0, score]])
     heard = saying({"": [], "a": [(10.0, SPREAD_M + 0.3, 6.0)]})
     assert Shown(("a",), boxes, Hearing(heard, ())).claims.supporting[1, 0] == vouched
+
+
+def test_two_fusions_are_compared_once_in_each_way():
+    heard, calls = hearing(**SEEN), []
+    joined, without = Shown(TEAM, np.vstack([REST, car()]), heard), Shown(("a", "b", "c"), REST, heard)
+
+    def compare(one, other):
+        calls.append((one, other))
+        return len(calls)
+
+    assert [joined.beside(without, compare) for _ in range(2)] == [1, 1]
+    assert without.beside(joined, compare) == 2
+    assert calls == [(joined, without), (without, joined)]
+    assert joined.overlap(without).tolist() == [[1.0], [0.0]]
