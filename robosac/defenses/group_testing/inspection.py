@@ -80,9 +80,15 @@ class Inspection:
         yield from (self._without(self._whole, name) for name in again)
 
     def conclude(self, answer: Hypothesis) -> None:
-        """Who lied in this frame; the posterior learns it, and memory keeps it."""
-        conclude(self._found, answer)
-        self._found.known.memory.senders = self._found.senders
+        """Who lied in this frame; the posterior learns it, and memory keeps it. Whether all of the answer are to be
+        left out again in the next frames, one after the other.
+        """
+        found, memory = self._found, self._found.known.memory
+        conclude(found, answer)
+        memory.senders = found.senders
+        if answer in found.shown and memory.vigilance.learn(found.shown[answer]):
+            for name in set(answer) - memory.straying.levels.keys():  # those are being looked at
+                found.lies.audited.pop(name, None)
 
     def judged(self, answer: Hypothesis) -> Judged | None:
         """How each box of an answer stands; None where nothing is known of objects."""

@@ -16,6 +16,7 @@ from robosac.defenses.group_testing.lies import Lies
 from robosac.defenses.group_testing.steadiness import Steadiness
 from robosac.defenses.group_testing.strangeness import Strangeness
 from robosac.defenses.group_testing.straying import Straying
+from robosac.defenses.group_testing.vigilance import Vigilance
 
 REPEAT_MEMORY = 60
 """Frames after which a test counts as new."""
@@ -82,6 +83,7 @@ class Memory:
     lies: Lies = field(default_factory=Lies)
     """About objects."""
     straying: Straying = field(default_factory=Straying)
+    vigilance: Vigilance = field(default_factory=Vigilance)
     steadiness: Steadiness = field(default_factory=Steadiness)
     strangeness: Strangeness = field(default_factory=Strangeness)
 
@@ -153,6 +155,7 @@ class Memory:
             "senders": {name: list(place) for name, place in self.senders.items()},
             "lies": self.lies.to_state(),
             "straying": self.straying.to_state(),
+            "vigilance": self.vigilance.to_state(),
             "steadiness": self.steadiness.to_state(),
             "strangeness": self.strangeness.to_state(),
         }
@@ -171,6 +174,7 @@ class Memory:
             senders={name: (float(x), float(y)) for name, (x, y) in state.get("senders", {}).items()},
             lies=Lies.from_state(state["lies"]) if "lies" in state else Lies(),
             straying=Straying.from_state(state.get("straying", {})),
+            vigilance=Vigilance.from_state(state.get("vigilance", ())),
             steadiness=Steadiness.from_state(state["steadiness"]) if "steadiness" in state else Steadiness(),
             strangeness=Strangeness.from_state(state.get("strangeness", ())),
         )

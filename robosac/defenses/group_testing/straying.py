@@ -58,28 +58,34 @@ def strays(joined: Shown, without: Shown, suspect: str) -> float:
     for said, fewest, worth in ((centres[~own], FEWEST_WITNESSES, 1.0), (centres[own], 1, OWN_WORD)):
         counts = (~np.isnan(said[..., 0])).sum(axis=0) >= fewest
         if counts.any():
-            rise = _rise(boxes[counts], others[counts], _median(said[:, counts]))
+            rise = _rise(boxes[counts], others[counts], median(said[:, counts]))
             total += worth * max(rise, LEAST_RISE)
     return total
 
 
-def _median(places: FloatArray) -> FloatArray:
+def median(places: FloatArray) -> FloatArray:
     """The median (n, 2) of places (witnesses, n, 2) along each axis, of those that are numbers: at least one."""
     ranked, count = np.sort(places, axis=0), (~np.isnan(places)).sum(axis=0)
     low, high = (np.take_along_axis(ranked, at[None], axis=0)[0] for at in ((count - 1) // 2, count // 2))
-    median: FloatArray = (low + high) / 2
-    return median
+    middle: FloatArray = (low + high) / 2
+    return middle
+
+
+def distances(boxes: FloatArray, places: FloatArray, yaws: FloatArray) -> FloatArray:
+    """``ln(1 + d^2)`` (n,) of how far boxes (n, 6) are from places (n, 2), along and across headings (n,), in units of
+    `SLACK_ALONG_M` and `SLACK_ACROSS_M`.
+    """
+    cos, sin = np.cos(yaws), np.sin(yaws)
+    x, y = (boxes[:, :2] - places).T
+    along, across = (x * cos + y * sin) / SLACK_ALONG_M, (y * cos - x * sin) / SLACK_ACROSS_M
+    off: FloatArray = np.log1p(along**2 + across**2)
+    return off
 
 
 def _rise(now: FloatArray, before: FloatArray, places: FloatArray) -> float:
-    """What ``ln(1 + d^2)`` grows by, over boxes (n, 6) of two fusions and the places (n, 2) of their vehicles."""
-    cos, sin = np.cos(before[:, 4]), np.sin(before[:, 4])
-    logarithms = []
-    for boxes in (now, before):
-        x, y = (boxes[:, :2] - places).T
-        along, across = (x * cos + y * sin) / SLACK_ALONG_M, (y * cos - x * sin) / SLACK_ACROSS_M
-        logarithms.append(np.log1p(along**2 + across**2))
-    grown = np.minimum(np.maximum(logarithms[0] - logarithms[1], -MOST_RISE), MOST_RISE)
+    """What `distances` grow by, over boxes (n, 6) of two fusions and the places (n, 2) of their vehicles."""
+    off, off_before = (distances(boxes, places, before[:, 4]) for boxes in (now, before))
+    grown = np.minimum(np.maximum(off - off_before, -MOST_RISE), MOST_RISE)
     return float(grown.sum() / np.sqrt(len(grown) + FEW))
 
 
