@@ -15,6 +15,12 @@ from robosac.defenses.group_testing.sets import ATTACKS, BENIGN, PLAIN
 _LIMITS = ((BENIGN, BENIGN), (BENIGN, ATTACKS), (ATTACKS, BENIGN), (PLAIN, PLAIN), (PLAIN, BENIGN), (BENIGN, PLAIN))
 
 _OF_A, _OF_D = 2 - np.array(_LIMITS).T[:, :, None]
+_UNATTACKED = np.array(
+    [[0, 0, 0, 1, 0, 0], [0, 0, 0, -1, 1, 0], [0, 0, 0, -1, 0, 1], [1, 0, 0, 1, -1, -1]], dtype=float
+)
+_ATTACKED = np.array([[-1, 1, 0, 0, 0, 0], [-1, 0, 1, 0, 0, 0], [1, -1, -1, 0, 0, 0]], dtype=float)
+_CERTAIN = np.array([[0.0], [0.0], [1.0]])
+"""What is unattacked (CLEAN,), and attacked (CELLS,), by what is below `_LIMITS` (L,), and by what is certain."""
 
 
 class Distribution:
@@ -102,17 +108,12 @@ class Distribution:
         Columns 0 to 3: no attacker in either; nobody complementary, somebody in d, in a, in both. Then for each kind:
         attackers in d only, in a only, in both.
         """
-        q = self._weights
-        below = self._at_most(a, d)
-        both, in_a, in_d = below[:, 0], below[:, 1], below[:, 2]
-        benign, _, _, neither, only_d, only_a = (q @ below.reshape(len(q), -1)).reshape(below.shape[1:])
-        only_d, only_a = only_d - neither, only_a - neither
-        cells = np.empty((a.shape[1], CLEAN + CELLS * self._kinds))
-        cells[:, 0], cells[:, 1], cells[:, 2] = neither, only_d, only_a
-        cells[:, 3] = benign - neither - only_d - only_a
-        for cell, chance in enumerate((in_a - both, in_d - both, 1 - in_a - in_d + both)):
-            np.multiply(chance[1:].T, q[1:], out=cells[:, CLEAN + cell :: CELLS])
-        return np.maximum(cells, 0.0)
+        q = self._weights[:, None, None]
+        below = q * self._at_most(a, d)
+        cells = np.empty((CLEAN + CELLS * self._kinds, a.shape[1]))
+        cells[:CLEAN] = _UNATTACKED @ below.sum(axis=0)
+        cells[CLEAN:] = (_ATTACKED @ below[1:] + _CERTAIN * q[1:]).reshape(-1, a.shape[1])
+        return np.maximum(cells.T, 0.0)
 
     def _at_most(self, a: IntArray, d: IntArray) -> FloatArray:
         """Probability (1 + K, L, n), given the kind, that no state in subsets ``a`` is above the first of each of

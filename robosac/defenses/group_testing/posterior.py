@@ -4,6 +4,7 @@ from __future__ import annotations
 
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
+from functools import lru_cache
 from typing import Any
 
 import numpy as np
@@ -23,6 +24,19 @@ VIEWS_CHANGE = 0.02
 _LEVELS = np.arange(sets.STATES)
 _GREATER = np.maximum.outer(_LEVELS, _LEVELS)
 _TINY = 1e-300
+
+
+@lru_cache(maxsize=16)
+def _by_level(kinds: int) -> IntArray:
+    """Which likelihood, by columns of `Posterior.cells`, belongs to each kind and the greatest states in a and in d
+    (1 + K, 3, 3); where nobody attacks no state is higher, so what comes after the last one belongs there.
+    """
+    which = np.empty((1 + kinds, sets.STATES, sets.STATES), dtype=np.int64)
+    which[:, :2, :2] = np.arange(CLEAN).reshape(2, 2)
+    which[0, 2], which[0, :, 2] = CLEAN + CELLS * kinds, CLEAN + CELLS * kinds
+    only_d, only_a, both = np.arange(CLEAN, CLEAN + CELLS * kinds).reshape(kinds, CELLS).T
+    which[1:, :2, 2], which[1:, 2, :2], which[1:, 2, 2] = only_d[:, None], only_a[:, None], both
+    return which
 
 
 @dataclass(frozen=True)
@@ -100,12 +114,8 @@ class Posterior(Distribution):
     def learn(self, masks: IntArray, log_likelihood: FloatArray) -> None:
         """As `update`, of subsets as `masks` (B, 2)."""
         of_a, of_d = masks.T.tolist()
-        likelihood = np.exp(log_likelihood - log_likelihood.max())
-        by_kind = likelihood[CLEAN:].reshape(self._kinds, CELLS)
-        by_level = np.empty((1 + self._kinds, sets.STATES, sets.STATES))  # the greatest states in a and in d
-        by_level[:, :2, :2] = likelihood[:CLEAN].reshape(2, 2)
-        by_level[0, 2], by_level[0, :, 2] = 0.0, 0.0
-        by_level[1:, :2, 2], by_level[1:, 2, :2], by_level[1:, 2, 2] = by_kind[:, :1], by_kind[:, 1:2], by_kind[:, 2]
+        likelihood = np.append(np.exp(log_likelihood - log_likelihood.max()), 0.0)
+        by_level = likelihood[_by_level(self._kinds)]
         touched = [b for b, (x, y) in enumerate(zip(of_a, of_d, strict=True)) if x | y]
         if not touched:
             return
