@@ -9,15 +9,16 @@ enough to know a message again; it is no proof of anything against somebody who 
 from __future__ import annotations
 
 import base64
+import math
 import zlib
-from collections.abc import Mapping
+from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
 from functools import lru_cache
 from typing import Any
 
 import numpy as np
 
-from robosac.boxes import FloatArray
+from robosac.boxes import FloatArray, IntArray
 
 VALUES = 2048
 """Of each tensor that are looked at; of a smaller one all."""
@@ -25,9 +26,8 @@ SKETCH = 128
 """Numbers in a sketch: correlations are estimated to within about .08."""
 RIM = 8
 """The rim of a map is this part of its side."""
-FEW = 7
 _STEPS = 127
-_BITS = {"float16": 16, "float32": 32, "float64": 64}
+_BITS = {np.dtype(f"float{bits}"): bits for bits in (16, 32, 64)}
 
 Tensor = np.ndarray[Any, np.dtype[Any]]
 
@@ -60,24 +60,37 @@ def fingerprints(messages: Mapping[str, Mapping[str, Tensor]]) -> dict[str, Fing
     """
     if not messages:
         return {}
+    everybody = list(messages.values())
     digests, blank = [0] * len(messages), np.ones(len(messages), dtype=bool)
-    sizes: list[dict[str, tuple[float, float]]] = [{} for _ in messages]
+    largest: list[dict[str, float]] = [{} for _ in messages]
+    rms: dict[str, FloatArray] = {}
     total = np.zeros((len(messages), SKETCH))
-    for name in sorted(next(iter(messages.values()))):
-        flats = [np.ascontiguousarray(tensors[name]).reshape(-1) for tensors in messages.values()]
-        places, signs = _drawn(name, len(flats[0]))
-        values = np.stack([flat.take(places) for flat in flats]).astype(np.float64)
-        blank &= [_blank(tensors[name]) for tensors in messages.values()]
-        with np.errstate(over="ignore", invalid="ignore"):  # what is no number comes out as none
-            rms = np.sqrt(np.einsum("ij,ij->i", values, values) / max(values.shape[1], 1))
-            total += _summed(values, signs)
-        for i, flat in enumerate(flats):
+    for name in sorted(everybody[0]):
+        shape, values, middles = everybody[0][name].shape, [], []
+        places, signs = _drawn(name, math.prod(shape))
+        inside, same = _glances(name, shape)
+        for i, tensors in enumerate(everybody):  # one after the other, while a tensor is in the processor's cache
+            flat = np.ascontiguousarray(tensors[name]).reshape(-1)
+            values.append(flat.take(places))
+            middles.append(flat.take(same))
             words = _words(flat)
-            digests[i] += int(np.dot(words, _weights(name, len(words))))
-            sizes[i][name] = (_largest(flat), float(rms[i]))
+            digests[i] += int(np.einsum("i,i->", words, _weights(name, len(words))))
+            largest[i][name] = _largest(flat)
+        drawn = np.stack(values).astype(np.float64)
+        blank &= (drawn[:, inside] == np.stack(middles).astype(np.float64)).all(axis=1)
+        for i in np.flatnonzero(blank).tolist():
+            blank[i] = _blank(everybody[i][name])
+        with np.errstate(over="ignore", invalid="ignore"):  # what is no number comes out as none
+            rms[name] = np.sqrt(np.einsum("ij,ij->i", drawn, drawn) / max(drawn.shape[1], 1))
+            total += _summed(drawn, signs)
     sketches = _coarse(np.where(blank[:, None], 0.0, total))
     return {
-        vehicle: Fingerprint(f"{digests[i] % 2**64:016x}", bool(blank[i]), sizes[i], sketches[i])
+        vehicle: Fingerprint(
+            f"{digests[i] % 2**64:016x}",
+            bool(blank[i]),
+            {name: (largest[i][name], float(of_all[i])) for name, of_all in rms.items()},
+            sketches[i],
+        )
         for i, vehicle in enumerate(messages)
     }
 
@@ -87,29 +100,32 @@ def likeness(one: FloatArray, other: FloatArray) -> float:
     return float(one @ other)
 
 
-def packed(sketch: FloatArray) -> str:
-    """A sketch as text."""
-    return base64.b64encode(_steps(sketch).tobytes()).decode()
+def packed(sketches: FloatArray) -> list[str]:
+    """Sketches (n, SKETCH) as text."""
+    return [base64.b64encode(steps.tobytes()).decode() for steps in _steps(sketches)]
 
 
-def unpacked(text: str) -> FloatArray:
-    """What `packed` made text of, to the last bit."""
-    steps = np.frombuffer(base64.b64decode(text, validate=True), dtype=np.int8)
-    sketch: FloatArray = _of_norm_1(steps[None].astype(np.float64))[0]
-    return sketch
+def unpacked(texts: Sequence[str]) -> FloatArray:
+    """What `packed` made texts of, to the last bit."""
+    steps = np.frombuffer(b"".join(base64.b64decode(text, validate=True) for text in texts), dtype=np.int8)
+    return _of_norm_1(steps.reshape(-1, SKETCH).astype(np.float64))
 
 
 def _blank(tensor: Tensor) -> bool:
     """Whether a map (..., H, W) has the same in all places, but for an eighth at each rim, where a network sees that
     map ends; or another array in all its values. Such a message says nothing that could be repeated or copied.
     """
+    inside, middle = _inside(tensor)
+    return bool((inside == middle).all())
+
+
+def _inside(tensor: Tensor) -> tuple[Tensor, Tensor]:
+    """What is within the rims, and what it has to be equal to."""
     if tensor.ndim < 3:
-        return bool((tensor == tensor.reshape(-1)[:1]).all())
+        return tensor, tensor.reshape(-1)[:1]
     rows, columns = (side // RIM for side in tensor.shape[-2:])
     inside = tensor[..., rows : tensor.shape[-2] - rows, columns : tensor.shape[-1] - columns]
-    middle = inside[..., :1, :1]
-    few = inside[..., ::FEW, ::FEW]  # spares most maps a look at all places
-    return bool((few == middle).all() and (inside == middle).all())
+    return inside, inside[..., :1, :1]
 
 
 def _words(flat: Tensor) -> np.ndarray[Any, np.dtype[np.uint64]]:
@@ -122,12 +138,13 @@ def _largest(flat: Tensor) -> float:
     """The largest absolute value, without a copy of the values: numbers are ordered as their bits are."""
     if not len(flat):
         return 0.0
-    bits = _BITS.get(flat.dtype.name)
+    bits = _BITS.get(flat.dtype)
     if bits is None:
         return float(np.abs(flat.astype(np.float64)).max())
-    above = max(int(flat.view(f"i{bits // 8}").max()), 0)
-    below = max(int(flat.view(f"u{bits // 8}").max()) - (1 << bits - 1), 0)
-    return float(np.array([max(above, below)], dtype=f"u{bits // 8}").view(flat.dtype)[0])
+    largest = int(flat.view(f"u{bits // 8}").max())
+    if largest >> bits - 1:  # numbers below 0 count from the highest bit on
+        largest = max(largest - (1 << bits - 1), int(flat.view(f"i{bits // 8}").max()))
+    return float(np.array([largest], dtype=f"u{bits // 8}").view(flat.dtype)[0])
 
 
 def _summed(values: FloatArray, signs: FloatArray) -> FloatArray:
@@ -175,3 +192,17 @@ def _drawn(name: str, size: int) -> tuple[np.ndarray[Any, np.dtype[np.int64]], F
     rng = np.random.default_rng([zlib.crc32(name.encode()), size, 1])
     places = np.sort(rng.choice(size, min(size, VALUES), replace=False)) if size else np.zeros(0, dtype=np.int64)
     return places, rng.choice([-1.0, 1.0], len(places))
+
+
+@lru_cache(maxsize=32)
+def _glances(name: str, shape: tuple[int, ...]) -> tuple[IntArray, IntArray]:
+    """Which of the values that are looked at are within the rims, and the place of what each is equal to in a blank
+    tensor.
+    """
+    size = math.prod(shape)
+    inside, middle = _inside(np.arange(size).reshape(shape))
+    same = np.full(size, -1)
+    same[inside] = np.broadcast_to(middle, inside.shape)
+    same = same[_drawn(name, size)[0]]
+    which = np.flatnonzero(same >= 0)
+    return which, same[which]

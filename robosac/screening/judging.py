@@ -17,16 +17,17 @@ honest vehicle that drives on an empty road, between walls or in a platoon are a
 from __future__ import annotations
 
 import math
-from collections.abc import Mapping
+from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, field, replace
 from typing import Any
 
 import numpy as np
 
 from robosac.answers import Distrust, Likeness, Reason
+from robosac.boxes import FloatArray
 from robosac.defenses import EGO, Rejection
 from robosac.detectors import Message
-from robosac.screening.fingerprints import Fingerprint, fingerprints, likeness, packed
+from robosac.screening.fingerprints import SKETCH, Fingerprint, fingerprints, likeness, packed, unpacked
 from robosac.screening.past import Anchor, Past, Place, Sent, is_kept, recent
 
 MARGIN = 2.0
@@ -109,13 +110,17 @@ class Screening:
         if not told:
             return Screened({}, (), memory)
         prints = fingerprints({**_comparable(ego, told), **{name: message.tensors for name, message in told.items()}})
+        pasts = {name: Past.from_json(memory.get(name)) for name in prints}
+        texts = packed(np.stack([one.sketch for one in prints.values()]))
+        anchors = {name: past.anchor.text for name, past in pasts.items() if past.anchor is not None}
+        before = dict(zip(anchors, unpacked(list(anchors.values())), strict=True))
         seen = {
-            name: _Seen(frame, _at(told.get(name, ego)), one, Past.from_json(memory.get(name)))
-            for name, one in prints.items()
+            name: _Seen(frame, _at(told.get(name, ego)), one, text, pasts[name], before.get(name))
+            for (name, one), text in zip(prints.items(), texts, strict=True)
         }
-        refused = {}
+        refused, earlier = {}, _earlier(seen)
         for name, one in seen.items():
-            if name != EGO and (why := self._implausible(one) or _copied(name, seen) or self._repeated(one)):
+            if name != EGO and (why := self._implausible(one) or _copied(name, seen, earlier) or self._repeated(one)):
                 often = one.past.refused + 1 >= NAMED_AFTER
                 refused[name] = replace(why, distrust=Distrust.NAMED) if often else why
         kept = {name: one.remembered(self, name in refused) for name, one in seen.items()}
@@ -141,7 +146,8 @@ class Screening:
         if seen.print.blank:
             return None
         if anchor is not None and self.bounds and seen.moved_from(anchor.place) > MOVED_M:
-            correlation = likeness(anchor.sketch, seen.print.sketch)
+            assert seen.anchored is not None
+            correlation = likeness(seen.anchored, seen.print.sketch)
             still = max(bounds.still for bounds in self.bounds.values())
             if 1.0 - correlation < (1.0 - still) / STEADIER:
                 return _repetition(seen, anchor.frame, anchor.place, correlation)
@@ -155,7 +161,11 @@ class _Seen:
     frame: int
     place: Place
     print: Fingerprint
+    text: str
+    """Its sketch, `packed`."""
     past: Past
+    anchored: FloatArray | None
+    """The sketch of its past's anchor, (SKETCH,)."""
 
     @property
     def first_sent(self) -> int:
@@ -185,50 +195,54 @@ class _Seen:
             far = self.moved_from(before.place) > MOVED_M
             if not far or screening._repeated(self) is not None:
                 return before
-        return Anchor(self.frame, self.place, packed(self.print.sketch))
+        return Anchor(self.frame, self.place, self.text)
 
 
-def _copied(name: str, seen: Mapping[str, _Seen]) -> Rejection | None:
+def _earlier(seen: Mapping[str, _Seen]) -> dict[str, list[tuple[str, int]]]:
+    """By digest, who sent a message, and since which frame."""
+    found: dict[str, list[tuple[str, int]]] = {}
+    for name, one in seen.items():
+        for sent in one.past.sent:
+            found.setdefault(sent.digest, []).append((name, sent.first))
+    return found
+
+
+def _copied(name: str, seen: Mapping[str, _Seen], earlier: Mapping[str, Sequence[tuple[str, int]]]) -> Rejection | None:
     """What another vehicle sent first. Who of two sent it first in one frame nobody knows, but for the ego."""
     one = seen[name]
     if one.print.blank:
         return None
+    if EGO in seen and seen[EGO].print.digest == one.print.digest:
+        return Rejection(Reason.COPIED, {"of": EGO, "of_frame": one.frame})
     since = one.first_sent
-    for other, theirs in seen.items():
-        if other == name:
-            continue
-        if other == EGO and theirs.print.digest == one.print.digest:
-            return Rejection(Reason.COPIED, {"of": EGO, "of_frame": theirs.frame})
-        for sent in theirs.past.sent:
-            if sent.digest == one.print.digest and sent.first < since + (other == EGO):
-                return Rejection(Reason.COPIED, {"of": other, "of_frame": sent.first})
+    for other, first in earlier.get(one.print.digest, ()):
+        if other != name and first < since + (other == EGO):
+            return Rejection(Reason.COPIED, {"of": other, "of_frame": first})
     return None
 
 
 def _alike(seen: Mapping[str, _Seen]) -> tuple[Likeness, ...]:
     """Pairs of maps of this frame, and of one of this frame and one sent elsewhere before."""
     names = list(seen)
-    if not names:
-        return ()
     now = np.stack([seen[name].print.sketch for name in names])
-    found = []
-    together = now @ now.T
-    for i, j in zip(*np.nonzero(np.triu(together >= ALIKE, 1)), strict=True):
-        found.append((names[i], names[j], seen[names[j]].frame, together[i, j]))
-    anchored = [(name, seen[name].past.anchor) for name in names]
-    before = [(name, anchor) for name, anchor in anchored if anchor is not None]
-    if before:
-        across = now @ np.stack([anchor.sketch for _, anchor in before]).T
-        for i, j in zip(*np.nonzero(across >= ALIKE), strict=True):
-            name, (other, anchor) = names[i], before[j]
-            same = name == other
-            if not same or (across[i, j] >= NEAR and seen[name].moved_from(anchor.place) > MOVED_M):
-                found.append((name, other, anchor.frame, across[i, j]))
-    found.sort(key=lambda entry: -entry[3])
-    return tuple(
-        Likeness(vehicle=a, other=b, of_frame=frame, correlation=round(min(float(c), 1.0), 4))
-        for a, b, frame, c in found[:MOST_TOLD]
-    )
+    together = np.triu(now @ now.T, 1)
+    before = {j: one for j, one in enumerate(seen.values()) if one.past.anchor is not None and one.anchored is not None}
+    across = np.zeros_like(together)
+    across[:, list(before)] = now @ np.reshape([one.anchored for one in before.values()], (-1, SKETCH)).T
+    for j, one in before.items():
+        assert one.past.anchor is not None
+        if across[j, j] < NEAR or one.moved_from(one.past.anchor.place) <= MOVED_M:
+            across[j, j] = 0.0
+    found = np.concatenate([together.ravel(), across.ravel()])
+    alike = np.flatnonzero(found >= ALIKE)
+    most = alike[np.argsort(-found[alike], kind="stable")[:MOST_TOLD]]
+    told = []
+    for then, i, j in zip(*np.unravel_index(most, (2, len(names), len(names))), strict=True):
+        anchor = before[j].past.anchor if then else None
+        of_frame = seen[names[j]].frame if anchor is None else anchor.frame
+        correlation = round(min(float((across if then else together)[i, j]), 1.0), 4)
+        told.append(Likeness(vehicle=names[i], other=names[j], of_frame=of_frame, correlation=correlation))
+    return tuple(told)
 
 
 def _repetition(seen: _Seen, frame: int, place: Place, correlation: float) -> Rejection:

@@ -4,11 +4,7 @@ from __future__ import annotations
 
 from collections.abc import Mapping
 from dataclasses import dataclass
-from functools import cached_property
 from typing import Any
-
-from robosac.boxes import FloatArray
-from robosac.screening.fingerprints import unpacked
 
 KEPT_FRAMES = 5
 """What was sent is remembered for so many frames; where numbers begin anew, what is as many ahead is forgotten, too."""
@@ -36,11 +32,6 @@ class Anchor:
     place: Place
     text: str
     """Its sketch, `packed`."""
-
-    @cached_property
-    def sketch(self) -> FloatArray:
-        """Its sketch, (SKETCH,)."""
-        return unpacked(self.text)
 
 
 @dataclass(frozen=True)

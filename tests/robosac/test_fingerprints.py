@@ -100,9 +100,10 @@ def test_fingerprints_do_not_depend_on_who_else_is_there(rng):
 
 
 def test_a_sketch_is_the_same_after_it_was_text(rng):
-    sketch = one(a_map(rng)).sketch
-    assert sketch.shape == (SKETCH,)
-    np.testing.assert_array_equal(unpacked(packed(sketch)), sketch)
-    np.testing.assert_array_equal(unpacked(packed(np.zeros(SKETCH))), np.zeros(SKETCH))
+    sketches = np.stack([one(a_map(rng)).sketch, np.zeros(SKETCH), one(a_map(rng)).sketch])
+    assert sketches.shape == (3, SKETCH)
+    np.testing.assert_array_equal(unpacked(packed(sketches)), sketches)
+    assert unpacked(packed(sketches)[2:])[0].tolist() == sketches[2].tolist()
+    assert unpacked([]).shape == (0, SKETCH)
     with pytest.raises(ValueError, match="base64"):
-        unpacked("?")
+        unpacked(["?"])
