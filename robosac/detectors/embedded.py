@@ -84,7 +84,7 @@ class EmbeddedDetector(MapFusionDetector):
         self._dtype, self._narrow = torch.float32, self._network
         self.place()
         self.recipe = recipe
-        self._gain = _number(recipe, "feature_gain", np.inf)
+        self.gain = _number(recipe, "feature_gain", np.inf)
         self._score_threshold = _number(recipe, "score_threshold", 1.0)
         layout = {FEATURES: TensorSpec("float16", (CHANNELS, MAP, MAP), ("int8",))}
         self.info = DetectorInfo(
@@ -116,12 +116,8 @@ class EmbeddedDetector(MapFusionDetector):
         pose = as_pose(pose)
         grid = torch.from_numpy(occupancy(points, float(pose[2, 3]))).float()
         with torch.inference_mode():
-            features = (self._network.encode(grid[None])[0] * self._gain).contiguous()
+            features = (self._network.encode(grid[None])[0] * self.gain).contiguous()
         return Message(pose, {FEATURES: features.numpy().astype(np.float16)})
-
-    def unscaled(self, sent: torch.Tensor) -> torch.Tensor:
-        """Maps without the gain."""
-        return sent / self._gain
 
     def fused(self, maps: Maps) -> torch.Tensor:
         """The maps' mean."""

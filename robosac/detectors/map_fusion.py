@@ -7,22 +7,26 @@ detector is a subclass of `MapFusionDetector`, which says how its maps are fused
 from __future__ import annotations
 
 from abc import ABC, abstractmethod
-from collections.abc import Callable, Collection, Mapping, Sequence
+from collections.abc import Callable, Collection, Iterator, Mapping, Sequence
 from copy import deepcopy
-from typing import ClassVar, Self
+from typing import Any, ClassVar, Self
 
 import numpy as np
 import torch
 
 from robosac.boxes import FloatArray
 from robosac.detectors.base import DetectorInfo, Message
-from robosac.detectors.device import CPU, as_device, on_device, stacked
-from robosac.detectors.warp import sampling_matrix, warp
+from robosac.detectors.device import CPU, as_device, by_cell, on_device, stacked
+from robosac.detectors.warp import corners, gathered, sampling_matrices, warp
+from robosac.testimony import planar
 
 FEATURES = "features"
 """The tensor of a message that holds its map."""
 WORTH = 8
 """Subsets that an accelerator decodes at once, unless told otherwise: the ego alone, and seven hypotheses."""
+AT_ONCE = 8
+"""Maps warped together: what more of them take in between no longer fits into caches."""
+Tensor = np.ndarray[Any, np.dtype[Any]]
 Maps = Sequence[torch.Tensor]
 Heads = tuple[torch.Tensor, torch.Tensor]
 """The class logit of each place where there might be a vehicle, and the codes of all boxes."""
@@ -35,7 +39,8 @@ Finder = Callable[[torch.Tensor], list[FloatArray]]
 class MapFusionDetector(ABC):
     """A detector (`robosac.detectors.base.Detector`) but for its network and `encode`.
 
-    Maps (C, H, W) have rows along +y. What an attacker perturbs is the map in the message, before it is warped.
+    Maps (C, H, W) have rows along +y. In a prepared frame the channels of a cell lie side by side in memory. What an
+    attacker perturbs is the map in the message, before it is warped.
     """
 
     info: DetectorInfo
@@ -45,6 +50,8 @@ class MapFusionDetector(ABC):
     """Where frames are prepared and decoded."""
     worth: int = 1
     """As `robosac.detectors.base.Batching.worth` of its frames."""
+    gain: float = 1.0
+    """What is fused are the maps that are sent, divided by this."""
 
     @abstractmethod
     def fused(self, maps: Maps) -> torch.Tensor:
@@ -92,15 +99,13 @@ class MapFusionDetector(ABC):
     def places(self, codes: torch.Tensor) -> torch.Tensor:
         """The box of each place, as `robosac.detectors.base.GeometricSurface.perceive` returns it."""
 
-    def unscaled(self, sent: torch.Tensor) -> torch.Tensor:
-        """What is fused of maps as they are sent; by default all of it."""
-        return sent
-
     def matrices(self, ego: Message, teammates: Collection[Message]) -> torch.Tensor:
         """Where in each teammate's map to look for the places of the ego's: (n, 2, 3), as `warp` takes them."""
-        half_extent_m = self.info.area_m[2]
-        matrices = [sampling_matrix(ego.pose, each.pose, half_extent_m, self.mirrored) for each in teammates]
-        return torch.from_numpy(np.stack(matrices)).float()
+        return torch.from_numpy(self._matrices(ego, teammates)).float()
+
+    def _matrices(self, ego: Message, teammates: Collection[Message]) -> FloatArray:
+        from_ego = planar(ego.pose, [each.pose for each in teammates])
+        return sampling_matrices(from_ego, self.info.area_m[2], self.mirrored)
 
     def prepare(self, ego: Message, teammates: Mapping[str, Message]) -> PreparedMaps:
         """Warp every teammate's map into the ego's frame, once."""
@@ -108,10 +113,14 @@ class MapFusionDetector(ABC):
         prepared.add(teammates)
         return prepared
 
-    def laid(self, ego: Message, teammates: Collection[Message]) -> torch.Tensor:
-        """Maps (n, C, H, W) of teammates as they lie in the ego's frame."""
-        sent = _sent(list(teammates), self.device)
-        return warp(self.unscaled(sent), self.matrices(ego, teammates).to(self.device))
+    def laid(self, ego: Message, teammates: Sequence[Message]) -> Iterator[torch.Tensor]:
+        """Maps (C, H, W) of teammates as they lie in the ego's frame."""
+        height, width = teammates[0].tensors[FEATURES].shape[1:]
+        cells, shares = (each.to(self.device) for each in corners(self._matrices(ego, teammates), height, width))
+        shares /= self.gain
+        for first in range(0, len(teammates), AT_ONCE):
+            some = slice(first, first + AT_ONCE)
+            yield from gathered(by_cell(_features(teammates[some]), self.device), cells[some], shares[some])
 
     def attack_surface(self, ego: Message, teammates: Mapping[str, Message]) -> MapSurface:
         """Show a frame to an attacker."""
@@ -123,14 +132,15 @@ class MapFusionDetector(ABC):
         return Message(message.pose, {**message.tensors, FEATURES: tensor.detach().contiguous().numpy().astype(dtype)})
 
 
-def _sent(messages: Sequence[Message], device: torch.device = CPU) -> torch.Tensor:
-    """Maps (n, C, H, W) as float32 in C order, as warped ones are."""
-    return stacked([message.tensors[FEATURES] for message in messages], device)
+def _features(messages: Collection[Message]) -> list[Tensor]:
+    return [message.tensors[FEATURES] for message in messages]
 
 
 def combined(maps: torch.Tensor, weights: FloatArray) -> torch.Tensor:
     """Sums (n, C, H, W) of maps (m, C, H, W), each with its weight in a row of ``weights`` (n, m), float32."""
-    return (torch.from_numpy(weights).to(maps.device) @ maps.flatten(1)).reshape(-1, *maps.shape[1:])
+    cells = maps.permute(0, 2, 3, 1)
+    sums = torch.from_numpy(weights).to(maps.device) @ cells.flatten(1)
+    return sums.view(-1, *cells.shape[1:]).permute(0, 3, 1, 2)
 
 
 class PreparedMaps:
@@ -143,7 +153,7 @@ class PreparedMaps:
         self._detector = detector
         self._ego = ego
         with torch.inference_mode():
-            self.own = detector.unscaled(_sent([ego], detector.device))[0]
+            self.own = by_cell(_features([ego]), detector.device)[0] / detector.gain
             self._find = detector.finder(ego, self.own)
         self.warped: dict[str, torch.Tensor] = {}
         self._together: torch.Tensor | None = None
@@ -157,8 +167,8 @@ class PreparedMaps:
         """Warp the maps of these teammates."""
         if teammates:
             with torch.inference_mode():
-                warped = self._detector.laid(self._ego, teammates.values())
-            self.warped.update(zip(teammates, warped, strict=True))
+                laid = self._detector.laid(self._ego, list(teammates.values()))
+                self.warped.update(zip(teammates, laid, strict=True))
             self._together = None
 
     def detect(self, teammates: Collection[str] = ()) -> FloatArray:
@@ -177,7 +187,8 @@ class PreparedMaps:
         with torch.inference_mode():
             if self._together is None:
                 # a map that overflowed is none of those that are fused without it, but infinity times 0 is no number
-                self._together = torch.nan_to_num(torch.stack([self.own, *self.warped.values()]))
+                cells = torch.stack([each.permute(1, 2, 0) for each in (self.own, *self.warped.values())])
+                self._together = torch.nan_to_num(cells).permute(0, 3, 1, 2)
             return self._find(self._detector.fused_of_each(self._together, chosen))
 
 
@@ -185,11 +196,11 @@ class MapSurface:
     """A frame for an attacker; see `robosac.detectors.base.GeometricSurface`. Benign maps are warped only once."""
 
     def __init__(self, detector: MapFusionDetector, ego: Message, teammates: Mapping[str, Message]) -> None:
-        own, *others = _sent([ego, *teammates.values()])
+        own, *others = stacked(_features([ego, *teammates.values()]))
         self.messages = dict(zip(teammates, others, strict=True))
         self._detector = detector
         with torch.no_grad():
-            self._own = detector.unscaled(own)
+            self._own = own / detector.gain
             self._decode = detector.decoder(ego, self._own)
         self._matrices = {name: detector.matrices(ego, [message]) for name, message in teammates.items()}
         self._benign = {name: self._warp(name, tensor) for name, tensor in self.messages.items()}
@@ -211,4 +222,4 @@ class MapSurface:
         return self._decode([self._own, *warped])
 
     def _warp(self, name: str, tensor: torch.Tensor) -> torch.Tensor:
-        return warp(self._detector.unscaled(tensor[None]), self._matrices[name])[0]
+        return warp(tensor[None] / self._detector.gain, self._matrices[name])[0]

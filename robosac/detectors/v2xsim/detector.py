@@ -148,7 +148,10 @@ class V2XSimDetector(MapFusionDetector):
 
     def fused(self, maps: Maps) -> torch.Tensor:
         """By the recipe's fusion."""
-        return self._fusion(torch.stack(list(maps)), dim=0)
+        if maps[0].is_contiguous():
+            return self._fusion(torch.stack(list(maps)), dim=0)
+        cells = torch.stack([each.permute(1, 2, 0) for each in maps])  # as they lie, or it takes ten times as long
+        return self._fusion(cells, dim=0).permute(2, 0, 1)
 
     def fused_of_each(self, maps: torch.Tensor, chosen: FloatArray) -> torch.Tensor:
         """As `MapFusionDetector.fused_of_each`."""

@@ -11,7 +11,7 @@ from robosac.calibrated import witness_of
 from robosac.defenses import EGO
 from robosac.detectors import decoding, load
 from robosac.detectors.base import Placeable
-from robosac.detectors.device import CPU, as_device, stacked
+from robosac.detectors.device import CPU, as_device, by_cell, stacked
 from tests.robosac.detectors.elsewhere import elsewhere
 
 
@@ -121,6 +121,15 @@ def test_what_goes_up_is_widened_there(kind, there, rng):
         maps = stacked(arrays, device)
         assert (maps.device.type, maps.dtype, maps.is_contiguous()) == (device.type, torch.float32, True)
         np.testing.assert_array_equal(maps.cpu().numpy(), np.stack(arrays).astype(np.float32))
+
+
+@pytest.mark.parametrize("kind", [np.float16, np.float32, np.uint8])
+def test_maps_go_up_cell_by_cell(kind, there, rng):
+    maps = [(100 * rng.random((2, 3, 4))).astype(kind).transpose(1, 2, 0) for _ in range(3)]
+    for device in (CPU, torch.device(there)):
+        cells = by_cell(maps, device)
+        assert (cells.device.type, cells.dtype, cells.stride()) == (device.type, torch.float32, (24, 1, 6, 3))
+        np.testing.assert_array_equal(cells.cpu().numpy(), np.stack(maps).astype(np.float32))
 
 
 @pytest.mark.parametrize("peaks", ["none", "some", "more than are looked at"])

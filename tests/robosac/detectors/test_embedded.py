@@ -89,7 +89,7 @@ def test_maps_of_any_layout_are_fused_in_one(detector, benign, ego_message):
     channels_last = np.ascontiguousarray(features.transpose(1, 2, 0)).transpose(2, 0, 1)
     for teammates in ({}, benign):
         prepared = detector.prepare(Message(ego_message.pose, {"features": channels_last}), teammates)
-        assert {maps.stride() for maps in (prepared.own, *prepared.warped.values())} == {(1024, 32, 1)}
+        assert {maps.stride() for maps in (prepared.own, *prepared.warped.values())} == {(1, 32 * 64, 64)}
 
 
 def found(boxes, truth):

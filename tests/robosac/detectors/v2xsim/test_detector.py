@@ -180,6 +180,16 @@ def test_fusions(fusion, expected):
     assert FUSIONS[fusion](torch.stack(maps), dim=0).flatten().tolist() == expected
 
 
+def test_maps_are_fused_as_they_lie_in_memory(v2xsim, ego, others):
+    """Prepared ones have the channels of a cell side by side; those of an attacker's surface are in C order."""
+    prepared = v2xsim.prepare(ego, others)
+    maps = [prepared.own, *prepared.warped.values()]
+    fused, in_c_order = v2xsim.fused(maps), v2xsim.fused([each.contiguous() for each in maps])
+    np.testing.assert_allclose(fused, in_c_order, rtol=1e-6)
+    assert fused.stride() == maps[0].stride() == (1, 32 * 256, 256)
+    assert in_c_order.is_contiguous()
+
+
 def test_the_recipe_chooses_the_fusion(published_state, v2xsim, ego, others, tmp_path):
     write_weights(published_state, "max", tmp_path / "max.safetensors")
     detector = load(str(tmp_path / "max.safetensors"))
