@@ -12,7 +12,8 @@ from torch.nn import functional
 from robosac.boxes import FloatArray
 from robosac.calibration.places import JITTER_M, OBSERVED_HITS, Places, places
 from robosac.detectors.base import Encoder, for_role
-from robosac.detectors.witness import Layout, Witness, WitnessNetwork
+from robosac.detectors.witness import Witness
+from robosac.detectors.witness_network import Layout, WitnessNetwork
 from robosac.scenes import DEFAULT_DATA, Scene, SceneError, SceneSource, View, encoded, seconds_apart
 from robosac.testimony import ACROSS, ALONG, LIKELIHOOD, X, Y
 

@@ -17,7 +17,7 @@ from robosac.cli.blame import blaming, failing
 from robosac.cli.options import DetectorName, Seed, command, load_data, load_detector, progress
 from robosac.cli.outputs import Force, check_file
 from robosac.detectors import DEFAULT_DETECTOR, Encoder
-from robosac.detectors.witness import Layout
+from robosac.detectors.witness_network import Layout
 from robosac.plugins import lacks
 from robosac.scenes import DATA_HELP, SceneError
 

@@ -18,7 +18,8 @@ from robosac.calibration.witness import (
 )
 from robosac.calibration.witness_check import check
 from robosac.detectors import DetectorInfo, Message, TensorSpec, load
-from robosac.detectors.witness import Layout, Witness, WitnessNetwork
+from robosac.detectors.witness import Witness
+from robosac.detectors.witness_network import Layout, WitnessNetwork
 from robosac.scenes import IntersectionScene, SceneError, View
 
 CELLS, HALF_EXTENT_M = 12, 12.0  # cells of 2 m

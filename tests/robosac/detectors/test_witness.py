@@ -9,8 +9,10 @@ import torch
 
 from robosac.boxes import pose_matrix
 from robosac.detectors import DetectorInfo, Message, TensorSpec
+from robosac.detectors.fast_witness import FastWitness
 from robosac.detectors.weights_file import WeightsError
-from robosac.detectors.witness import AT_ONCE, GEOMETRY, HIGHEST_M, USUAL_M, Layout, Witness, WitnessNetwork
+from robosac.detectors.witness import AT_ONCE, LARGEST, Witness
+from robosac.detectors.witness_network import GEOMETRY, HIGHEST_M, USUAL_M, Layout, WitnessNetwork
 from robosac.testimony import LAYERS
 
 MAP = {"other": TensorSpec("float16", (2, 8, 8)), "map": TensorSpec("float32", (4, 16, 16))}
@@ -62,6 +64,22 @@ def test_maps_mirrored_or_not_give_the_same_testimony():
     np.testing.assert_array_equal(mirrored.maps, plain.maps)
     np.testing.assert_array_equal(mirrored.over_ego, plain.over_ego)
     assert np.abs(unflipped.maps - plain.maps).max() > 0.01
+
+
+@pytest.mark.parametrize("mirrored", [False, True])
+def test_messages_are_read_as_the_network_reads_maps(mirrored, rng):
+    """Together and alone, whatever their size, and however high their sensors are."""
+    sent, reader = messages(rng), witness(replace(INFO, mirrored=mirrored), scale=0.3)
+    sent["high"] = Message(pose_matrix(0, 0, 400.0, 0), sent["a"].tensors)
+    maps = reader.layout.maps(list(sent.values()))
+    expected = reader.read(maps, [float(each.pose[2, 3]) for each in sent.values()]).numpy()
+    assert np.abs(expected).max() < LARGEST
+    said = reader.testify("", sent)
+    np.testing.assert_allclose(said.maps, expected, rtol=1e-3, atol=1e-3)  # half floats
+    for name, maps in zip(sent, expected, strict=True):
+        np.testing.assert_allclose(reader.read_message(sent[name]), maps, rtol=1e-3, atol=1e-3)
+        found = FastWitness(reader.network, reader.layout).read([sent[name]]).flatten(4).flatten(2, 3)[0]
+        np.testing.assert_allclose(found, maps, atol=1e-5 * np.abs(maps).max())
 
 
 def test_what_there_is_no_time_for_says_nothing(rng):
@@ -182,8 +200,8 @@ def test_a_message_that_is_the_same_around_a_place_shows_nothing_there(mirrored,
 
 
 def test_a_witness_survives_a_file(rng, tmp_path):
-    before, path = witness(scale=0.7), tmp_path / "x.witness.safetensors"
-    before.network.half().float()  # as files hold it
+    learned, path = witness(scale=0.7), tmp_path / "x.witness.safetensors"
+    before = Witness(learned.network.half().float(), learned.layout)  # as files hold it
     before.write(path, INFO, {"seed": 3})
     after = Witness.open(path, INFO)
     assert after.layout == before.layout

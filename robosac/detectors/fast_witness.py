@@ -1,0 +1,67 @@
+"""The network of a witness with fewer operations.
+
+It computes what `robosac.detectors.witness_network.WitnessNetwork` does, which stays the reference:
+
+- What the network makes of where cells are is the same for all messages, but for a part that grows with the sensor's
+  height.
+- Its first weights are divided by the scale, and not the maps.
+- The channels of a cell lie side by side in memory, as convolutions are fastest.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+
+import torch
+from torch.nn import functional
+
+from robosac.detectors.base import Message
+from robosac.detectors.device import stacked
+from robosac.detectors.witness_network import DILATIONS, WIDTH, Layout, WitnessNetwork, told
+from robosac.testimony import LAYERS
+
+
+class FastWitness:
+    """The network of a witness, weights fixed.
+
+    Parameters
+    ----------
+    network : WitnessNetwork
+        On the device where messages are to be read.
+    layout : Layout
+    """
+
+    def __init__(self, network: WitnessNetwork, layout: Layout) -> None:
+        self._layout = layout
+        self._device = network.read.weight.device
+        with torch.no_grad():
+            read = network.read.weight[:, :, 0, 0].T / layout.scale
+            place: torch.Tensor = network.place(layout.geometry([0.0], self._device))
+            ground = place[0].permute(1, 2, 0) + network.read.get_parameter("bias")
+            self._place = (ground.flip(1) if layout.mirrored else ground).flatten()
+            self._height = network.place.weight[:, -1, 0, 0].repeat(1, layout.height * layout.width)
+            self._blocks = [
+                (
+                    block.get_parameter("weight").clone(memory_format=torch.channels_last),
+                    block.get_parameter("bias").clone(),
+                    dilation,
+                )
+                for block, dilation in zip(network.blocks, DILATIONS, strict=True)
+            ]
+            self._head = network.head.get_parameter("bias").clone(), network.head.weight[:, :, 0, 0].T.contiguous()
+        with torch.inference_mode():  # where it is expanded
+            self._read = read.clone(memory_format=torch.contiguous_format)
+
+    def read(self, messages: Sequence[Message]) -> torch.Tensor:
+        """Testimony (n, LAYERS, H, u, W, u): what `WitnessNetwork` gives, before the sides of a map are joined."""
+        layout, u = self._layout, self._layout.upsampling
+        sent = stacked([message.tensors[layout.tensor] for message in messages], self._device).flatten(2)
+        heights = told([float(message.pose[2, 3]) for message in messages], self._device)
+        hidden = torch.bmm(sent.mT, self._read.expand(len(sent), -1, -1)).flatten(1)
+        hidden.add_(self._place).addmm_(heights[:, None], self._height).relu_()
+        cells = hidden.view(-1, layout.height, layout.width, WIDTH)
+        maps = (cells.flip(2) if layout.mirrored else cells).permute(0, 3, 1, 2)
+        for weight, bias, dilation in self._blocks:
+            maps = functional.conv2d(maps, weight, bias, 1, dilation, dilation).relu_().add_(maps)
+        said = torch.addmm(self._head[0], maps.permute(0, 2, 3, 1).flatten(0, 2), self._head[1])
+        return said.view(-1, layout.height, layout.width, LAYERS, u, u).permute(0, 3, 1, 4, 2, 5)
