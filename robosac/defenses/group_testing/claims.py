@@ -66,13 +66,11 @@ class Claims:
         """Look up boxes (n, 5+), each by itself; or beside others that are ``shown`` (m, 2+), themselves among them."""
         cos, sin = np.cos(boxes[:, 4]), np.sin(boxes[:, 4])
         along, across = np.stack([cos, sin], axis=-1), np.stack([-sin, cos], axis=-1)
-        around = boxes[:, None, :2] + AROUND_M * (
-            _STEPS[None, :, :1] * along[:, None] + _STEPS[None, :, 1:] * across[:, None]
-        )
-        found = heard.likelihood(around.reshape(-1, 2)).reshape(len(heard.agents), len(boxes), len(_STEPS))
+        around = boxes[:, :2] + AROUND_M * (_STEPS[:, None, :1] * along + _STEPS[:, None, 1:] * across)
+        found = heard.likelihood(around.reshape(-1, 2)).reshape(len(heard.agents), len(_STEPS), len(boxes))
         if shown is not None:
             found[:, _nearer_to_another(around, shown)] = -np.inf
-        return cls(boxes, heard.agents, found.max(axis=2))
+        return cls(boxes, heard.agents, found.max(axis=1))
 
     def without(self, agents: Collection[str]) -> Claims:
         """The same boxes, and what the other witnesses say of them."""
@@ -181,16 +179,17 @@ class Claims:
 
 
 def _nearer_to_another(around: FloatArray, shown: FloatArray) -> BoolArray:
-    """Which places (n, k) around boxes, given as (n, k, 2) with their centres first, are nearer than these to another
+    """Which places (k, n) around boxes, given as (k, n, 2) with their centres first, are nearer than these to another
     box beside them, of those shown (m, 2+).
     """
-    x, y = (shown[:, axis] - around[:, :1, axis] for axis in (0, 1))
+    x, y = (shown[:, axis] - around[0, :, None, axis] for axis in (0, 1))
     apart = x * x + y * y
     own, other = np.nonzero((apart > _SAME_M**2) & (apart <= BESIDE_M**2))
     nearer = np.zeros(around.shape[:2], dtype=bool)
     if len(own):
-        x, y = (around[own, :, axis] - shown[other, None, axis] for axis in (0, 1))
-        np.logical_or.at(nearer, own, x * x + y * y < (apart[own, other] - _SAME_M)[:, None])
+        x, y = (around[:, own, axis] - shown[other, axis] for axis in (0, 1))
+        at, pair = np.nonzero(x * x + y * y < apart[own, other] - _SAME_M)
+        nearer[at, own[pair]] = True
     return nearer
 
 
