@@ -24,7 +24,7 @@ MAX_STRING = 2**16
 MAX_ENTRIES = 2**16
 """Entries of all arrays and maps of a body: small containers by the million would cost far more than their bytes."""
 _LEAST_SHARE = 256
-"""Entries that a teammate's part may have in any case where parts are unpacked one by one."""
+"""Entries that a part of a body may have in any case where parts are unpacked one by one."""
 
 
 @dataclass(frozen=True)
@@ -194,12 +194,13 @@ def _unpack_apart(body: bytes, fault: WireError) -> tuple[dict[Any, Any], dict[s
     try:
         members = _members(body)
         parts = _members(members.pop("teammates"))
-        frame = {name: unpack(member) for name, member in members.items()}
+        share = _share(members)
+        frame = {name: unpack(member, most_entries=share) for name, member in members.items()}
     except Exception as error:  # as of `unpack`
         raise fault from error
     read: dict[Any, Any] = {}
     unreadable: dict[str, WireError] = {}
-    share = max(MAX_ENTRIES // max(len(parts), 1), _LEAST_SHARE)
+    share = _share(parts)
     for name, part in parts.items():
         try:
             read[name] = unpack(part, most_entries=share)
@@ -210,9 +211,20 @@ def _unpack_apart(body: bytes, fault: WireError) -> tuple[dict[Any, Any], dict[s
     return {**frame, "teammates": read}, unreadable
 
 
+def _share(parts: Mapping[Any, bytes]) -> int:
+    """Entries that each of some parts may have where they are unpacked one by one."""
+    return max(MAX_ENTRIES // max(len(parts), 1), _LEAST_SHARE)
+
+
 def _members(body: bytes) -> dict[Any, bytes]:
-    """The members of a map, still packed; what is wrong inside them is not looked at."""
-    walker = msgpack.Unpacker(strict_map_key=False, max_buffer_size=len(body), max_str_len=MAX_STRING)
+    """The members of a map, still packed; what is wrong inside them is not looked at. A name is no array and no map."""
+    walker = msgpack.Unpacker(
+        strict_map_key=False,
+        max_buffer_size=len(body),
+        max_str_len=MAX_STRING,
+        max_array_len=0,  # these bound the names alone: what is skipped is not built
+        max_map_len=0,
+    )
     walker.feed(body)
     size = walker.read_map_header()
     if size > MAX_MAP:

@@ -1,3 +1,5 @@
+import tracemalloc
+
 import msgpack
 import numpy as np
 import pytest
@@ -163,6 +165,37 @@ def test_a_body_that_is_no_map_is_refused(value):
     for read in (wire.read_message, wire.read_frame):
         with pytest.raises(wire.WireError, match="must be a map"):
             read(msgpack.packb(value))
+
+
+def frame_with(name: bytes, member: bytes, times: int = 1) -> bytes:
+    """A frame with further members, so many of a name that takes one number."""
+    more = b"".join(name.replace(b"%", msgpack.packb(number)) + member for number in range(times))
+    known = msgpack.packb({"frame": 0, "ego": {}, "teammates": {}})[1:]
+    return b"\xde" + (3 + times).to_bytes(2, "big") + more + known
+
+
+FEW = b"\xdc\x00\x40" + (b"\xdc\x00\x40" + b"\x90" * 64) * 64
+"""Small containers, as many as a body may have."""
+
+
+@pytest.mark.parametrize(
+    "body",
+    [
+        frame_with(b"\xdd" + (2**18).to_bytes(4, "big") + b"\x90" * 2**18, b"\xc0"),  # a name that is a long array
+        frame_with(b"%", FEW, 60),  # members that are small enough each, and too much together
+    ],
+    ids=["name", "members"],
+)
+def test_a_frame_that_is_unpacked_in_parts_is_bounded_as_a_whole(body):
+    tracemalloc.start()
+    try:
+        with pytest.raises(wire.WireError) as caught:
+            wire.read_frame(body)
+        _, most = tracemalloc.get_traced_memory()
+    finally:
+        tracemalloc.stop()
+    assert caught.value.code == "malformed-msgpack"
+    assert most < 4 * len(body) + 2**22
 
 
 plain = st.recursive(
