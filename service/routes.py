@@ -193,9 +193,9 @@ async def post_message(
 ) -> Response:
     """A vehicle's own message. The ego's starts the fusion and is answered with the frame result."""
     limit = gateway.frames.body_limit(caller, whole_frame=False)
-    with gateway.frames.waiting(caller), _room(gateway, caller).holding(expected_bytes(request, limit)):
+    with gateway.frames.waiting(caller), (room := _room(gateway, caller)).holding(expected_bytes(request, limit)):
         body = await _read_body(request, caller, gateway, limit)
-        answer = await gateway.frames.post_message(caller, body, arrival_of(request.scope))
+        answer = await gateway.frames.post_message(caller, body, arrival_of(request.scope), room)
     return _negotiated(answer, accept, 202) if isinstance(answer, Receipt) else _handed_over(answer, accept, gateway)
 
 
@@ -211,9 +211,9 @@ async def post_frame(
 ) -> Response:
     """A whole frame in one request by the ego."""
     limit = gateway.frames.body_limit(caller, whole_frame=True)
-    with gateway.frames.waiting(caller), _room(gateway, caller).holding(expected_bytes(request, limit)):
+    with gateway.frames.waiting(caller), (room := _room(gateway, caller)).holding(expected_bytes(request, limit)):
         body = await _read_body(request, caller, gateway, limit)
-        answer = await gateway.frames.post_frame(caller, body, arrival_of(request.scope))
+        answer = await gateway.frames.post_frame(caller, body, arrival_of(request.scope), room)
     return _handed_over(answer, accept, gateway)
 
 

@@ -23,6 +23,7 @@ from service.keeping.record import SessionRecord
 from service.schemas import Receipt
 from service.sessions.gathering import Contradiction, Received
 from service.sessions.live import Caller
+from service.sessions.room import Share
 from service.sessions.sessions import Sessions
 from service.watching.metrics import Metrics
 
@@ -43,26 +44,31 @@ class Frames:
     max_jump: int
     """By how much a frame's number may exceed the latest answered one."""
 
-    async def post_message(self, caller: Caller, body: bytes, arrived: float) -> Answered | Receipt:
-        """A vehicle's own message, whose request came then: kept for a teammate, answered for the ego."""
+    async def post_message(self, caller: Caller, body: bytes, arrived: float, room: Share) -> Answered | Receipt:
+        """A vehicle's own message, whose request came then: kept for a teammate, answered for the ego.
+
+        ``room`` is that of bodies, in which this one is counted as it came.
+        """
         frame, received = await self._read(caller, body, read_message)
         if not caller.is_ego:
             record = await self._keep(caller, frame, received)
             return Receipt(frame=frame, vehicle_id=caller.vehicle_id, receipt=self.sessions.keys.receipt(record))
         asked = Asked(caller, frame, received, arrived)
         asked.spent("receive", arrived)
-        return await self._answer(asked, gather=True)
+        with room.holding(_expanded_by(asked, body)):
+            return await self._answer(asked, gather=True)
 
-    async def post_frame(self, caller: Caller, body: bytes, arrived: float) -> Answered:
+    async def post_frame(self, caller: Caller, body: bytes, arrived: float, room: Share) -> Answered:
         """A whole frame from the ego, whose request came then. A teammate whose part is malformed is left out, and the
-        frame is answered.
+        frame is answered. ``room`` as for `post_message`.
         """
         frame, parts = await self._read(caller, body, read_frame)
         for name in parts.malformed:
             self.metrics.refused(parts.unusable[name].reason.value)
         asked = Asked(caller, frame, parts.ego, arrived, parts.messages, parts.unusable)
         asked.spent("receive", arrived)
-        return await self._answer(asked, gather=False)
+        with room.holding(_expanded_by(asked, body)):
+            return await self._answer(asked, gather=False)
 
     def waiting(self, caller: Caller) -> AbstractContextManager[None]:
         """Count a request of an ego among its frames that wait, from before its body is read; refuse one too many.
@@ -165,6 +171,12 @@ class Frames:
             raise
         self.sessions.moving.message_waits(caller)
         return record
+
+
+def _expanded_by(asked: Asked, body: bytes) -> int:
+    """By how many bytes the tensors of a body exceed it: they may have come compressed, or in a narrower type."""
+    received = (asked.ego, *asked.messages.values())
+    return max(sum(one.nbytes for one in received) - len(body), 0)
 
 
 @contextlib.asynccontextmanager

@@ -81,8 +81,9 @@ class Share:
 
     @contextmanager
     def holding(self, nbytes: int) -> Iterator[None]:
-        """Hold bytes for the length of a block, if there is room."""
-        self.check(nbytes)
+        """Hold bytes for the length of a block, if there is room; for none there always is."""
+        if nbytes:
+            self.check(nbytes)
         self.add(nbytes)
         try:
             yield

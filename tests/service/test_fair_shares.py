@@ -8,6 +8,7 @@ from collections import Counter
 import pytest
 
 from clients.client import GatewayClient
+from robosac import wire
 from robosac.detectors import EmbeddedDetector
 from tests.service.conftest import EGO, TEAM, problem, serve
 from tests.service.many import MANY
@@ -164,6 +165,19 @@ async def test_bodies_of_one_session_leave_room_for_those_of_another(good_frame)
         assert (await served.post(modest, "frames", body)).status_code == 200
         go_on.set()
         assert (await held).status_code == 200
+        assert served.gateway.bodies.nbytes == 0
+
+
+async def test_a_body_counts_as_what_its_tensors_hold_once_they_are_expanded(messages):
+    ego, team, small = messages[EGO], dict.fromkeys(MY_TEAM, messages["rsu"]), wire.Packing(compress=True)
+    body = wire.pack_frame(0, ego, team, packing=small)
+    assert len(body) < 2**20 < len(wire.pack_frame(0, ego, team))
+    async with serve(max_inflight_bytes=2**20) as served:
+        session = await served.client.open_session(EGO, MY_TEAM, latency_budget_ms=20_000)
+        refused = await served.post(session, "frames", body)
+        assert "ROBOSAC_MAX_INFLIGHT_BYTES" in problem(refused, 503, "overloaded")["detail"]
+        assert served.gateway.bodies.nbytes == 0
+        assert (await served.post(session, "frames", wire.pack_frame(0, ego, {}, packing=small))).status_code == 200
         assert served.gateway.bodies.nbytes == 0
 
 
