@@ -113,8 +113,8 @@ def check(caller: Caller, vehicle: str, frame: int, payload: Any, path: str) -> 
     message = wire.check_message(payload, caller.live.detector.info, role, path)
     signature = wire.read_signature(payload, path)
     truth = read_truth(payload, path) if role == "ego" else None
-    received = Received(message, wire.content_digest(frame, vehicle, message), signature, truth)
     key = caller.record.public_keys.get(vehicle)
+    received = Received(message, wire.content_digest(frame, vehicle, message), signature, key, truth)
     if key is not None:
         field_ = f"{path}.signature" if path else "signature"
         if signature is None:

@@ -158,6 +158,8 @@ class Frames:
 
     async def _keep(self, caller: Caller, frame: int, received: Received) -> SessionRecord:
         record = await self.sessions.current(caller)
+        if caller.vehicle_id in record.token_ids:  # else it has left, which goes on record below
+            caller.check_token(record)
         self.sessions.moving.check_open()
         try:
             closed = caller.live.gathering.closed

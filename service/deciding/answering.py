@@ -123,12 +123,14 @@ class Deciding:
                     asked.absences[name] = live.gathering.absence(name, asked.frame)
                 left_out.setdefault(name, asked.absences[name])
                 continue
-            doubt = live.motion.implausible(name, asked.frame, received.message.pose, ego_pose)
-            if doubt is None:
-                present[name] = received
-            else:
+            if received.key != record.public_keys.get(name):
+                detail = "it joined again with another key after its message was checked"
+                left_out[name] = Rejection(Reason.UNAUTHENTICATED, {"detail": detail})
+            elif doubt := live.motion.implausible(name, asked.frame, received.message.pose, ego_pose):
                 left_out[name] = Rejection(Reason.MALFORMED, {"field": "pose", "detail": doubt})
                 self.metrics.refused(Reason.MALFORMED.value)
+            else:
+                present[name] = received
         live.gathering.begin(asked.frame)
         return present, left_out
 

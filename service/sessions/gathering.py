@@ -30,6 +30,8 @@ class Received:
     digest: str
     """`robosac.wire.content_digest`."""
     signature: bytes | None = None
+    key: str | None = None
+    """The vehicle's registered key, base64, by which the signature was checked; None if it had none."""
     truth: Truth | None = None
     """What the ego tells for recordings."""
     at: float = field(default_factory=time.time, compare=False)

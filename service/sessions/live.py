@@ -11,6 +11,7 @@ from dataclasses import dataclass, field
 from robosac.audit.events import Proof
 from robosac.detectors import Detector, Role
 from robosac.session import Session
+from service.errors import TokenReplaced
 from service.keeping.record import SessionRecord
 from service.sessions.gathering import Gathering
 from service.sessions.motion import Motion
@@ -41,6 +42,7 @@ class LiveSession:
     session: Session
     detector: Detector
     team: tuple[str, ...]
+    public_keys: Mapping[str, str]
     gathering: Gathering
     motion: Motion
     budget_s: float
@@ -63,9 +65,11 @@ class LiveSession:
 
     def follow(self, record: SessionRecord) -> None:
         """Catch up with what another process did to the session, if one did."""
-        if self.team != record.teammates:
-            self.team = record.teammates
+        if (self.team, self.public_keys) != (record.teammates, record.public_keys):
+            known = [one for one in record.teammates if self.public_keys.get(one) == record.public_keys.get(one)]
+            self.gathering.change_team(known)  # what those with another key now have sent does not count
             self.gathering.change_team(record.teammates)
+            self.team, self.public_keys = record.teammates, record.public_keys
         if record.last_frame is not None and record.last_frame > self.gathering.closed:
             self.gathering.close(record.last_frame)
         self.session.state = record.state
@@ -107,6 +111,17 @@ class Caller:
     def is_ego(self) -> bool:
         """Whether the ego speaks."""
         return self.vehicle_id == self.record.ego_id
+
+    def check_token(self, now: SessionRecord) -> None:
+        """Refuse a caller whose token was good when it was authenticated, and is not in the session as it is now.
+
+        Raises
+        ------
+        TokenReplaced
+            If the token was renewed, or its vehicle has left, even if that has joined again since.
+        """
+        if now.token_ids.get(self.vehicle_id) != self.record.token_ids[self.vehicle_id]:
+            raise TokenReplaced
 
     @property
     def role(self) -> Role:

@@ -221,6 +221,7 @@ class Sessions:
             Session(detector, record.teammates, defense, {"state": record.state}),
             detector,
             record.teammates,
+            record.public_keys,
             Gathering(
                 record.teammates,
                 settings.max_pending_frames,

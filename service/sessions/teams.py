@@ -8,7 +8,7 @@ from dataclasses import dataclass
 from robosac.audit.events import TeamChanged, TokenRenewed
 from robosac.budget import DomainError
 from robosac.session import changed_team
-from service.errors import Kind, Refused, TokenReplaced
+from service.errors import Kind, Refused
 from service.keeping.record import SessionRecord
 from service.keeping.store import Store
 from service.schemas import ChangedTeam, RenewedToken
@@ -34,6 +34,7 @@ class Teams:
         """Let teammates join, from the next frame on; the answer is the only place where their tokens are shown."""
         async with caller.live.lock:
             record = await self.sessions.current(caller)
+            caller.check_token(record)
             for name in newcomers:
                 if name == record.ego_id or name in record.teammates:
                     raise Refused(Kind.ALREADY_ENROLLED, f"{name} is in the session already", "teammates")
@@ -51,6 +52,7 @@ class Teams:
         """Let a teammate leave, from the next frame on; its token is worth nothing any more."""
         async with caller.live.lock:
             record = await self.sessions.current(caller)
+            caller.check_token(record)
             if leaver not in record.teammates:
                 raise Refused(Kind.UNKNOWN_TEAMMATE, "there is no such teammate in the session")
             token_ids = {name: token_id for name, token_id in record.token_ids.items() if name != leaver}
@@ -63,16 +65,14 @@ class Teams:
         vehicle = caller.vehicle_id
         async with caller.live.lock:  # else a team that changes meanwhile would bring the old token back
             record = await self.sessions.current(caller)
-            before = caller.record.token_ids[vehicle]
-            if record.token_ids.get(vehicle) != before:
-                raise TokenReplaced
+            caller.check_token(record)
             if caller.live.renewals[vehicle] >= MAX_RENEWALS:
                 detail = f"a vehicle may have {MAX_RENEWALS} tokens between two frames"
                 raise Refused(Kind.TOO_MANY_RENEWALS, detail)
             caller.live.renewals[vehicle] += 1
             token = self.tokens.issue(record.session_id, vehicle, is_ego=caller.is_ego)
             event = TokenRenewed(vehicle_id=vehicle, expires_at=token.expires_at)
-            await self.store.renew_token(record.session_id, before, token.token_id, event)
+            await self.store.renew_token(record.session_id, record.token_ids[vehicle], token.token_id, event)
             return RenewedToken(token=token.text, expires_at=token.expires_at)
 
     async def _change_team(

@@ -1,0 +1,108 @@
+"""What was on its way when its vehicle left, joined again, or took another token."""
+
+import asyncio
+import contextlib
+import json
+
+import pytest
+from cryptography.hazmat.primitives.asymmetric.ed25519 import Ed25519PrivateKey
+
+from robosac import audit, wire
+from robosac.signatures import show_public_key, sign
+from tests.service.conftest import EGO, HOOKED, TEAM, problem, serve
+
+KEY, OTHER_KEY = (Ed25519PrivateKey.from_private_bytes(bytes([number]) * 32) for number in (1, 2))
+NONE = {"kind": "none"}
+
+
+@contextlib.asynccontextmanager
+async def on_the_way(served, session, what, body, token, media_type=None):
+    """A request whose body comes to its end after the block only; gives what will hold the response."""
+    begun, go_on, answer = asyncio.Event(), asyncio.Event(), []
+
+    async def slowly():
+        yield body[:10]
+        begun.set()
+        await go_on.wait()
+        yield body[10:]
+
+    headers = {"Content-Length": str(len(body)), **({"Content-Type": media_type} if media_type else {})}
+    post = asyncio.create_task(served.post(session, what, slowly(), token, **headers))
+    await begun.wait()
+    yield answer
+    go_on.set()
+    answer.append(await post)
+
+
+async def faults(ego):
+    return audit.verify([line.encode() for line in await ego.audit_lines()])
+
+
+def signed(key, session, frame, name, message):
+    return sign(key, session.session_id, name, frame, wire.content_digest(frame, name, message))
+
+
+@pytest.mark.parametrize("key", [None, KEY])
+async def test_a_message_on_its_way_does_not_count_for_whoever_joins_by_its_name(key, served, messages):
+    session = await served.open(gather_ms=20, defense=NONE)
+    ego, body = served.ego(session), wire.pack_message(0, "rsu", messages["rsu"])
+    async with on_the_way(served, session, "messages", body, session.teammate_tokens["rsu"]) as answer:
+        await ego.dismiss("rsu")
+        await ego.enrol(["rsu"], {"rsu": show_public_key(key)} if key else {})
+    problem(answer[0], 401, "unauthenticated")
+    assert (await ego.ask(0, messages[EGO])).rejected["rsu"].reason == "missing"
+    assert await faults(ego) == []
+
+
+async def test_a_message_on_its_way_does_not_count_once_its_token_is_renewed(served, messages):
+    session = await served.open(gather_ms=20, defense=NONE)
+    body = wire.pack_message(0, "rsu", messages["rsu"])
+    async with on_the_way(served, session, "messages", body, session.teammate_tokens["rsu"]) as answer:
+        renewed = await served.teammate(session, "rsu").renew()
+    problem(answer[0], 401, "unauthenticated")
+    await served.client.vehicle(session.session_id, "rsu", renewed.token).send(0, messages["rsu"])
+
+
+async def test_nobody_joins_by_a_token_that_was_renewed_meanwhile(served):
+    session = await served.open()
+    body = json.dumps({"teammates": ["friend"]}).encode()
+    async with on_the_way(served, session, "teammates", body, session.ego_token, "application/json") as answer:
+        renewed = await served.ego(session).renew()
+    problem(answer[0], 401, "unauthenticated")
+    state = await served.client.vehicle(session.session_id, EGO, renewed.token).state()
+    assert state["teammates"] == list(TEAM)
+
+
+async def test_a_part_of_a_frame_that_was_checked_by_a_key_of_before_is_left_out(messages, benign):
+    async with serve(extra_detectors=HOOKED) as served:
+        session = await served.open(defense=NONE)
+        ego = served.ego(session)
+        loop = asyncio.get_running_loop()
+        lock = served.gateway.sessions.in_use(session.session_id).lock
+        await lock.acquire()  # as while the frame before is answered
+        changes = []
+        for change in (ego.dismiss("rsu"), ego.enrol(["rsu"], {"rsu": show_public_key(KEY)})):
+            changes.append(loop.create_task(change))
+            await asyncio.sleep(0.1)
+        post = loop.create_task(ego.post_frame(0, messages[EGO], benign))
+        await asyncio.sleep(0.3)
+        lock.release()
+        answer = await post
+        await asyncio.gather(*changes)
+        assert set(answer.accepted) == {*TEAM} - {"rsu"}
+        assert answer.rejected["rsu"].reason == "unauthenticated"
+        assert await faults(ego) == []
+
+
+async def test_what_waits_at_one_gateway_does_not_count_for_whoever_joins_at_another(tmp_path, messages):
+    where = {"database_url": f"sqlite:///{tmp_path}/robosac.db"}
+    async with serve(**where) as one, serve(**where) as other:
+        keys = {"rsu": show_public_key(KEY)}
+        session = await one.client.open_session(EGO, TEAM, defense=NONE, gather_ms=20, public_keys=keys)
+        body = wire.pack_message(0, "rsu", messages["rsu"], signed(KEY, session, 0, "rsu", messages["rsu"]))
+        assert (await one.post(session, "messages", body, session.teammate_tokens["rsu"])).status_code == 202
+        ego = other.ego(session)
+        await ego.dismiss("rsu")
+        await ego.enrol(["rsu"], {"rsu": show_public_key(OTHER_KEY)})
+        assert (await one.ego(session).ask(0, messages[EGO])).rejected["rsu"].reason == "missing"
+        assert await faults(ego) == []
