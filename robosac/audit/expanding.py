@@ -80,7 +80,7 @@ def unpacked(record: Mapping[str, Any]) -> tuple[FloatArray, tuple[Support, ...]
 def _blaming(name: str, unpack: Callable[..., T], *packed: Any) -> T:
     try:
         return unpack(*packed)
-    except (ValueError, TypeError, KeyError, IndexError, AttributeError, RecursionError) as error:
+    except (ValueError, TypeError, LookupError, AttributeError, OverflowError, RecursionError) as error:
         raise ValueError(f"{name}: {error}") from error
 
 

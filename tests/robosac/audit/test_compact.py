@@ -15,7 +15,8 @@ from robosac.audit.lines import RecordError
 from robosac.boxes import from_units, in_units
 
 NAMES = ["car-1", "car-2", "car-3", "rsu"]
-JUNK = [None, True, -1, 2.5, "", "?", "AAAA", "eJw=", [], [1], [["a"]], {}, {"rsu": 5}, {"rsu": [1, 2, 3]}, "f" * 99]
+JUNK = [None, True, -1, 2.5, "", "?", "AAAA", "eJw=", [], [1], [["a"]], {}, {"rsu": 5}, {"rsu": [1, 2, 3]}, "f" * 99,
+        10**400, [10**400] * 10, {"rsu": 10**400}]  # fmt: skip
 
 
 def an_answer(events, frame=1, **changes) -> FrameAnswered:
@@ -65,7 +66,7 @@ def test_evidence_is_told_once_until_a_full_record_tells_all(events):
     assert told == [items[:1], items[1:2], items[2:], items]
 
 
-@pytest.mark.parametrize("value", JUNK, ids=str)
+@pytest.mark.parametrize("value", JUNK, ids=lambda value: str(value)[:24])
 def test_junk_in_any_part_is_told_as_such(events, value):
     record = json.loads(on_a_line(compact(an_answer(events))))
     changes = [
