@@ -5,11 +5,13 @@ from __future__ import annotations
 import codecs
 import json
 import re
-from collections.abc import Mapping
-from typing import Any, NoReturn
+from collections.abc import Iterator, Mapping
+from typing import Any, BinaryIO, NoReturn
 
 import rfc8785
 
+MOST_BYTES = 2**24
+"""Of a line: far more than a gateway writes. A longer one is not read: it would take many times as much memory."""
 _FOREIGN = {codecs.BOM_UTF8: "a byte order mark", b"\x1f\x8b": "the mark of gzip"}
 """What other programs put before a text, or before what they have packed."""
 
@@ -30,14 +32,26 @@ _NUMBER = re.compile(rb"[:\[,]-?(?:\d{16}|\d+(?:\.0*[,\]}]|(?:\.\d+)?[eE]))")
 """A number that Python may write otherwise than RFC 8785: large, with an exponent, or a whole one with a point."""
 
 
+def lines_in(file: BinaryIO) -> Iterator[bytes]:
+    """The lines of a file with their line breaks; of one that is too long no more than shows that it is."""
+    while line := file.readline(MOST_BYTES + 2):
+        yield line
+        while len(line) > MOST_BYTES and not line.endswith(b"\n"):
+            line = file.readline(MOST_BYTES + 2)
+            if not line:
+                return
+
+
 def read(line: bytes) -> dict[str, Any]:
     """The record on a line, its line break taken off.
 
     Raises
     ------
     RecordError
-        If it is not a JSON object.
+        If it is not a JSON object, or too long.
     """
+    if len(line) > MOST_BYTES:
+        raise RecordError(f"not JSON: a line has at most {MOST_BYTES} bytes")
     try:
         record = _READER.decode(line.decode())
     except (ValueError, RecursionError) as error:

@@ -20,8 +20,10 @@ import numpy as np
 from robosac.answers import Standing, Support
 from robosac.boxes import FloatArray, from_units, in_units
 
-MOST_BYTES = 2**26
-"""Of one packed field, unpacked: far more than the largest state of 1024 teammates."""
+MOST_BYTES = 2**23
+"""Of one packed field, unpacked: several times the largest state of 1024 teammates. As Python's values it may take
+sixty times as much.
+"""
 _BOX_BYTES = 24
 _RAW = -15
 """No header of zlib's, and the largest window."""

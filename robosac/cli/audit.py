@@ -18,7 +18,7 @@ import typer
 
 from robosac import wire
 from robosac.audit import Receipts, digest, misbehaviour, sentence, verification
-from robosac.audit.lines import RecordError, read
+from robosac.audit.lines import RecordError, lines_in, read
 from robosac.audit.receipts import by_id
 from robosac.cli.blame import blaming
 from robosac.cli.named import load_named
@@ -48,7 +48,7 @@ def verify(
     if head is not None and re.fullmatch("[0-9a-f]{64}", head) is None:
         raise typer.BadParameter("must be 64 hexadecimal digits, lower case", param_hint="--head")
     with blaming("FILE", OSError), file.open("rb") as lines:
-        log = _Counted(lines)
+        log = _Counted(lines_in(lines))
         findings = verification.verify(log, head, promised)
     for finding in findings:
         _say(finding)
@@ -104,7 +104,7 @@ def replay_decision(
         body = messages.read_bytes()
         number = wire.read_frame(body).frame if frame is None else frame
     with blaming("FILE", OSError, replay.ReplayError), file.open("rb") as lines:
-        decision = replay.find(lines, number)
+        decision = replay.find(lines_in(lines), number)
     loaded = load_named(detector, decision.session.detector, "log")
     with blaming("--defense", ValueError):
         kinds = None if defense is None else defenses.known([defense])
@@ -136,13 +136,13 @@ def report(
         check_file(out, "--out", force)
     try:
         with blaming("FILE", OSError), _open_again_and_again(file) as lines:
-            log = _Counted(lines)
+            log = _Counted(lines_in(lines))
             findings = verification.verify(log)
             if findings:
                 _say(f"{file}: {findings[0]}; see robosac audit verify", err=True)
                 raise typer.Exit(1)
             lines.seek(0)
-            checked = islice(lines, log.count)  # the log may have grown meanwhile
+            checked = islice(lines_in(lines), log.count)  # the log may have grown meanwhile
             fields = misbehaviour.report(checked, vehicle, datetime.now(UTC))
     except misbehaviour.NothingToReport as nothing:
         _say(f"{file}: {nothing}", err=True)
@@ -188,7 +188,7 @@ def _lines(file: Path) -> Iterator[bytes]:
     gone.
     """
     with blaming("FILE", OSError), file.open("rb") as lines:
-        yield from lines
+        yield from lines_in(lines)
 
 
 def _read_receipts(file: Path, keys: list[str]) -> Receipts:
@@ -197,7 +197,7 @@ def _read_receipts(file: Path, keys: list[str]) -> Receipts:
     with blaming("--gateway-key", ValueError):
         known = by_id(keys)
     with blaming("--receipts", OSError), file.open("rb") as lines:
-        return Receipts.read(lines, known)
+        return Receipts.read(lines_in(lines), known)
 
 
 def _say(what: object, *, err: bool = False) -> None:

@@ -1,3 +1,4 @@
+import io
 import json
 
 import pytest
@@ -5,7 +6,7 @@ import rfc8785
 from hypothesis import given
 from hypothesis import strategies as st
 
-from robosac.audit.lines import is_canonical, read
+from robosac.audit.lines import MOST_BYTES, RecordError, is_canonical, lines_in, read
 
 NUMBERS = (
     st.integers(-(2**60), 2**60)
@@ -50,3 +51,13 @@ def test_numbers_are_written_in_one_way(number, where):
     line = where.format(number).encode()
     record = read(line)
     assert is_canonical(line, record) == (canonical(record) == line)
+
+
+@pytest.mark.parametrize("end", [b"\n", b"\n{}", b"\n{}\n", b""])
+@pytest.mark.parametrize("more", [0, 1, 2, 3, MOST_BYTES])
+def test_of_a_line_that_is_too_long_no_more_is_read_than_shows_it(more, end):
+    first, *others = lines_in(io.BytesIO(b" " * (MOST_BYTES + more) + end))
+    assert len(first) <= MOST_BYTES + 2
+    assert others == [end[1:]] * (len(end) > 1)
+    with pytest.raises(RecordError, match="at most" if more else "empty"):
+        read(first.removesuffix(b"\n"))
