@@ -55,18 +55,23 @@ export function namesOf(frame) {
   return [...new Set([...frame.accepted, ...frame.rejected.map((entry) => entry.vehicle_id)])].sort();
 }
 
+/** A vehicle may be called as what every object has, such as "constructor". */
+function suspicionOf(frame, name) {
+  return frame.suspicion && Object.hasOwn(frame.suspicion, name) ? frame.suspicion[name] : undefined;
+}
+
 export function showTeam(body, frame) {
   const names = namesOf(frame);
-  const ranges = Object.fromEntries(frame.teammates.map((mate) => [mate.vehicle_id, mate.range_m]));
+  const ranges = new Map(frame.teammates.map((mate) => [mate.vehicle_id, mate.range_m]));
   tell(body, names.map((name) => {
     const entry = frame.rejected.find((one) => one.vehicle_id === name);
     const named = frame.named.includes(name);
-    const suspicion = frame.suspicion ? frame.suspicion[name] : undefined;
+    const suspicion = suspicionOf(frame, name);
     const head = made('th', [swatch(...lineOf(names, name), 2.5), ` ${name}`]);
     head.scope = 'row';
     return made('tr', [
       head,
-      made('td', name in ranges ? `${ranges[name].toFixed(1)} m` : 'not known'),
+      made('td', ranges.has(name) ? `${ranges.get(name).toFixed(1)} m` : 'not known'),
       made('td', suspicion === undefined ? 'not known' : suspicion.toFixed(3), suspicion > 0.5 ? 'alarm' : ''),
       made('td', entry ? `left out: ${entry.why}` : 'in the answer', named ? 'alarm' : ''),
     ]);
@@ -103,11 +108,11 @@ export function drawSuspicion(canvas, frames, cursor) {
     pen.setLineDash(dash);
     pen.beginPath();
     past.forEach((frame, i) => {
-      const p = frame.suspicion ? frame.suspicion[name] : undefined;
+      const p = suspicionOf(frame, name);
       if (p !== undefined) pen.lineTo(...at(i, p));
     });
     pen.stroke();
-    const p = frames[cursor].suspicion ? frames[cursor].suspicion[name] : undefined;
+    const p = suspicionOf(frames[cursor], name);
     now.push(`${name} ${p === undefined ? 'not known' : p.toFixed(2)}`);
   }
   pen.setLineDash([]);
