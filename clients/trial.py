@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import asyncio
 import json
+import re
 import sys
 import tempfile
 from collections.abc import AsyncIterator, Coroutine, Sequence
@@ -31,6 +32,7 @@ T = TypeVar("T")
 
 MOST_BUDGET_MS = 60_000
 """Longer budgets no gateway grants."""
+_KEY = re.compile(r"[A-Za-z0-9._~+/-]+=*")
 
 
 def checked_url(url: str | None) -> str | None:
@@ -48,11 +50,19 @@ def checked_url(url: str | None) -> str | None:
     return url
 
 
+def checked_key(key: str | None) -> str | None:
+    """An API key that a header can carry."""
+    if key is not None and not _KEY.fullmatch(key):
+        raise typer.BadParameter("a key has only A-Z a-z 0-9 . _ ~ + / -, and may have = at its end")
+    return key
+
+
 Url = Annotated[
     str | None, typer.Option(callback=checked_url, help="The gateway; by default one is started for the test.")
 ]
 ApiKey = Annotated[
-    str | None, typer.Option(envvar=API_KEY_VARIABLE, help="Opens sessions, where the gateway asks for one.")
+    str | None,
+    typer.Option(envvar=API_KEY_VARIABLE, callback=checked_key, help="Opens sessions, where the gateway asks for one."),
 ]
 Seconds = Annotated[float, typer.Option(min=0.5, help="Length of each part.")]
 Budget = Annotated[float, typer.Option(min=1, max=MOST_BUDGET_MS, help="Latency budget.")]

@@ -50,6 +50,14 @@ def test_a_command_line_takes_a_key_from_the_option_or_the_environment(by_option
     assert "a-key-of-the-fleet" not in result.output
 
 
+@pytest.mark.parametrize("key", ["", "schl\u00fcssel", "two words", "line\n", "=a"])
+def test_a_key_that_no_header_can_carry_is_refused_by_its_option(key):
+    result = CliRunner().invoke(command(fleet.main), ["--url", "http://127.0.0.1:9", "--api-key", key])
+    assert result.exit_code == 2
+    assert "--api-key" in result.output
+    assert "a key has only" in result.output
+
+
 @pytest.mark.parametrize("module", [fleet, flood, load_test])
 def test_every_command_that_opens_sessions_elsewhere_takes_a_key(module):
     (option,) = [one for one in typer.main.get_command(command(module.main)).params if one.name == "api_key"]
