@@ -160,6 +160,12 @@ def test_a_body_that_is_no_msgpack_within_limits_is_refused(body):
     assert (caught.value.code, caught.value.field) == ("malformed-msgpack", "")
 
 
+@pytest.mark.parametrize("body", [GOOD + b"\x00", b"hello", b'{"frame": 0}'])
+def test_bytes_after_the_value_are_told_as_such(body):
+    with pytest.raises(wire.WireError, match="is no msgpack, or has bytes left over after its one value"):
+        wire.read_message(body)
+
+
 @pytest.mark.parametrize("value", [None, 3, [], "x", msgpack.ExtType(1, b"abcd"), msgpack.Timestamp(0)])
 def test_a_body_that_is_no_map_is_refused(value):
     for read in (wire.read_message, wire.read_frame):
