@@ -2,7 +2,8 @@
 
 from __future__ import annotations
 
-from collections.abc import Collection, Iterator
+import shlex
+from collections.abc import Collection, Iterable, Iterator
 from contextlib import contextmanager
 
 import typer
@@ -14,7 +15,7 @@ def blaming(option: str, *errors: type[Exception]) -> Iterator[None]:
     try:
         yield
     except errors as error:
-        raise typer.BadParameter(str(error), param_hint=option) from error
+        raise typer.BadParameter(_told(error), param_hint=option) from error
 
 
 @contextmanager
@@ -31,4 +32,16 @@ def check_known(names: Collection[str], known: Collection[str], option: str) -> 
     """Refuse names that are not known."""
     unknown = sorted(set(names) - set(known))
     if unknown:
-        raise typer.BadParameter(f"unknown {', '.join(unknown)}; known: {', '.join(known)}", param_hint=option)
+        raise typer.BadParameter(f"unknown {listed(unknown)}; known: {listed(known)}", param_hint=option)
+
+
+def listed(names: Iterable[str]) -> str:
+    """Names as one types them, one after the other."""
+    return ", ".join(map(shlex.quote, names))
+
+
+def _told(error: Exception) -> str:
+    """An error without the number that the system has for it."""
+    if isinstance(error, OSError) and error.strerror and error.filename is not None:
+        return f"{error.filename}: {error.strerror}"
+    return str(error)

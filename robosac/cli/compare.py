@@ -14,7 +14,7 @@ from rich.console import Console
 
 from robosac import defenses
 from robosac.attacks import lacking, load_campaign
-from robosac.cli.blame import blaming, check_known
+from robosac.cli.blame import blaming, check_known, listed
 from robosac.cli.options import (
     WORLD_HELP,
     DataName,
@@ -60,7 +60,7 @@ def run(  # the options of a command line
         ),
     ],
     quick: Annotated[bool, typer.Option(help="Fewer attacks and frames, in a few minutes.")] = False,
-    only: Annotated[list[str] | None, typer.Option(help=f"One of {', '.join(DEFENSES)}; may be repeated.")] = None,
+    only: Annotated[list[str] | None, typer.Option(help=f"One of {listed(DEFENSES)}; may be repeated.")] = None,
     defense: Annotated[
         list[str] | None,
         typer.Option(help="A defence of one's own, module:callable, to be compared too; may be repeated."),

@@ -7,6 +7,7 @@ import typer
 from typer.testing import CliRunner
 
 from robosac.cli import app, commands
+from robosac.cli.blame import check_known
 
 runner = CliRunner()
 WRITTEN = {
@@ -126,3 +127,14 @@ def test_work_that_fails_ends_with_a_line():
 
     result = runner.invoke(own, [])
     assert (result.exit_code, result.output) == (1, "Error: the disk is full\n")
+
+
+def test_a_file_that_is_not_there_is_told_by_its_name(tmp_path):
+    result = CliRunner().invoke(app, ["audit", "show", str(tmp_path / "nosuch")], env={"COLUMNS": "300"})
+    assert result.exit_code == 2
+    assert f"FILE: {tmp_path / 'nosuch'}: No such file or directory" in result.output
+
+
+def test_names_are_listed_as_one_types_them():
+    with pytest.raises(typer.BadParameter, match=r"unknown x; known: plain, 'group_testing, expecting \.2 m'$"):
+        check_known(["x"], ["plain", "group_testing, expecting .2 m"], "--only")
