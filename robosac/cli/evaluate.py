@@ -84,7 +84,7 @@ def run(  # the options of a command line
 
 def _print(console: Console, report: BoundsReport, attack: str, attackers: int) -> None:
     table = Table(
-        title=f"{report.frames} test frames, {attackers} {attack.upper()} attacker(s)",
+        title=f"{report.frames} test frames, {attackers} attacker(s): {attack}",
         title_justify="left",
     )
     for heading in ("perception", "AP50", "AP70", "steps", "success", "infiltrated"):
