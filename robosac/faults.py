@@ -3,6 +3,8 @@
 from __future__ import annotations
 
 import re
+from collections.abc import Mapping
+from typing import Any
 
 MESSAGE_CHARS = 240
 """What is kept of an exception's message."""
@@ -12,6 +14,7 @@ _UNKEPT = (
     re.compile(r"\bb(['\"])(?:\\.|(?!\1)[^\\]){24,}+\1?"),  # tensors as bytes
     re.compile(r"(?:[-+]?\d[\w.+-]*+[\s,;\[\](){}]++){6,}"),  # and as numbers
 )
+_PLAIN = {"missing": "is missing", "extra_forbidden": "there is no such field"}
 _PART_OF_A_WORD = re.compile(r"[\w.~+/=-]*+$")
 
 
@@ -38,3 +41,8 @@ def describe(error: BaseException) -> str:
     except Exception as failure:
         message = f"no message, for a {type(failure).__name__}"
     return in_short(f"{type(error).__name__}: {message}")
+
+
+def in_words(fault: Mapping[str, Any]) -> str:
+    """What is wrong with a value by one of `pydantic.ValidationError.errors`, without where it stands."""
+    return _PLAIN.get(fault["type"]) or str(fault["msg"]).removeprefix("Value error, ")

@@ -18,6 +18,7 @@ from starlette.exceptions import HTTPException
 from starlette.types import Receive, Scope, Send
 
 from robosac.defenses import shipped
+from robosac.faults import in_words
 from robosac.possession import ALGORITHM
 from robosac.wire import WireError
 from service.errors import Kind, Refused
@@ -28,6 +29,7 @@ MEDIA_TYPE = "application/problem+json"
 TYPE_PREFIX = "urn:robosac:problem:"
 _CHALLENGE = {"WWW-Authenticate": "Bearer"}
 _PROOF = {"WWW-Authenticate": f'DPoP algs="{ALGORITHM}", error="invalid_dpop_proof"'}  # RFC 9449, section 7.1
+_UNROUTED = {404: "there is nothing at this path", 405: "this path does not take this method"}
 _CLOSE = {"Connection": "close"}  # as the rest of the body may still come, or never
 ANSWERS: Mapping[Kind, tuple[int, Mapping[str, str]]] = {
     Kind.MALFORMED_JSON: (400, {}),
@@ -129,13 +131,12 @@ def install(app: FastAPI) -> None:
             detail = f"not JSON: {first.get('ctx', {}).get('error', first['msg'])}"
             return response(Refused(Kind.MALFORMED_JSON, detail))
         where = [str(part) for part in first["loc"] if part not in ("body", "query", "path", *shipped())]
-        detail = str(first["msg"]).removeprefix("Value error, ")
-        return response(Refused(Kind.INVALID_REQUEST, detail, ".".join(where) or "body"))
+        return response(Refused(Kind.INVALID_REQUEST, in_words(first), ".".join(where) or "body"))
 
     @app.exception_handler(HTTPException)
     async def _http(_: Request, error: HTTPException) -> JSONResponse:
         slug = HTTPStatus(error.status_code).phrase.lower().replace(" ", "-")  # of 404 and 405, where no route fits
-        return _problem(error.status_code, slug, str(error.detail), headers=error.headers)
+        return _problem(error.status_code, slug, _UNROUTED.get(error.status_code, error.detail), headers=error.headers)
 
     @app.exception_handler(Exception)
     async def _internal(request: Request, error: Exception) -> JSONResponse:

@@ -52,11 +52,13 @@ def _as_served(value: object, of_shipped: ValidatorFunctionWrapHandler, about: V
     """Read the settings of a defence that ships, or of another one that is served: these are the context."""
     if isinstance(value, DefenseSettings):
         return value
-    kinds: Kinds = about.context or {}
-    kind = value.get("kind") if isinstance(value, dict) else None
-    if isinstance(kind, str) and kind in kinds and kind not in shipped():
-        return kinds[kind].model_validate(value)
-    return of_shipped(value)
+    if not isinstance(value, dict):
+        return of_shipped(value)
+    kinds: Kinds = about.context or shipped()
+    kind = value.get("kind")
+    if not isinstance(kind, str) or kind not in kinds:
+        raise ValueError(f"kind must be one of {', '.join(kinds)}")
+    return of_shipped(value) if kind in shipped() else kinds[kind].model_validate(value)
 
 
 if TYPE_CHECKING:

@@ -12,6 +12,7 @@ from robosac.budget import DomainError
 from robosac.defenses.group_testing import Calibration
 from robosac.defenses.protocol import Defense
 from robosac.defenses.settings import DefenseSettings
+from robosac.faults import in_words
 from robosac.plugins import Kind
 
 Kinds = Mapping[str, type[DefenseSettings]]
@@ -93,8 +94,7 @@ def read_settings(settings: Mapping[str, Any], kinds: Kinds | None = None) -> De
         return model.model_validate(settings)
     except ValidationError as error:
         first = error.errors(include_url=False)[0]
-        told = first["msg"].removeprefix("Value error, ")
-        raise DomainError(": ".join([str(kind), *map(str, first["loc"]), told])) from error
+        raise DomainError(": ".join([str(kind), *map(str, first["loc"]), in_words(first)])) from error
 
 
 def build(

@@ -202,6 +202,17 @@ async def test_bad_json_is_told_where(served, body, status, slug, field):
     assert problem(refused, status, slug).get("field") == field
 
 
+async def test_what_is_wrong_is_told_in_plain_words(served):
+    body = {"ego": "a", "teammates": []}
+    missing = problem(await served.http.post("/v1/sessions", json=body), 422, "invalid-request")
+    assert (missing["field"], missing["detail"]) == ("ego_id", "is missing")
+    unknown = problem(await served.http.post("/v1/sessions", json={"ego_id": "a", **body}), 422, "invalid-request")
+    assert (unknown["field"], unknown["detail"]) == ("ego", "there is no such field")
+    assert problem(await served.http.get("/v1/session"), 404, "not-found")["detail"] == "there is nothing at this path"
+    told = problem(await served.http.put("/v1/sessions"), 405, "method-not-allowed")["detail"]
+    assert told == "this path does not take this method"
+
+
 async def test_the_description_says_what_to_send(served):
     paths = (await served.http.get("/openapi.json")).json()["paths"]
     for path, name in (("/v1/sessions", "ego_id"), ("/v1/sessions/{sid}/teammates", "teammates")):

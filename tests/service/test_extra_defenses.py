@@ -64,6 +64,15 @@ async def test_its_settings_are_checked_like_those_of_one_that_ships(defense, fi
         assert problem(answer, 422, "invalid-request")["field"] == field
 
 
+async def test_whoever_names_no_kind_is_told_all_that_are_served():
+    async with serve(**EXTRA) as served:
+        for defense in ({"kind": "unwary"}, {"kind": None}, {}):
+            request = {"ego_id": "a", "teammates": ["b"], "defense": defense}
+            told = problem(await served.http.post("/v1/sessions", json=request), 422, "invalid-request")["detail"]
+            assert told.startswith("kind must be one of a2cp, ")
+            assert told.endswith(", wary")
+
+
 async def test_what_is_not_listed_is_not_served(served):
     request = {"ego_id": "a", "teammates": ["b"], "defense": {"kind": "wary"}}
     assert problem(await served.http.post("/v1/sessions", json=request), 422, "invalid-request")["field"] == "defense"

@@ -100,7 +100,7 @@ def test_a_defence_is_built_from_json(settings, defense):
     [
         ({}, "no defence of kind None; known: a2cp, "),
         ({"kind": "nonesuch"}, "no defence of kind 'nonesuch'"),
-        ({"kind": "none", "ratios": [0.5]}, "none: .*ratios"),
+        ({"kind": "none", "ratios": [0.5]}, "none: ratios: there is no such field"),
         ({"kind": "sample_consensus", "reference": "next"}, "sample_consensus: reference: .*'ego' or 'previous'"),
         ({"kind": "sample_consensus", "attacker_ratio": 2}, "sample_consensus: attacker_ratio: .*less than 1"),
         ({"kind": "a2cp", "ratios": 3}, "a2cp: ratios: .*tuple"),
