@@ -5,6 +5,7 @@ A fault inside does not fail a frame, so a caller's mistake would be answered as
 
 from __future__ import annotations
 
+import operator
 from collections.abc import Collection, Iterable, Mapping
 
 import numpy as np
@@ -24,15 +25,31 @@ def check_session(team: object, defense: object, rng: object, screening: object)
     ------
     TypeError, ValueError
     """
-    if not isinstance(team, Collection):
-        raise TypeError(f"team must be a sequence of ids, got {team!r}")
-    check_ids("team", team)
+    check_team(team)
     if defense is not None:
         check_defense(defense)
     if rng is not None:
         check_rng(rng)
     if not isinstance(screening, Screening | None) and screening != "calibrated":
         raise TypeError(f'screening must be a Screening, None or "calibrated", got {screening!r}')
+
+
+def check_team(team: object) -> None:
+    """`TypeError` or `DomainError` for what is no team: one text would be a team of its letters."""
+    if isinstance(team, str) or not isinstance(team, Collection):
+        raise TypeError(f"team must be a sequence of ids, got {team!r}")
+    check_ids("team", team)
+
+
+def checked_number(frame: object) -> int:
+    """A frame's number as a plain integer, which JSON can hold; `TypeError` for what is none.
+
+    It is remembered, so anything else would cost the answers of later frames too.
+    """
+    try:
+        return operator.index(frame)  # type: ignore[arg-type]
+    except TypeError:
+        raise TypeError(f"frame must be an integer, got {frame!r}") from None
 
 
 def check_ids(field: str, names: Iterable[object]) -> None:

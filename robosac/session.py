@@ -8,7 +8,7 @@ from typing import Any, Literal
 import numpy as np
 
 from robosac.ahead import Ahead
-from robosac.arguments import check_frame, check_ids, check_rng, check_session
+from robosac.arguments import check_frame, check_rng, check_session, check_team, checked_number
 from robosac.calibrated import calibration_of, screening_for
 from robosac.deadline import Deadline
 from robosac.defenses import Defense, DefenseSettings, SampleConsensus, State, build
@@ -44,7 +44,7 @@ def changed_team(defense: Defense, state: State, team: Sequence[str]) -> State:
     robosac.budget.DomainError
         If the defence's settings make no sense for it, or an id cannot be one.
     """
-    check_ids("team", team)
+    check_team(team)
     alone, memory = separated(state)
     return joined(defense.change_team(alone, list(team)), memory)
 
@@ -143,7 +143,7 @@ class Session:
         Raises
         ------
         TypeError, ValueError
-            If a message is none, or not of the detector's layout.
+            If the frame is no integer, or a message is none or not of the detector's layout.
         """
         result = self.decide(frame, ego, teammates, self._rng, deadline, detector)
         self.remember(result)
@@ -174,6 +174,7 @@ class Session:
         detector: Preparer | None = None,
     ) -> Steps[FusionResult]:
         """Decide as `decide` does, but pause before each pass, so that the work of others can take turns with it."""
+        frame = checked_number(frame)
         check_rng(rng)
         check_frame((detector or self.detector).info, ego, teammates)
         deadline = deadline or Deadline()

@@ -1,5 +1,6 @@
 """Mistakes of a caller are told by the argument's name, and not answered as faults."""
 
+import json
 from dataclasses import replace
 
 import numpy as np
@@ -62,9 +63,20 @@ def test_a_message_may_be_frozen_spaced_or_of_wider_numbers(detector, ego_messag
         assert (result.accepted, result.boxes.tolist()) == (wanted.accepted, wanted.boxes.tolist())
 
 
+def test_a_frame_that_is_no_integer_is_refused_and_spoils_no_later_one(detector, ego_message, benign):
+    session = robosac.Session(detector, list(benign), rng=np.random.default_rng(0))
+    for wrong in ("0", None, 0.0, [0]):
+        with pytest.raises(TypeError, match="frame must be an integer"):
+            session.answer(wrong, ego_message, benign)
+    for number in np.arange(2):
+        assert session.answer(number, ego_message, benign).fault is None
+    json.dumps(session.save())
+
+
 def test_a_session_names_what_it_cannot_be_made_of():
     for wrong, kind, told in (
         ({"team": None}, TypeError, "team must be a sequence of ids"),
+        ({"team": "car-2"}, TypeError, "team must be a sequence of ids, got 'car-2'"),
         ({"team": ["a", "b", "a"]}, ValueError, "team: id 2 is there twice"),
         ({"defense": "none"}, TypeError, "defense must be a defence, and str lacks"),
         ({"rng": 7}, TypeError, r"rng must be a numpy.random.Generator"),

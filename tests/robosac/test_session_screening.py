@@ -31,7 +31,7 @@ def frames(count, frozen=("c",), seed=0):
 
 def test_a_teammate_that_repeats_itself_is_rejected_and_the_defence_never_meets_it():
     detector = FakeDetector()
-    session = Session(detector, "abc", Undefended())
+    session = Session(detector, [*"abc"], Undefended())
     answers = [session.answer(i, *messages) for i, messages in enumerate(frames(4))]
     assert answers[0].accepted == ("a", "b", "c")
     for frame, result in enumerate(answers[1:], 1):
@@ -45,7 +45,7 @@ def test_a_teammate_that_repeats_itself_is_rejected_and_the_defence_never_meets_
 
 
 def test_a_session_without_the_tests_takes_all_and_remembers_nothing_of_messages():
-    session = Session(FakeDetector(), "abc", Undefended(), screening=None)
+    session = Session(FakeDetector(), [*"abc"], Undefended(), screening=None)
     for i, messages in enumerate(frames(3)):
         assert session.answer(i, *messages).accepted == ("a", "b", "c")
     assert MEMORY not in session.state
@@ -59,7 +59,7 @@ def test_what_the_tests_remember_is_saved_and_hidden_from_the_defence():
 
     saved, refused = None, []
     for i, messages in enumerate(frames(4)):
-        session = Session(FakeDetector(), "abc", Watching(), saved)
+        session = Session(FakeDetector(), [*"abc"], Watching(), saved)
         result = session.answer(i, *messages)
         assert result.fault is None
         refused.append("c" in result.rejected and result.rejected["c"].reason is Reason.REPEATED)
@@ -69,19 +69,19 @@ def test_what_the_tests_remember_is_saved_and_hidden_from_the_defence():
 
 
 def test_a_change_of_the_team_forgets_nothing_that_was_sent():
-    session = Session(FakeDetector(), "abc", StaticTeam())
+    session = Session(FakeDetector(), [*"abc"], StaticTeam())
     sent = list(frames(2))
     session.answer(0, *sent[0])
-    session.change_team("bc")
+    session.change_team([*"bc"])
     ego, others = sent[1]
     result = session.answer(1, ego, {name: others[name] for name in "bc"})
     assert result.rejected["c"].reason is Reason.REPEATED
-    assert changed_team(session.defense, {"trusted": ["b"], "frames_since_check": 0}, "b").keys().isdisjoint({MEMORY})
+    assert changed_team(session.defense, {"trusted": ["b"], "frames_since_check": 0}, ["b"]).keys().isdisjoint({MEMORY})
 
 
 def test_what_was_sent_counts_even_where_the_fusion_failed(caplog):
     detector = FakeDetector()
-    session = Session(detector, "abc", Undefended())
+    session = Session(detector, [*"abc"], Undefended())
     sent = list(frames(2))
     detector.broken = "detect"
     with caplog.at_level(logging.CRITICAL):
@@ -91,7 +91,7 @@ def test_what_was_sent_counts_even_where_the_fusion_failed(caplog):
 
 
 def test_who_is_refused_is_rejected_for_it_also_where_the_fusion_fails(caplog):
-    session = Session(FakeDetector(broken="detect"), "abc", Undefended())
+    session = Session(FakeDetector(broken="detect"), [*"abc"], Undefended())
     with caplog.at_level(logging.CRITICAL):
         results = [session.answer(i, *messages) for i, messages in enumerate(frames(2))]
     reasons = {name: why.reason for name, why in results[1].rejected.items()}
@@ -99,7 +99,7 @@ def test_who_is_refused_is_rejected_for_it_also_where_the_fusion_fails(caplog):
 
 
 def test_a_copy_of_the_egos_map_is_answered_with_the_egos_id():
-    session = Session(FakeDetector(), "abc", Undefended())
+    session = Session(FakeDetector(), [*"abc"], Undefended())
     ego, others = next(frames(1))
     result = session.answer(0, ego, {**others, "b": Message(others["b"].pose, ego.tensors)})
     answer = result.answer(0, {}, {}, "car-1")
@@ -108,7 +108,7 @@ def test_a_copy_of_the_egos_map_is_answered_with_the_egos_id():
 
 
 def test_an_implausible_message_is_refused_where_bounds_are_known():
-    session = Session(FakeDetector(), "abc", Undefended(), screening=Screening({"features": Bounds(3.0, 1.0, 0.99)}))
+    session = Session(FakeDetector(), [*"abc"], Undefended(), screening=Screening({"features": Bounds(3.0, 1.0, 0.99)}))
     ego, others = next(frames(1))
     loud = Message(others["a"].pose, {"features": others["a"].tensors["features"] * np.float16(4)})
     result = session.answer(0, ego, {**others, "a": loud})

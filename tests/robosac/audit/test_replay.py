@@ -236,7 +236,7 @@ def test_a_log_names_no_code_to_run_and_says_nothing_to_the_terminal(got, tmp_pa
         (["verify", "nonesuch"], "No such file"),
         (["verify", "log", "--head", "12"], "64 hexadecimal digits"),
         (["replay", "log", "--messages", "nonesuch"], "No such file"),
-        (["replay", "log", "--messages", "log"], "not a msgpack value"),
+        (["replay", "log", "--messages", "log"], "is no msgpack"),
         (["replay", "log", "--messages", "body", "--frame", "7"], "no answer to frame 7"),
         (["replay", "log", "--messages", "body", "--frame", "1"], "of frame 2, not 1"),
         (["replay", "log", "--messages", "body", "--detector", "nonesuch"], "no detector 'nonesuch'"),
