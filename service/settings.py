@@ -115,7 +115,7 @@ class Settings(BaseSettings):
     )
     max_teammates: int = Field(63, ge=1, le=1024, description="Teammates of one session.")
     max_pending_frames: int = Field(
-        4, ge=1, le=10_000, description="Frames after the next for which a teammate's message is kept."
+        4, ge=1, le=10_000, description="Messages of a teammate that may wait beside that for the next frame."
     )
     max_pending_bytes: int = Field(
         2**30, ge=2**20, le=2**50, description="Tensors of all teammates' messages that wait; beyond, more are refused."
