@@ -67,7 +67,8 @@ def frame(  # the options of a command line
     with blaming("--out", OSError, ValueError):  # matplotlib names the formats it knows
         draw_frame(shown, out, f"{sequence.title}; frame {number}, {settings.kind}")
     tests = len(shown.result.hypotheses)
-    typer.echo(f"{out}: {len(shown.found)} boxes answered after {tests} tests, {_named(shown)}")
+    many = "1 test" if tests == 1 else f"{tests} tests"
+    typer.echo(f"{out}: {len(shown.found)} boxes answered after {many}, {_named(shown)}")
 
 
 @app.command("film")
