@@ -220,12 +220,9 @@ def _share(parts: Mapping[Any, bytes]) -> int:
 
 def _members(body: bytes) -> dict[Any, bytes]:
     """The members of a map, still packed; what is wrong inside them is not looked at. A name is no array and no map."""
+    # arrays and maps are bounded among the names alone: what is skipped is not built
     walker = msgpack.Unpacker(
-        strict_map_key=False,
-        max_buffer_size=len(body),
-        max_str_len=MAX_STRING,
-        max_array_len=0,  # these bound the names alone: what is skipped is not built
-        max_map_len=0,
+        strict_map_key=False, max_buffer_size=len(body), max_str_len=MAX_STRING, max_array_len=0, max_map_len=0
     )
     walker.feed(body)
     size = walker.read_map_header()
