@@ -63,14 +63,14 @@ async def test_state_and_end(served, good_frame):
 @pytest.mark.parametrize(
     ("request_", "field", "hint"),
     [
-        ({}, "ego_id", "required"),
-        ({"ego_id": "a"}, "teammates", "required"),
+        ({}, "ego_id", "is missing"),
+        ({"ego_id": "a"}, "teammates", "is missing"),
         ({"ego_id": "a b", "teammates": []}, "ego_id", "pattern"),
         ({"ego_id": "../etc", "teammates": []}, "ego_id", "pattern"),
         ({"ego_id": "a\n", "teammates": []}, "ego_id", "pattern"),
         ({"ego_id": "a", "teammates": ["b", "b"]}, "teammates", "distinct"),
         ({"ego_id": "a", "teammates": ["b", "a"]}, "teammates", "own teammate"),
-        ({"ego_id": "a", "teammates": ["b"], "surprise": 1}, "surprise", "not permitted"),
+        ({"ego_id": "a", "teammates": ["b"], "surprise": 1}, "surprise", "no such field"),
         ({"ego_id": "a", "teammates": ["b"], "latency_budget_ms": 0}, "latency_budget_ms", "greater than 0"),
         ({"ego_id": "a", "teammates": ["b"], "latency_budget_ms": 50, "gather_ms": 51}, "gather_ms", "50 ms"),
         ({"ego_id": "a", "teammates": ["b"], "detector": "nonesuch"}, "detector", "intersection-mean"),

@@ -246,7 +246,7 @@ def test_the_command(tmp_path):
     assert f"`robosac compare --out DIR {given}`: 1 test sequences of 6 frames at 5 Hz, car-1 the ego" in text
     unknown = CliRunner().invoke(app, ["compare", "--only", "nonesuch", "--out", str(tmp_path)])
     assert unknown.exit_code == 2
-    assert "known: no defence" in unknown.output
+    assert "known: 'no defence'" in unknown.output
 
 
 def test_the_command_with_all_its_options(tmp_path):
