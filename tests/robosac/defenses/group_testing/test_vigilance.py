@@ -35,6 +35,10 @@ def test_what_is_always_off_is_usual_and_a_rise_is_not():
     assert True in alarms(vigilance, *[0.4] * 4)
 
 
+def test_a_rise_as_small_as_honest_frames_show_never_adds_up():
+    assert not any(alarms(Vigilance(), *[0.0] * USUAL_FRAMES, *[0.06] * 40))
+
+
 def test_after_an_alarm_all_is_learned_anew():
     vigilance = Vigilance()
     told = alarms(vigilance, *[0.0] * 10, *[0.4] * 30)
