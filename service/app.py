@@ -187,7 +187,7 @@ async def _running(gateway: Gateway, settings: Settings, tokens: Tokens, tracing
             blamed_on("ROBOSAC_EXTRA_DETECTORS", engine.start()),
         )
         gateway.recorder.start()
-        for reads in (tokens.start, gateway.keys.start):
+        for reads in (tokens.start, gateway.keys.start, gateway.sessions.quota.look):
             await blamed_on("ROBOSAC_DATABASE_URL", reads(store))
         gateway.metrics.sessions.set(await blamed_on("ROBOSAC_DATABASE_URL", store.count()))
         if settings.detector not in engine.detectors:

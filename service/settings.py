@@ -150,6 +150,12 @@ class Settings(BaseSettings):
         le=10**12,
         description="Records of one session's log; beyond, its frames are refused. One has about 2 kB.",
     )
+    audit_max_bytes_per_key: int = Field(
+        2**38,
+        ge=2**20,
+        le=2**60,
+        description="Logs of all sessions of one API key, ended ones too; beyond, it opens none and nobody joins.",
+    )
     audit_full_every: int = Field(
         200, ge=1, le=100_000, description="Frames from one audit record with the whole state to the next."
     )

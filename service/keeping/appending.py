@@ -15,6 +15,8 @@ from service.keeping.record import SessionRecord
 from service.keeping.rows import CHANGE, GET_BUT_STATE, GET_TO_CHANGE, columns, read_row
 from service.keeping.tables import audit_lines
 
+GROWTH = ("audit_seq", "audit_head", "kept_bytes")
+"""Fields that change with every line."""
 Change = Callable[[SessionRecord], Mapping[str, Any]]
 """Of a session as it is, the fields that change."""
 
@@ -50,9 +52,10 @@ def append(  # a transaction's work, and what was made ready for it
         **changes,
         audit_seq=record.audit_seq + 1,
         audit_head=digest(line),
+        kept_bytes=record.kept_bytes + len(line.encode()),
         revision=record.revision + bool(changes),
     )
-    changed = columns(after, *changes, "audit_seq", "audit_head", "revision", state=state)
+    changed = columns(after, *changes, *GROWTH, "revision", state=state)
     connection.execute(CHANGE.values(changed), {"this": session_id})
     connection.execute(insert(audit_lines), line_row(session_id, after.audit_seq, line))
     return after

@@ -49,6 +49,8 @@ class SessionRecord:
     """Which API key opened it (`service.sessions.identity.ApiKeys.check`); empty where none was asked for."""
     holder: str = ""
     """Name of the process that the ego asked last (`service.sessions.moving.Moving`); empty if that is not known."""
+    kept_bytes: int = 0
+    """Of its log, and of the messages that are kept with it once it has ended."""
     revision: int = 0
     """Changes to the session so far, other than to its log."""
 

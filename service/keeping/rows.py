@@ -7,10 +7,10 @@ import time
 from dataclasses import fields
 from typing import Any
 
-from sqlalchemy import Row, bindparam, false, select, update
+from sqlalchemy import Row, bindparam, false, func, select, update
 
 from service.keeping.record import SessionRecord
-from service.keeping.tables import sessions
+from service.keeping.tables import kept_messages, sessions
 
 _JSON = frozenset({"teammates", "defense", "token_ids", "public_keys", "state"})
 FIELDS = tuple(field.name for field in fields(SessionRecord))
@@ -26,6 +26,11 @@ TOUCH = (
     .where(THIS, OPEN, sessions.c.touched_at < bindparam("used_at"))
     .values(touched_at=bindparam("used_at"))
 )
+_MESSAGES = select(func.coalesce(func.sum(func.length(kept_messages.c.body)), 0)).where(
+    kept_messages.c.session_id == bindparam("this")
+)
+ADD_MESSAGES = CHANGE.values(kept_bytes=sessions.c.kept_bytes + _MESSAGES.scalar_subquery())
+"""Of an ended session: no message is forgotten any more before its log is."""
 NO_CHANGE = update(sessions).where(false()).values(ended_at=None)
 """A database that takes no changes refuses it all the same; PostgreSQL is asked nothing before the first statement."""
 

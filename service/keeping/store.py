@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from collections import Counter
 from collections.abc import Callable, Collection, Mapping, Sequence
 from dataclasses import replace
 from typing import Any
@@ -11,13 +12,13 @@ from sqlalchemy import Connection, Delete, Select, Update, func, insert, select,
 from robosac.audit import FULL_EVERY, digest
 from robosac.audit.events import DetectorChanged, Event, FrameAnswered, SessionEnded, TeamChanged, TokenRenewed
 from service.errors import AuditFull, FrameDecided, SessionChanged, TokenReplaced
-from service.keeping import migrations, once, partitions, purging
+from service.keeping import migrations, once, partitions, purging, usage
 from service.keeping.appending import Change, append, check_revision, line_row, renewal
 from service.keeping.database import connect
 from service.keeping.limits import Limits
 from service.keeping.patience import Patience
 from service.keeping.record import SessionRecord
-from service.keeping.rows import FIELDS, GET, NO_CHANGE, OPEN, TOUCH, columns, read_row
+from service.keeping.rows import ADD_MESSAGES, FIELDS, GET, NO_CHANGE, OPEN, TOUCH, columns, read_row
 from service.keeping.sealing import Draft, Ready, Sealing, drafted, sealed
 from service.keeping.seen import Seen
 from service.keeping.tables import audit_lines, kept_messages, sessions
@@ -74,9 +75,10 @@ class Store:
         draft = Draft(lambda: sealed(event, record.session_id, 1, record.audit_head))
 
         def work(connection: Connection) -> SessionRecord:
-            kept = replace(record, audit_seq=1, audit_head=digest(draft.made))
+            line = draft.made
+            kept = replace(record, audit_seq=1, audit_head=digest(line), kept_bytes=len(line.encode()))
             connection.execute(insert(sessions), columns(kept, *FIELDS))
-            connection.execute(insert(audit_lines), line_row(kept.session_id, 1, draft.made))
+            connection.execute(insert(audit_lines), line_row(kept.session_id, 1, line))
             return kept
 
         return self._seen.remember(await self._database.write(work, draft.write))
@@ -159,8 +161,10 @@ class Store:
         self._sealing.follow(record.session_id, draft.made.following)
         return kept
 
-    async def change_team(self, record: SessionRecord, event: TeamChanged, token_ids: Mapping[str, str]) -> None:
-        """Keep a new team of a session, with its tokens and keys and the defence's state for it.
+    async def change_team(
+        self, record: SessionRecord, event: TeamChanged, token_ids: Mapping[str, str]
+    ) -> SessionRecord:
+        """Keep a new team of a session, with its tokens and keys and the defence's state for it; the session with it.
 
         Raises
         ------
@@ -173,7 +177,7 @@ class Store:
             kept = {"teammates": event.teammates, "public_keys": event.public_keys, "state": event.state}
             return {**kept, "token_ids": token_ids}
 
-        await self._append(record.session_id, event, change)
+        return await self._append(record.session_id, event, change)
 
     async def change_detector(self, record: SessionRecord, event: DetectorChanged) -> SessionRecord:
         """Let a session go on with other weights; the session with them.
@@ -231,7 +235,11 @@ class Store:
 
     async def end(self, session_id: str, event: SessionEnded) -> None:
         """End a session; its log stays until it is purged."""
-        await self._append(session_id, event, lambda _: {"ended_at": event.time})
+
+        def keep(connection: Connection) -> None:
+            connection.execute(ADD_MESSAGES, {"this": session_id})
+
+        await self._append(session_id, event, lambda _: {"ended_at": event.time}, keep)
 
     async def unused_since(self, moment: float) -> list[str]:
         """Open sessions to which nothing was added, and that were not touched, since then (Unix time)."""
@@ -250,6 +258,10 @@ class Store:
         of_key = () if key_id is None else (sessions.c.key_id == key_id,)
         query = select(func.count()).select_from(sessions).where(OPEN, *of_key)
         return await self._database.read(lambda connection: connection.execute(query).scalar_one())
+
+    async def kept_bytes(self) -> Counter[str]:
+        """Bytes that are kept of the sessions of each API key."""
+        return await self._database.read(usage.of_keys)
 
     async def ping(self) -> None:
         """Find out whether the database takes changes. It makes none, but after one that failed: a full disk would take

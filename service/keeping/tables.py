@@ -38,10 +38,13 @@ sessions = Table(
     Column("key_id", Text, nullable=False, server_default=""),
     Column("holder", Text, nullable=False, server_default=""),
     Column("touched_at", Double, nullable=False),  # Unix time of the last audit record, or of a later use
+    Column("kept_bytes", BigInteger, nullable=False, server_default="0"),
 )
 _open, _ended = sessions.c.ended_at.is_(None), sessions.c.ended_at.is_not(None)
 Index("sessions_open", sessions.c.touched_at, sqlite_where=_open, postgresql_where=_open)
 Index("sessions_ended", sessions.c.touched_at, sqlite_where=_ended, postgresql_where=_ended)
+_summed = sessions.c.key_id, sessions.c.kept_bytes, sessions.c.ended_at  # the last, or SQLite reads the rows as well
+Index("sessions_kept", *_summed, sqlite_where=_ended, postgresql_where=_ended)
 
 audit_lines = Table(
     "audit_lines",

@@ -54,6 +54,7 @@ class Opening:
         defense, state = await asyncio.to_thread(_defense, request, info)  # files are read the first time
         _check_hypotheses(defense, self.settings.max_hypotheses)
         budget_ms, gather_ms = self._times(request)
+        self.sessions.quota.check(key_id)
         already_open = await self._count_if_there_is_room(key_id)
         session_id = secrets.token_hex(16)
         vehicles = (request.ego_id, *request.teammates)
@@ -78,6 +79,7 @@ class Opening:
             calibration_digest=calibration_digest(info),
         )
         kept = await self.store.create(record, await asyncio.to_thread(_first_record, record, info))
+        self.sessions.quota.add(kept)
         self.sessions.begin(record)
         self.metrics.sessions.set(already_open + 1)
         team = {"ego_id": record.ego_id, "teammates": len(record.teammates)}

@@ -31,6 +31,7 @@ from service.sessions.journal import Journal
 from service.sessions.live import Caller, LiveSession
 from service.sessions.motion import Motion
 from service.sessions.moving import Moving
+from service.sessions.quota import LogQuota
 from service.sessions.room import Room
 from service.settings import Settings
 from service.watching.metrics import Metrics
@@ -68,6 +69,7 @@ class Sessions:
         self.backlog = Room(self.settings.max_pending_bytes, name="ROBOSAC_MAX_PENDING_BYTES")
         self.journal = Journal(self.store, self.metrics)
         self.moving = Moving(self.store)
+        self.quota = LogQuota(self.settings.audit_max_bytes_per_key)
 
     def begin(self, record: SessionRecord) -> None:
         """Let a session be used whose record is kept now."""
@@ -177,6 +179,7 @@ class Sessions:
                     if record is None or record.ended_at is not None or moved:
                         self._forget(session_id)
                 await self.store.purge(time.time() - self.settings.audit_retention_s)
+                await self.quota.look(self.store)
             except Exception:  # a sweep that fails must not be the last one
                 logger.exception("idle sessions could not be ended")
 

@@ -35,6 +35,7 @@ class Teams:
         async with caller.live.lock:
             record = await self.sessions.current(caller)
             caller.check_token(record)
+            self.sessions.quota.check(record.key_id)
             for name in newcomers:
                 if name == record.ego_id or name in record.teammates:
                     raise Refused(Kind.ALREADY_ENROLLED, f"{name} is in the session already", "teammates")
@@ -96,7 +97,8 @@ class Teams:
             public_keys=dict(keys),
             state=dict(state),
         )
-        await self.store.change_team(record, event, token_ids)
+        kept = await self.store.change_team(record, event, token_ids)
+        self.sessions.quota.add(kept, record)
         caller.live.follow(await self.sessions.current(caller))
 
 

@@ -10,6 +10,7 @@ import pytest
 from clients.client import GatewayClient
 from robosac import wire
 from robosac.detectors import EmbeddedDetector
+from service.schemas import SessionCreated
 from tests.service.conftest import EGO, TEAM, problem, serve
 from tests.service.many import MANY
 
@@ -223,6 +224,33 @@ async def test_a_key_has_only_so_many_sessions_and_another_has_its_own():
         refused = problem(await opened("a"), 503, "too-many-sessions")
         assert "ROBOSAC_MAX_SESSIONS_PER_KEY" in refused["detail"]
         assert (await opened("b")).status_code == 201
+
+
+async def test_a_key_keeps_only_so_much_whether_its_sessions_have_ended_or_not(messages, benign):
+    async with serve(api_keys="a" * 20 + "," + "b" * 20, audit_max_bytes_per_key=2**20) as served:
+        long_record = {"kind": "conformal", "calibration": [i / 7000 for i in range(7000)]}
+
+        async def opened(key, **more):
+            body = {"ego_id": EGO, "teammates": ["rsu"], **more}
+            return await served.http.post("/v1/sessions", json=body, headers={"Authorization": f"Bearer {key * 20}"})
+
+        going_on, ended = (await opened("a")).json(), 0
+        while (answer := await opened("a", defense=long_record)).status_code == 201:
+            assert ended < 100
+            mine = {"Authorization": f"Bearer {answer.json()['ego_token']}"}
+            await served.http.delete(f"/v1/sessions/{answer.json()['session_id']}", headers=mine)
+            ended += 1
+        assert "ROBOSAC_AUDIT_MAX_BYTES_PER_KEY" in problem(answer, 507, "audit-full")["detail"]
+        mine = {"Authorization": f"Bearer {going_on['ego_token']}"}
+        path = f"/v1/sessions/{going_on['session_id']}/teammates"
+        problem(await served.http.post(path, json={"teammates": ["car-9"]}, headers=mine), 507, "audit-full")
+        assert (await opened("b")).status_code == 201
+        ego = served.ego(SessionCreated.model_validate(going_on))
+        frame = await ego.post_frame(0, messages[EGO], {"rsu": benign["rsu"]})
+        assert frame.source == "consensus"
+        await served.gateway.store.purge(time.time() + 1)
+        await served.gateway.sessions.quota.look(served.gateway.store)
+        assert (await opened("a")).status_code == 201
 
 
 async def test_a_frame_number_does_not_leap(messages, benign):

@@ -6,7 +6,7 @@ from pathlib import Path
 
 from sqlalchemy import Connection, func, inspect, select, text
 
-HEAD = "0006"
+HEAD = "0007"
 """The latest step."""
 _LOCK = 0x0D5EAC
 """Number of the advisory lock that processes starting at once take in PostgreSQL, chosen at random."""

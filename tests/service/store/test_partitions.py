@@ -69,13 +69,15 @@ async def test_what_was_there_before_stays_and_the_log_goes_on(url):
         command.upgrade(config, "0005")
 
     await database.write(before)
-    await run(url, "ALTER TABLE audit_lines ADD COLUMN day bigint DEFAULT 0")  # for the code of today
+    later = {"audit_lines": "day", "sessions": "kept_bytes"}  # columns that the code of today writes
+    await run(url, *(f"ALTER TABLE {table} ADD COLUMN {name} bigint DEFAULT 0" for table, name in later.items()))
     store = Store(url)
     sid = await added(store)
     await store.log(sid, note())
     await store.close()
-    await run(url, "ALTER TABLE audit_lines DROP COLUMN day")
+    await run(url, *(f"ALTER TABLE {table} DROP COLUMN {name}" for table, name in later.items()))
     async with opened(url) as store:
+        assert await store.kept_bytes() == {"": 2 * 2048}
         await store.log(sid, note())
         assert len(await check_chain(store, sid)) == 3
     assert (await run(url, f"SELECT count(*) FROM {partitions.BEFORE}"))[0][0] == 2

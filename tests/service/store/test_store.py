@@ -36,7 +36,7 @@ async def test_a_session_comes_back_as_it_was_kept(store):
     kept = await store.get(record.session_id)
     (line,) = await check_chain(store, record.session_id)
     assert json.loads(line)["note"] == "first"
-    assert kept == dataclasses.replace(record, audit_seq=1, audit_head=kept.audit_head)
+    assert kept == dataclasses.replace(record, audit_seq=1, audit_head=kept.audit_head, kept_bytes=len(line))
     assert store.seen(record.session_id) == kept
     assert await store.count() == 1
 
@@ -282,6 +282,20 @@ async def test_a_log_is_read_in_pages_and_purged_in_short_transactions(store):
     await purging
     assert (await store.get(sid), await store.audit(sid, 0)) == (None, [])
     assert len(await store.audit(other, 0)) == 1
+
+
+async def test_it_is_known_what_is_kept_for_each_key(store):
+    open_one, ended, of_other = [await added(store, n, key_id=key) for n, key in enumerate("aab")]
+    await decided(store, open_one, 1)
+    for frame, messages in enumerate([b"m" * 1000, b"m" * 3000]):
+        seed, record = f"{frame:064x}", await store.get(ended)
+        await store.decide(record, a_decision(frame), seed, messages, keep_frames=1)
+    await store.end(ended, THE_END)
+    lines = {sid: sum(len(line.encode()) for line in await store.audit(sid, 0)) for sid in (open_one, ended, of_other)}
+    assert await store.kept_bytes() == {"a": lines[open_one] + lines[ended] + 3000, "b": lines[of_other]}
+    assert (await store.get(open_one)).kept_bytes == lines[open_one]
+    await store.purge(time.time() + 1)
+    assert await store.kept_bytes() == {"a": lines[open_one], "b": lines[of_other]}
 
 
 async def test_a_full_log_takes_only_the_end(url):
