@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import os
 from collections.abc import Awaitable, Callable, Sequence
 from pathlib import Path
 
@@ -67,5 +68,14 @@ class ReceiptBook:
         if before is None or receipt.seq > before.seq:
             self._latest[session_id] = receipt
         if self._file is not None:
-            with self._file.open("a") as kept:
-                kept.write(receipt.model_dump_json() + "\n")
+            _add_line(self._file, receipt.model_dump_json())
+
+
+def _add_line(file: Path, line: str) -> None:
+    """Add a line to a file whose last one may be torn, as by a process that was killed."""
+    with file.open("ab+") as kept:
+        torn = False
+        if kept.seek(0, os.SEEK_END):
+            kept.seek(-1, os.SEEK_END)
+            torn = kept.read() != b"\n"
+        kept.write(b"\n" * torn + line.encode() + b"\n")

@@ -10,6 +10,7 @@ MESSAGE_CHARS = 240
 """What is kept of an exception's message."""
 _LOOKED_AT_CHARS = 2048
 _UNKEPT = (
+    re.compile(r"(?<=with text )'.*", re.DOTALL),  # a value that SQLite cannot read
     re.compile(r"[A-Za-z0-9_-]{40,}"),  # keys, tokens, seeds and digests, whole or in part
     re.compile(r"\bb(['\"])(?:\\.|(?!\1)[^\\]){24,}+\1?"),  # tensors as bytes
     re.compile(r"(?:[-+]?\d[\w.+-]*+[\s,;\[\](){}]++){6,}"),  # and as numbers

@@ -205,7 +205,12 @@ _ON_RECORD = documented(507)
 _AUDIT_HEAD = {"Audit-Head": {"description": "SHA-256 of the log's last record.", "schema": {"type": "string"}}}
 DETECTORS: Answers = {200: _answer(DetectorList, "All detectors.")}
 KEYS: Answers = {200: _answer(GatewayKeyList, "All keys.")}
-OPENED: Answers = {**_OF_JSON, **_ON_RECORD, **documented(401), 201: _answer(SessionCreated, "The session and its tokens.")}
+OPENED: Answers = {
+    **_OF_JSON,
+    **_ON_RECORD,
+    **documented(401),
+    201: _answer(SessionCreated, "The session and its tokens."),
+}
 STATE: Answers = {**_OF_EGO, 200: _answer(SessionState, "The session now.")}
 ENDED: Answers = {**_PROVEN, 204: {"description": "It has ended.", "headers": _AUDIT_HEAD}}
 RENEWED: Answers = {**documented(401, 404, 429), **_ON_RECORD, 201: _answer(RenewedToken, "The fresh token.")}

@@ -5,6 +5,7 @@ from __future__ import annotations
 import difflib
 import os
 import re
+from collections import Counter
 from pathlib import Path
 from typing import Annotated, Literal
 
@@ -219,6 +220,10 @@ def settings_of_environment() -> Settings:
         If a value cannot be, or there is no setting of a name that begins with ``ROBOSAC_``.
     """
     wrong = [_misspelt(name) for name in sorted(os.environ) if not _is_known(name)]
+    written = Counter(name.upper() for name in os.environ if name.upper().startswith(PREFIX))
+    wrong += [
+        f"{name}: is set {times} times, in capital and small letters" for name, times in written.items() if times > 1
+    ]
     try:
         settings = Settings()
     except ValidationError as error:

@@ -148,7 +148,10 @@ def _fuse(
 ) -> FusionResult:
     logged, previous = decision.answer, decision.previous
     saved = {"state": state, "previous": None if previous is None else previous.as_json()}
-    session = Session(detector, decision.session.teammates, defense, saved, screening=_screening(decision))
+    try:
+        session = Session(detector, decision.session.teammates, defense, saved, screening=_screening(decision))
+    except DomainError as error:
+        raise ReplayError(f"the log's team makes no session: {error}") from error
     teammates = dict(messages)
     ego = teammates.pop(decision.session.ego_id)
     cut_short = logged.out_of_time or logged.unread

@@ -18,18 +18,19 @@ from collections.abc import Callable, Iterator
 from concurrent.futures import ThreadPoolExecutor
 from contextlib import contextmanager, suppress
 from functools import partial
+from pathlib import Path
 from typing import Any, Protocol, TypeVar
 
 from sqlalchemy import Connection, Engine, create_engine, event
 from sqlalchemy.engine import URL
 from sqlalchemy.exc import SQLAlchemyError
 from sqlalchemy.ext.asyncio import create_async_engine
-from sqlalchemy.pool import QueuePool
+from sqlalchemy.pool import NullPool, QueuePool
 
 from robosac.extras import need
 from robosac.faults import describe
 from service.errors import StoreUnavailable
-from service.keeping.limits import Limits
+from service.keeping.limits import UNBOUND, Limits
 from service.keeping.together import Piece, Work, do_each, prepare_each
 from service.keeping.urls import read_url
 
@@ -74,6 +75,9 @@ class Database(Protocol):
         from being done.
         """
 
+    async def prepare(self, work: Work[None]) -> None:
+        """As `write`, of what may take long, before anybody is served."""
+
     async def close(self) -> None:
         """Let go of files and connections."""
 
@@ -117,6 +121,10 @@ class Postgres(_Failing):
         import asyncpg  # noqa: PLC0415 (most gateways keep their sessions in SQLite and do without)
 
         self._failures = (asyncpg.PostgresError, asyncpg.InterfaceError)
+        patient = {"timeout": CONNECT_TIMEOUT_S, "server_settings": UNBOUND}
+        self._patient = partial(
+            create_async_engine, url, poolclass=NullPool, hide_parameters=True, connect_args=patient
+        )
         self._engine = create_async_engine(
             url,
             pool_size=limits.connections,
@@ -124,7 +132,7 @@ class Postgres(_Failing):
             pool_timeout=CONNECT_TIMEOUT_S,
             hide_parameters=True,
             connect_args={
-                "timeout": CONNECT_TIMEOUT_S,
+                **patient,
                 "command_timeout": max(COMMAND_TIMEOUT_S, 2 * limits.statement_s),
                 "server_settings": limits.of_server(),
             },
@@ -143,6 +151,15 @@ class Postgres(_Failing):
             async with self._engine.begin() as connection:
                 return await connection.run_sync(work)
 
+    async def prepare(self, work: Work[None]) -> None:
+        engine = self._patient()
+        try:
+            with self._changing(*self._failures):
+                async with engine.begin() as connection:
+                    await connection.run_sync(work)
+        finally:
+            await engine.dispose()
+
     async def close(self) -> None:
         await self._engine.dispose()
 
@@ -151,10 +168,11 @@ class Sqlite(_Failing):
     """One SQLite file in WAL mode, or a database in memory, which has a single connection."""
 
     def __init__(self, url: URL) -> None:
-        self._writer = _SqliteThreads(url, 1)
-        event.listen(self._writer.engine, "begin", _begin_immediate)
         in_memory = url.database in (None, "", ":memory:")
-        self._readers = None if in_memory else _SqliteThreads(url, READERS)
+        place = _Place(None if in_memory else Path(str(url.database)))
+        self._writer = _SqliteThreads(url, 1, place)
+        event.listen(self._writer.engine, "begin", _begin_immediate)
+        self._readers = None if in_memory else _SqliteThreads(url, READERS, place)
         self._waiting: list[tuple[Piece, asyncio.Future[Any]]] = []
         self._writing: asyncio.Task[None] | None = None
 
@@ -171,6 +189,9 @@ class Sqlite(_Failing):
             self._writing = asyncio.create_task(self._write_all())
         with self._changing():
             return await done
+
+    async def prepare(self, work: Work[None]) -> None:
+        await self.write(work)
 
     async def close(self) -> None:
         if self._writing is not None:
@@ -198,10 +219,37 @@ class Sqlite(_Failing):
         self._writing = None
 
 
+class _Place:
+    """Where a database's file is, if it has one. What is written to one that is not there any more is lost."""
+
+    def __init__(self, path: Path | None) -> None:
+        self._path = path
+        self._file: tuple[int, int] | None = None
+
+    def remember(self) -> None:
+        """The file is open."""
+        if self._file is None and self._path is not None:
+            self._file = self._found(self._path)
+
+    def check(self) -> None:
+        """Refuse to go on if the file that was opened is not in its place.
+
+        Raises
+        ------
+        FileNotFoundError
+        """
+        if self._file is not None and self._path is not None and self._file != self._found(self._path):
+            raise FileNotFoundError("the database's file was moved, and another one put in its place")
+
+    def _found(self, path: Path) -> tuple[int, int]:
+        status = path.stat()
+        return status.st_dev, status.st_ino
+
+
 class _SqliteThreads:
     """Connections to a SQLite database with as many threads to use them."""
 
-    def __init__(self, url: URL, number: int) -> None:
+    def __init__(self, url: URL, number: int, place: _Place) -> None:
         self.engine: Engine = create_engine(
             url.update_query_dict({"timeout": str(BUSY_TIMEOUT_S), **url.query}),
             poolclass=QueuePool,
@@ -212,6 +260,7 @@ class _SqliteThreads:
         )
         event.listen(self.engine, "do_connect", _create_for_us_alone)
         event.listen(self.engine, "connect", _prepare)
+        self._place = place
         self._threads = ThreadPoolExecutor(number, "sqlite")
 
     async def run(self, work: Work[T], first: Callable[[], object] = _nothing) -> T:
@@ -225,7 +274,9 @@ class _SqliteThreads:
 
     def _run(self, work: Work[T], first: Callable[[], object]) -> T:
         first()
+        self._place.check()
         with self.engine.begin() as connection:
+            self._place.remember()
             return work(connection)
 
 

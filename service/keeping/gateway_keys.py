@@ -7,6 +7,7 @@ import binascii
 import contextlib
 import os
 import stat
+import tempfile
 from collections.abc import Sequence
 from pathlib import Path
 
@@ -39,12 +40,13 @@ class GatewayKeys:
         Raises
         ------
         ValueError
-            If the file holds something else, or others may read it.
+            If the file, or the store, holds something else, or others may read the file.
         """
         text = await store.secret("gateway-signing", _new) if self._file is None else _read(self._file)
-        self._keys = [_key(line) for line in text.splitlines() if line.strip()]
+        where = "the database's gateway-signing" if self._file is None else f"ROBOSAC_GATEWAY_KEY_FILE: {self._file}"
+        self._keys = [_key(line, where) for line in text.splitlines() if line.strip()]
         if not self._keys:
-            raise ValueError(f"ROBOSAC_GATEWAY_KEY_FILE: {self._file} holds no key")
+            raise ValueError(f"{where} holds no key")
         self._id = key_id(self._keys[0].public_key())
 
     def published(self) -> list[tuple[str, str, bool]]:
@@ -70,10 +72,8 @@ def _new() -> str:
 def _read(file: Path) -> str:
     """The text of a file of keys, which is made if it is not there; nobody else may read it."""
     try:
-        with contextlib.suppress(FileExistsError):
-            descriptor = os.open(file, os.O_CREAT | os.O_EXCL | os.O_WRONLY, 0o600)
-            with os.fdopen(descriptor, "w") as made:
-                made.write(_new() + "\n")
+        if not file.exists():
+            _make(file)
         if stat.S_IMODE(file.stat().st_mode) & 0o077:
             raise ValueError(f"ROBOSAC_GATEWAY_KEY_FILE: others may read {file}; take that right away (chmod 600)")
         return file.read_text()
@@ -81,8 +81,22 @@ def _read(file: Path) -> str:
         raise ValueError(f"ROBOSAC_GATEWAY_KEY_FILE: {file} cannot be read: {type(error).__name__}") from error
 
 
-def _key(line: str) -> Ed25519PrivateKey:
+def _make(file: Path) -> None:
+    """Make a file with a new key, at once and whole, unless somebody else has just done so."""
+    descriptor, name = tempfile.mkstemp(prefix=f".{file.name}.", dir=file.parent)  # nobody else may read it
+    try:
+        with os.fdopen(descriptor, "w") as made:
+            made.write(_new() + "\n")
+            made.flush()
+            os.fsync(made.fileno())
+        with contextlib.suppress(FileExistsError):
+            os.link(name, file)
+    finally:
+        Path(name).unlink()
+
+
+def _key(line: str, where: str) -> Ed25519PrivateKey:
     try:
         return Ed25519PrivateKey.from_private_bytes(base64.b64decode(line.strip(), validate=True))
     except (binascii.Error, ValueError) as error:
-        raise ValueError("ROBOSAC_GATEWAY_KEY_FILE: a line is no Ed25519 key, 32 bytes in base64") from error
+        raise ValueError(f"{where}: a line is no Ed25519 key, 32 bytes in base64") from error

@@ -4,6 +4,14 @@ from __future__ import annotations
 
 from dataclasses import dataclass
 
+UNBOUND = {
+    "application_name": "robosac",
+    "tcp_keepalives_idle": "5",
+    "tcp_keepalives_interval": "2",
+    "tcp_keepalives_count": "3",
+}
+"""Settings of a connection that may take as long as it needs to."""
+
 
 @dataclass(frozen=True)
 class Limits:
@@ -19,5 +27,4 @@ class Limits:
         """Settings of a connection."""
         milliseconds = str(round(self.statement_s * 1e3))
         bounds = {"statement_timeout": milliseconds, "idle_in_transaction_session_timeout": milliseconds}
-        alive = {"tcp_keepalives_idle": "5", "tcp_keepalives_interval": "2", "tcp_keepalives_count": "3"}
-        return {"application_name": "robosac", **bounds, **alive}
+        return {**UNBOUND, **bounds}

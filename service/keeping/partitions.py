@@ -51,16 +51,17 @@ def make_ahead(connection: Connection) -> None:
             connection.execute(text(f"CREATE TABLE {name} PARTITION OF audit_lines {values}"))
 
 
-def finished(connection: Connection, before: float) -> list[str]:
-    """Parts of days that ended before then (Unix time), in which no log has a line that can still be read."""
-    old = [name for name in connection.execute(_PARTS).scalars() if _day_of(name) < day(before)]
-    return [name for name in old if not connection.execute(_any_of(name)).first()]
+def old(connection: Connection, before: float) -> list[str]:
+    """Parts of days that ended before then (Unix time)."""
+    return [name for name in connection.execute(_PARTS).scalars() if _day_of(name) < day(before)]
 
 
-def drop(connection: Connection, name: str) -> None:
-    """Forget a part."""
-    _wait_briefly(connection)
-    connection.execute(text(f"DROP TABLE {name}"))
+def drop_if_finished(connection: Connection, name: str) -> None:
+    """Forget a part, if it is still there and no log has a line in it that can still be read."""
+    migrations.lock(connection)  # others may be about to do the same
+    if name in connection.execute(_PARTS).scalars().all() and not connection.execute(_any_of(name)).first():
+        _wait_briefly(connection)
+        connection.execute(text(f"DROP TABLE {name}"))
 
 
 def name_of(number: int) -> str:

@@ -9,6 +9,7 @@ from __future__ import annotations
 
 import time
 from collections.abc import Callable, Iterator, Sequence
+from functools import partial
 from typing import Any
 
 from sqlalchemy import Delete, Select, Update, delete, exists, select, update
@@ -29,21 +30,22 @@ async def purge(database: Database, moment: float, *forget: Callable[[str], None
 
     Each of ``forget`` is told of each. A log that is half gone is not shown any more.
     """
-    in_parts = await database.write(partitions.are_there) and moment < time.time() - partitions.DAY_S
+    has_parts = await database.write(partitions.are_there)
+    in_parts = has_parts and moment < time.time() - partitions.DAY_S
     await database.write(partitions.make_ahead)
     ended = select(sessions.c.session_id).where(ENDED, sessions.c.touched_at < moment)
     if in_parts:
         while some := await _ids(database, ended.where(sessions.c.token_ids != "{}").limit(SESSIONS_TOGETHER)):
             await _forget_together(database, some)
             _tell(forget, *some)
-        await _drop_parts(database, moment)
-        return
-    for session_id in await _ids(database, ended):
+    for session_id in () if in_parts else await _ids(database, ended):
         await _done(database, _locked([session_id]))
         _tell(forget, session_id)
         for part in parts(session_id):
             while await _done(database, part):
                 pass
+    if has_parts:
+        await _drop_parts(database, moment)
 
 
 def _tell(forget: Sequence[Callable[[str], None]], *session_ids: str) -> None:
@@ -62,8 +64,8 @@ async def _forget_together(database: Database, session_ids: Sequence[str]) -> No
 
 
 async def _drop_parts(database: Database, moment: float) -> None:
-    for name in await database.read(lambda connection: partitions.finished(connection, moment)):
-        await database.write(lambda connection, this=name: partitions.drop(connection, this))  # type: ignore[misc]
+    for name in await database.read(lambda connection: partitions.old(connection, moment)):
+        await database.write(partial(partitions.drop_if_finished, name=name))
     purged = sessions.c.token_ids == "{}"
     its_line = audit_lines.c.session_id == sessions.c.session_id
     pinned = select(sessions.c.session_id).where(

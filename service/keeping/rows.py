@@ -3,14 +3,18 @@
 from __future__ import annotations
 
 import json
+import logging
 import time
 from dataclasses import fields
 from typing import Any
 
 from sqlalchemy import Row, bindparam, false, func, select, update
 
+from service.errors import StoreUnavailable
 from service.keeping.record import SessionRecord
 from service.keeping.tables import kept_messages, sessions
+
+logger = logging.getLogger(__name__)
 
 _JSON = frozenset({"teammates", "defense", "token_ids", "public_keys", "state"})
 FIELDS = tuple(field.name for field in fields(SessionRecord))
@@ -36,8 +40,18 @@ NO_CHANGE = update(sessions).where(false()).values(ended_at=None)
 
 
 def read_row(row: Row[Any]) -> SessionRecord:
-    """The session of a row of `FIELDS`; without its state, where that is not in the row."""
-    values = {name: json.loads(value) if name in _JSON else value for name, value in row._mapping.items()}
+    """The session of a row of `FIELDS`; without its state, where that is not in the row.
+
+    Raises
+    ------
+    StoreUnavailable
+        If the row is damaged.
+    """
+    try:
+        values = {name: json.loads(value) if name in _JSON else value for name, value in row._mapping.items()}
+    except (ValueError, TypeError, RecursionError) as error:
+        logger.error("the database failed: the row of session %s is damaged", row.session_id)
+        raise StoreUnavailable from error
     return SessionRecord(**{**values, "teammates": tuple(values["teammates"])})
 
 

@@ -67,7 +67,7 @@ class Store:
 
     async def start(self) -> None:
         """Bring the database to this version's schema."""
-        await self._database.write(migrations.upgrade)
+        await self._database.prepare(migrations.upgrade)
         await self._database.write(partitions.make_ahead)
 
     async def create(self, record: SessionRecord, event: Event) -> SessionRecord:
@@ -268,6 +268,7 @@ class Store:
         what changes nothing.
         """
         if self._database.failed:
+            await self._database.write(partitions.make_ahead)
             await self._database.write(once.change)
         else:
             await self._execute(NO_CHANGE)

@@ -45,12 +45,18 @@ def read_url(text: str) -> URL:
         raise ValueError(f"the URL of a {kind} database may have no other option than {', '.join(_OPTIONS[kind])}")
     if kind == "sqlite" and "timeout" in url.query and not _is_timeout(url.query["timeout"]):
         raise ValueError(f"a SQLite database's timeout must be a number of seconds from 0 to {MOST_TIMEOUT_S:g}")
+    if not all(0 < port < 65_536 for port in (url.port, _number(url.query.get("port"))) if port is not None):
+        raise ValueError("a database's port must be a number from 1 to 65535")
     url = url.set(drivername=_DRIVERS[url.drivername])
     try:
         url.get_dialect()().create_connect_args(url)
     except (ArgumentError, ValueError, TypeError) as error:
         raise ValueError(f"not the URL of a {kind} database") from error
     return url
+
+
+def _number(value: object) -> int | None:
+    return int(value) if isinstance(value, str) and value.isdecimal() else None
 
 
 def _is_timeout(value: object) -> bool:

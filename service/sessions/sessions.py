@@ -5,7 +5,7 @@ from __future__ import annotations
 import asyncio
 import contextlib
 import time
-from collections.abc import AsyncIterator, Callable
+from collections.abc import AsyncIterator, Callable, Iterator
 from dataclasses import dataclass
 
 import structlog
@@ -133,7 +133,8 @@ class Sessions:
             await self.authenticate_ego(session_id, token)
         elif (vehicle := await self._holder(record, token)) != record.ego_id:
             raise _ego_only(vehicle)
-        return self._pages(session_id, after, min(record.audit_seq, after + limit))
+        pages = self._pages(session_id, after, min(record.audit_seq, after + limit))
+        return _begun(await anext(pages, ""), pages)  # what fails at once can still be told
 
     async def _pages(self, session_id: str, after: int, last: int) -> AsyncIterator[str]:
         while after < last:
@@ -166,22 +167,29 @@ class Sessions:
         return record.audit_head
 
     async def expire_idle(self) -> None:
-        """End, every so often and for ever, the sessions that nobody has used for too long, and purge old logs."""
+        """`sweep` every so often and for ever."""
         while True:
             await asyncio.sleep(self._idle.every_s)
-            try:
-                for session_id in await self._idle.unused():
-                    await self._end(session_id, "expired")
-                for session_id in [one for one in self._live if self._idle.may_be_over(one)]:
-                    record = await self.store.get(session_id)
-                    moved = record is not None and self.moving.is_elsewhere(record)
-                    moved = moved and self._idle.may_be_over(session_id)
-                    if record is None or record.ended_at is not None or moved:
-                        self._forget(session_id)
-                await self.store.purge(time.time() - self.settings.audit_retention_s)
-                await self.quota.look(self.store)
-            except Exception:  # a sweep that fails must not be the last one
-                logger.exception("idle sessions could not be ended")
+            await self.sweep()
+
+    async def sweep(self) -> None:
+        """Purge old logs, end the sessions that nobody has used for too long, and let go of those that are over here.
+
+        What fails for one session, or in one step, keeps nothing else from being done.
+        """
+        with _going_on("logs could not be purged"):  # first, as it makes room for the lines of a new day
+            await self.store.purge(time.time() - self.settings.audit_retention_s)
+        unused: list[str] = []
+        with _going_on("idle sessions could not be found"):
+            unused = await self._idle.unused()
+        for session_id in unused:
+            with _going_on("an idle session could not be ended", session_id=session_id):
+                await self._end(session_id, "expired")
+        for session_id in [one for one in self._live if self._idle.may_be_over(one)]:
+            with _going_on("it is unknown whether a session is over", session_id=session_id):
+                await self._forget_if_over(session_id)
+        with _going_on("it is unknown what is kept for whom"):
+            await self.quota.look(self.store)
 
     async def current(self, caller: Caller) -> SessionRecord:
         """The session as it is now; it may have moved on, or ended, since the caller was authenticated.
@@ -259,6 +267,13 @@ class Sessions:
             live.send_away()
             live.gathering.clear()
 
+    async def _forget_if_over(self, session_id: str) -> None:
+        """Let go of a session that has ended, or goes on elsewhere."""
+        record = await self.store.get(session_id)
+        moved = record is not None and self.moving.is_elsewhere(record) and self._idle.may_be_over(session_id)
+        if record is None or record.ended_at is not None or moved:
+            self._forget(session_id)
+
     async def _end(self, session_id: str, why: str) -> None:
         with contextlib.suppress(SessionOver):
             await self.store.end(session_id, SessionEnded(why=why))
@@ -287,6 +302,22 @@ class Sessions:
             live = self._live_session(record) if record.ended_at is None and self._is_served(record) else None
             await self.journal.stranger(record.session_id, live, refused)
             raise
+
+
+async def _begun(first: str, others: AsyncIterator[str]) -> AsyncIterator[str]:
+    if first:
+        yield first
+    async for page in others:
+        yield page
+
+
+@contextlib.contextmanager
+def _going_on(fault: str, **what: str) -> Iterator[None]:
+    """Log what is raised in the block, and go on after it."""
+    try:
+        yield
+    except Exception:
+        logger.exception(fault, **what)
 
 
 def _ego_only(vehicle_id: str) -> Refused:

@@ -31,6 +31,7 @@ def test_what_helps_is_kept(message):
         str(torch.linspace(0, 1, 50).reshape(2, 25)),
         repr(np.linspace(-1, 1, 9).tolist()),
         repr(np.linspace(0, 1, 50).astype("float16").tobytes()),
+        "Could not decode to UTF-8 column 'value' with text '+z4jy\ufffdxt7t/k/qLfA='",
     ],
 )
 def test_what_belongs_in_no_log_is_not(secret):

@@ -1,7 +1,9 @@
 """The gateway's promises about its logs: signed with its own key, checked and kept by clients."""
 
 import base64
+import errno
 import json
+import os
 
 import httpx
 import pytest
@@ -105,6 +107,38 @@ async def test_a_bad_key_file_is_refused(tmp_path, text, mode, why):
     file.chmod(mode)
     with pytest.raises(ValueError, match=why):
         await GatewayKeys(file).start(None)
+
+
+async def test_a_key_file_is_made_whole_or_not_at_all(tmp_path, monkeypatch):
+    file = tmp_path / "gateway.key"
+
+    def full(_):
+        raise OSError(errno.ENOSPC, "No space left on device")
+
+    with monkeypatch.context() as patched:
+        patched.setattr(os, "fsync", full)
+        with pytest.raises(ValueError, match="cannot be read"):
+            await GatewayKeys(file).start(None)
+    assert list(tmp_path.iterdir()) == []
+    keys = GatewayKeys(file)
+    with monkeypatch.context() as patched:  # another process makes it at the same time
+        patched.setattr(os, "fsync", lambda _: file.write_text(ANOTHER) and file.chmod(0o600))
+        await keys.start(None)
+    assert file.read_text() == ANOTHER
+    assert [path.name for path in tmp_path.iterdir()] == ["gateway.key"]
+
+
+async def test_a_torn_receipt_costs_no_other_one(messages, tmp_path):
+    async with serve() as served:
+        file = tmp_path / "receipts.jsonl"
+        client = GatewayClient("http://gateway", transport=served.client._http._transport, receipts=file)
+        session = await client.open_session(EGO, TEAM, gather_ms=20)
+        whole = file.read_bytes()
+        file.write_bytes(whole + whole[:40])
+        ego = client.vehicle(session.session_id, EGO, session.ego_token)
+        await ego.ask(0, messages[EGO])
+        kept = Receipts.read(file.read_bytes().splitlines(), by_id(await client.public_keys()))
+    assert (len(kept.doubts), sorted(kept.of(session.session_id))) == (1, [1, 2])
 
 
 async def test_answers_with_tokens_are_not_stored(served):

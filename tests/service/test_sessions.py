@@ -1,5 +1,6 @@
 import asyncio
 import json
+import sqlite3
 
 import pytest
 from sqlalchemy import delete
@@ -10,6 +11,7 @@ from robosac.audit.events import TokenRenewed
 from service.errors import SessionOver, StoreUnavailable
 from service.keeping.store import PAGE
 from service.keeping.tables import audit_lines
+from service.sessions.idle import Idle
 from tests.service.conftest import EGO, TEAM, problem, serve
 
 
@@ -177,6 +179,56 @@ async def test_idle_sessions_expire():
             await served.ego(busy).state()
         with pytest.raises(SessionNotFound):
             await served.ego(idle).state()
+
+
+async def test_a_session_that_cannot_be_ended_keeps_no_other_from_it_nor_logs_from_being_purged(monkeypatch):
+    async with serve(session_idle_s=1.0, audit_retention_s=0.01) as served:
+        store = served.gateway.store
+        over, *idle = [await served.open() for _ in range(3)]
+        await served.ego(over).close()
+        damaged, done, end = idle[0].session_id, [], store.end
+
+        async def ended(sid, event):
+            if sid == damaged:
+                raise StoreUnavailable
+            await end(sid, event)
+            done.append(sid)
+
+        async def fails(*_):
+            raise StoreUnavailable
+
+        monkeypatch.setattr(store, "end", ended)
+        monkeypatch.setattr(store, "kept_bytes", fails)
+        monkeypatch.setattr(Idle, "unused", lambda _: asyncio.sleep(0, [session.session_id for session in idle]))
+        await asyncio.sleep(0.02)
+        await served.gateway.sessions.sweep()
+        assert done == [idle[1].session_id]
+        assert await store.get(over.session_id) is None
+
+
+async def test_a_damaged_session_is_unavailable_and_no_fault_of_the_gateway(tmp_path, good_frame):
+    path = tmp_path / "robosac.db"
+    async with serve(database_url=f"sqlite:///{path}") as served:
+        damaged, whole = await served.open(), await served.open()
+        database = sqlite3.connect(path)
+        with database:
+            database.execute("UPDATE sessions SET defense = '{' WHERE session_id = ?", [damaged.session_id])
+        database.close()
+        bearer = {"Authorization": f"Bearer {damaged.ego_token}"}
+        answer = await served.http.get(f"/v1/sessions/{damaged.session_id}", headers=bearer)
+        problem(answer, 503, "store-unavailable")
+        await served.ego(whole).post_frame_body(good_frame(0))
+
+
+async def test_a_log_whose_first_page_cannot_be_read_is_a_problem_and_no_empty_log(served, monkeypatch):
+    session = await served.open()
+
+    async def fails(*_):
+        raise StoreUnavailable
+
+    monkeypatch.setattr(served.gateway.store, "audit", fails)
+    bearer = {"Authorization": f"Bearer {session.ego_token}"}
+    problem(await served.http.get(f"/v1/sessions/{session.session_id}/audit", headers=bearer), 503, "store-unavailable")
 
 
 async def test_a_session_that_could_not_be_ended_goes_on_with_the_messages_that_wait(served, messages, monkeypatch):

@@ -94,6 +94,12 @@ def test_a_misspelt_variable_is_named_with_the_nearest_right_one(variable, meant
     assert str(caught.value) == f"{variable}: there is no such setting" + (f"; do you mean {meant}?" if meant else "")
 
 
+def test_a_variable_in_capital_and_in_small_letters_is_one_and_set_twice(environment):
+    environment(robosac_max_sessions="3", ROBOSAC_MAX_SESSIONS="4")
+    with pytest.raises(SettingsError, match=r"^ROBOSAC_MAX_SESSIONS: is set 2 times"):
+        settings_of_environment()
+
+
 def test_all_that_is_wrong_is_told_at_once_and_no_value(environment):
     environment(
         ROBOSAC_TOKN=KEY, ROBOSAC_GATHER_MS="soon", ROBOSAC_TOKEN_TTL_S="inf", ROBOSAC_DATABASE_URL=f"x://{KEY}"

@@ -26,9 +26,6 @@ def upgrade(connection: Connection) -> None:
     revision = _revision(connection)
     if revision == HEAD:
         return
-    if connection.dialect.name == "postgresql":  # a step may rewrite what takes longer than a frame may wait
-        connection.execute(text("SET LOCAL statement_timeout = 0"))
-        connection.execute(text("SET LOCAL idle_in_transaction_session_timeout = 0"))
     from alembic import command  # noqa: PLC0415 - 0.2 s that most starts need not spend
     from alembic.config import Config  # noqa: PLC0415
     from alembic.util import CommandError  # noqa: PLC0415

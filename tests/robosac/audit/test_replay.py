@@ -192,6 +192,9 @@ def test_what_cannot_be_replayed_is_explained(got, detector):
     session = decision.session.model_copy(update={"defense": {"kind": "nonesuch"}})
     with pytest.raises(replay.ReplayError, match="no defence of kind 'nonesuch'"):
         replay.replay(dataclasses.replace(decision, session=session), got.bodies[2], detector)
+    twice = decision.session.model_copy(update={"teammates": decision.session.teammates * 2})
+    with pytest.raises(replay.ReplayError, match="the log's team makes no session"):
+        replay.replay(dataclasses.replace(decision, session=twice), got.bodies[2], detector)
 
 
 def test_the_commands_prove_a_decision(got, tmp_path):

@@ -3,6 +3,7 @@
 import asyncio
 import contextlib
 import os
+import shutil
 import sqlite3
 import subprocess
 import sys
@@ -22,10 +23,11 @@ from robosac import wire
 from service.errors import StoreUnavailable
 from service.keeping import migrations
 from service.keeping.database import _keep_a_journal, connect
+from service.keeping.limits import Limits
 from service.keeping.store import Store
 from service.keeping.tables import metadata
 from tests.service.conftest import problem, serve
-from tests.service.store.conftest import added, all_of, check_chain, note, opened
+from tests.service.store.conftest import added, all_of, check_chain, decided, note, opened
 
 INI = Path(migrations.__file__).parent / "alembic.ini"
 
@@ -167,6 +169,41 @@ async def test_a_new_file_behind_a_link_is_its_owners_too(tmp_path):
     async with opened(f"sqlite:///{tmp_path}/robosac.db") as store:
         await added(store)
         assert (tmp_path / "kept.db").stat().st_mode & 0o777 == 0o600
+
+
+@pytest.mark.parametrize("put_in_its_place", ["nothing", "a copy"])
+async def test_a_file_that_was_moved_takes_nothing(tmp_path, put_in_its_place):
+    path, elsewhere = tmp_path / "robosac.db", tmp_path / "elsewhere.db"
+    store = Store(f"sqlite:///{path}")
+    await store.start()
+    sid = await added(store)
+    path.rename(elsewhere)
+    if put_in_its_place == "a copy":
+        shutil.copy(elsewhere, path)
+    for refused in (decided(store, sid, 1), store.get(sid), store.ping(), store.ping()):
+        with pytest.raises(StoreUnavailable):
+            await refused
+    elsewhere.rename(path)
+    await decided(store, sid, 1)
+    await store.ping()
+    await store.close()
+
+
+async def test_a_start_waits_for_another_one_as_long_as_it_takes(postgres):
+    url, holding = await postgres.new_database(), asyncio.Event()
+    first, second = connect(url), Store(url, limits=Limits(statement_s=0.1))
+
+    def slow(connection):
+        migrations.lock(connection)
+        loop.call_soon_threadsafe(holding.set)
+        connection.execute(text("SELECT pg_sleep(1)"))
+
+    loop = asyncio.get_running_loop()
+    upgrading = asyncio.create_task(first.prepare(slow))
+    await holding.wait()
+    await second.start()
+    assert upgrading.done()
+    await all_of(upgrading, first.close(), second.close())
 
 
 async def test_a_database_that_is_not_there_is_unavailable(tmp_path):

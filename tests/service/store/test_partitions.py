@@ -1,5 +1,6 @@
 """The log in a part for each day, in PostgreSQL."""
 
+import asyncio
 import time
 
 import asyncpg
@@ -122,6 +123,36 @@ async def test_a_day_goes_as_a_whole_once_nobody_can_read_its_logs(url):
         assert [await store.get(sid) for sid in (ended, other, open_one)] == [None] * 3
         with pytest.raises(SessionOver):
             await store.log(other, note())
+
+
+async def test_parts_go_where_logs_are_kept_for_less_than_a_day(url):
+    now, old = time.time(), day() - 2
+    async with opened(url) as store:
+        sid = await added(store)
+        await store.end(sid, THE_END)
+        await written_on(url, sid, old)
+        await run(url, f"UPDATE sessions SET touched_at = {now - 2 * DAY_S}")
+        await store.purge(now - 3600)
+        assert await store.get(sid) is None
+        assert name_of(old) not in await parts(url)
+
+
+async def test_two_may_forget_the_same_days_at_once(url):
+    async with opened(url) as one, opened(url) as other:
+        for number in range(2, 6):
+            await written_on(url, "nobody", day() - number)
+        await asyncio.gather(*(store.purge(time.time() - DAY_S) for store in (one, other, one)))
+        assert name_of(day() - 2) not in await parts(url)
+
+
+async def test_readiness_makes_the_part_of_a_day_that_has_none(url):
+    async with opened(url) as store:
+        sid = await added(store)
+        await run(url, "DELETE FROM audit_lines", f"DROP TABLE {name_of(day())}")  # as after a leap of the clock
+        with pytest.raises(StoreUnavailable):
+            await store.log(sid, note())
+        await store.ping()
+        await store.log(sid, note())
 
 
 async def test_a_part_of_young_lines_is_kept_though_nobody_reads_it(url):
