@@ -8,7 +8,8 @@ A message is refused only on evidence that cannot be turned against somebody hon
 - its values are far beyond all that honest messages of the detector were seen to hold (``implausible``);
 - it is what its sender sent from another place, byte for byte or closer than two scans of one unchanged place ever are
   (``repeated``). A parked vehicle cannot fail that;
-- it is, byte for byte, what another vehicle had sent in an earlier frame, or the ego has sent (``copied``).
+- it is, byte for byte, what another vehicle had sent in an earlier frame in which this one sent something else, or the
+  ego has sent (``copied``). Whoever was silent then may have been overheard, and its message sent in its place.
 
 Two messages that are merely alike are told, and stay in. Nobody can know from the maps who copied. And the maps of an
 honest vehicle that drives on an empty road, between walls or in a platoon are as alike as .99.
@@ -118,13 +119,13 @@ class Screening:
             name: _Seen(frame, _at(told.get(name, ego)), one, text, pasts[name], before.get(name))
             for (name, one), text in zip(prints.items(), texts, strict=True)
         }
-        refused, earlier = {}, _earlier(seen)
+        silent = {name: past for name, past in memory.items() if name not in seen and recent(past, frame)}
+        refused, earlier = {}, _earlier({**pasts, **{name: Past.from_json(past) for name, past in silent.items()}})
         for name, one in seen.items():
             if name != EGO and (why := self._implausible(one) or _copied(name, seen, earlier) or self._repeated(one)):
                 often = one.past.refused + 1 >= NAMED_AFTER
                 refused[name] = replace(why, distrust=Distrust.NAMED) if often else why
         kept = {name: one.remembered(self, name in refused) for name, one in seen.items()}
-        silent = {name: past for name, past in memory.items() if name not in kept and recent(past, frame)}
         return Screened(refused, _alike(seen), {**silent, **kept})
 
     def _implausible(self, seen: _Seen) -> Rejection | None:
@@ -172,6 +173,10 @@ class _Seen:
         """The frame in which the vehicle sent this very message first."""
         return min((each.first for each in self.past.sent if each.digest == self.print.digest), default=self.frame)
 
+    def sent_in(self, frame: int) -> bool:
+        """Whether it is known that the vehicle sent something in a frame before."""
+        return any(frame in (each.first, each.last) for each in self.past.sent)
+
     def moved_from(self, place: Place) -> float:
         return math.dist(self.place, place)
 
@@ -198,11 +203,11 @@ class _Seen:
         return Anchor(self.frame, self.place, self.text)
 
 
-def _earlier(seen: Mapping[str, _Seen]) -> dict[str, list[tuple[str, int]]]:
+def _earlier(pasts: Mapping[str, Past]) -> dict[str, list[tuple[str, int]]]:
     """By digest, who sent a message, and since which frame."""
     found: dict[str, list[tuple[str, int]]] = {}
-    for name, one in seen.items():
-        for sent in one.past.sent:
+    for name, past in pasts.items():
+        for sent in past.sent:
             found.setdefault(sent.digest, []).append((name, sent.first))
     return found
 
@@ -216,7 +221,11 @@ def _copied(name: str, seen: Mapping[str, _Seen], earlier: Mapping[str, Sequence
         return Rejection(Reason.COPIED, {"of": EGO, "of_frame": one.frame})
     since = one.first_sent
     for other, first in earlier.get(one.print.digest, ()):
-        if other != name and first < since + (other == EGO):
+        if other == EGO:
+            is_later = first <= since
+        else:
+            is_later = other != name and first < since and one.sent_in(first)
+        if is_later:
             return Rejection(Reason.COPIED, {"of": other, "of_frame": first})
     return None
 

@@ -162,6 +162,30 @@ def test_what_another_had_sent_before_is_copied(draw):
     assert why(again) == {"b": (Reason.COPIED, {"of": "a", "of_frame": 0})}
 
 
+@pytest.mark.parametrize("silent_before", [True, False])
+def test_who_is_overheard_while_it_is_silent_is_not_accused_of_what_another_sent_in_its_place(draw, silent_before):
+    play, parked = Frames(draw), draw()
+    if not silent_before:
+        play(owner=at(0.0, draw()), thief=at(9.0, draw()))
+    play(thief=at(9.0, parked))
+    for _ in range(2 * KEPT_FRAMES):
+        assert play(owner=at(0.0, parked), thief=at(9.0, parked)).refused == {}
+
+
+def test_a_parked_vehicle_that_comes_back_is_not_accused_of_what_it_sent_itself(draw):
+    play, parked = Frames(draw), draw()
+    play(owner=at(0.0, parked), thief=at(9.0, draw()))
+    for _ in range(KEPT_FRAMES):
+        play(thief=at(9.0, parked))
+    assert "owner" not in play(owner=at(0.0, parked), thief=at(9.0, parked)).refused
+
+
+def test_what_was_sent_by_somebody_who_is_silent_now_is_copied_too(draw):
+    play, first = Frames(draw), draw()
+    play(owner=at(0.0, first), thief=at(9.0, draw()))
+    assert why(play(thief=at(9.0, first))) == {"thief": (Reason.COPIED, {"of": "owner", "of_frame": 0})}
+
+
 def test_the_same_map_in_the_same_frame_accuses_nobody(draw):
     play = Frames(draw)
     for frame in range(4):
