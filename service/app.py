@@ -151,7 +151,7 @@ def _built(
         limits=Limits(settings.database_connections, settings.database_statement_s),
     )
     keys = GatewayKeys(settings.gateway_key_file)
-    sessions = Sessions(settings, store, engine, metrics, tokens, keys, seeds)
+    sessions = Sessions(settings, store, engine, metrics, tokens, keys, len(api_keys) > 1, seeds)
     feed = Feed(store.audit, settings.max_viewers, frames_event)
     keeping = Keeping(sessions, store, settings.keep_frames)
     deciding = Deciding(sessions, keeping, engine, metrics, admission, tracing, feed)

@@ -46,6 +46,7 @@ class Kind(StrEnum):
     UNKNOWN_DETECTOR = "unknown-detector"
     TOO_MANY_TEAMMATES = "too-many-teammates"
     TOO_MANY_RENEWALS = "too-many-renewals"
+    TOO_MANY_CHANGES = "too-many-changes"
     TOO_MANY_PROOFS = "too-many-proofs"
     INTERNAL_ERROR = "internal-error"
     NOT_READY = "not-ready"

@@ -66,6 +66,7 @@ ANSWERS: Mapping[Kind, tuple[int, Mapping[str, str]]] = {
     Kind.UNKNOWN_DETECTOR: (422, {}),
     Kind.TOO_MANY_TEAMMATES: (422, {}),
     Kind.TOO_MANY_RENEWALS: (429, {"Retry-After": "1"}),
+    Kind.TOO_MANY_CHANGES: (429, {"Retry-After": "1"}),
     Kind.TOO_MANY_PROOFS: (429, {"Retry-After": "60"}),
     Kind.INTERNAL_ERROR: (500, {}),
     Kind.NOT_READY: (503, {"Retry-After": "5"}),

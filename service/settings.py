@@ -121,6 +121,9 @@ class Settings(BaseSettings):
     max_pending_bytes: int = Field(
         2**30, ge=2**20, le=2**50, description="Tensors of all teammates' messages that wait; beyond, more are refused."
     )
+    max_pending_bytes_per_key: int = Field(
+        2**29, ge=2**20, le=2**50, description="The same of the sessions of one API key, where there are several keys."
+    )
     max_speed_mps: float = Field(
         70.0, gt=0, le=1e6, description="A vehicle that moved faster from frame to frame is refused."
     )

@@ -221,11 +221,7 @@ def _copied(name: str, seen: Mapping[str, _Seen], earlier: Mapping[str, Sequence
         return Rejection(Reason.COPIED, {"of": EGO, "of_frame": one.frame})
     since = one.first_sent
     for other, first in earlier.get(one.print.digest, ()):
-        if other == EGO:
-            is_later = first <= since
-        else:
-            is_later = other != name and first < since and one.sent_in(first)
-        if is_later:
+        if (other == EGO and first <= since) or (other not in (EGO, name) and first < since and one.sent_in(first)):
             return Rejection(Reason.COPIED, {"of": other, "of_frame": first})
     return None
 

@@ -1,8 +1,9 @@
-"""Hangs up on viewers who have stopped to read."""
+"""Hangs up on whoever has stopped to read a stream."""
 
 from __future__ import annotations
 
 import asyncio
+import re
 
 import structlog
 from starlette.requests import ClientDisconnect
@@ -13,19 +14,21 @@ from service.arriving.paths import path_of
 logger = structlog.stdlib.get_logger(__name__)
 
 PATIENCE_S = 30.0
-"""How long the socket of a viewer may take nothing. Meanwhile `service.viewing.viewers` bounds what waits for it."""
-PATH = "/v1/live/"
+"""How long a socket may take nothing. Meanwhile `service.viewing.viewers` bounds what waits for a viewer's, and
+`service.sessions.sessions` what of a log.
+"""
+_STREAMED = re.compile(r"/v1/(live/|sessions/[^/]*/(audit|standby)$)")
 
 
 class HangingUp:
-    """Middleware that ends the stream of a viewer whose socket takes nothing for too long."""
+    """Middleware that ends a stream whose socket takes nothing for too long: of a viewer, or of a log."""
 
     def __init__(self, app: ASGIApp, patience_s: float = PATIENCE_S) -> None:
         self._app = app
         self._patience_s = patience_s
 
     async def __call__(self, scope: Scope, receive: Receive, send: Send) -> None:
-        if scope["type"] != "http" or not path_of(scope).startswith(PATH):
+        if scope["type"] != "http" or not _STREAMED.match(path_of(scope)):
             await self._app(scope, receive, send)
             return
         hung_up = False
@@ -37,11 +40,11 @@ class HangingUp:
                     await send(message)
             except TimeoutError:
                 hung_up = True
-                raise OSError("the viewer does not read") from None
+                raise OSError("whoever asked does not read") from None
 
         try:
             await self._app(scope, receive, patient)
         except (OSError, ClientDisconnect):  # which of them depends on the server's version of ASGI
             if not hung_up:
                 raise
-            logger.info("hung up on a viewer who does not read", path=scope["path"])
+            logger.info("hung up on somebody who does not read", path=scope["path"])

@@ -42,6 +42,13 @@ class Typical:
         self.value = sorted(self._latest)[(len(self._latest) - 1) // 2]
 
 
+class Needs:
+    """What the frames of a session need, seconds: on the detector's thread, and besides."""
+
+    def __init__(self, work_s: float, rest_s: float) -> None:
+        self.work, self.rest = Typical(work_s), Typical(rest_s)
+
+
 class Ordering(Protocol):
     """Who goes before whom, as `service.turns.Turns` has it."""
 
@@ -74,9 +81,8 @@ class Admission:
         self._turns = Turns() if turns is None else turns
         self._in_hand: set[Work] = set()
         self._waiting: Counter[str] = Counter()
-        self._store, self._rest = Typical(0.0), Typical(0.0)
-        self._frame = Typical(FIRST_GUESS_S)
-        self._of_session: OrderedDict[str, Typical] = OrderedDict()
+        self._store, self._frame = Typical(0.0), Typical(FIRST_GUESS_S)
+        self._of_session: OrderedDict[str, Needs] = OrderedDict()
 
     @property
     def busy(self) -> bool:
@@ -156,17 +162,22 @@ class Admission:
             Of that, what keeping its decision took.
         """
         self._frame.learn(worked_s)
-        self._rest.learn(rest_s)
         self._store.learn(store_s)
         if session_id not in self._of_session:
-            self._of_session[session_id] = Typical(self._frame.value)
-        self._of_session[session_id].learn(worked_s)
+            self._of_session[session_id] = self._needs(session_id)
+        needs = self._of_session[session_id]
+        needs.work.learn(worked_s)
+        needs.rest.learn(rest_s)
         self._of_session.move_to_end(session_id)
         if len(self._of_session) > SESSIONS_KNOWN:
             self._of_session.popitem(last=False)
 
+    def _needs(self, session_id: str) -> Needs:
+        """What a session's frames need; of one that is not known, what others need, but for how slowly they send."""
+        return self._of_session.get(session_id) or Needs(self._frame.value, self._store.value)
+
     def _cost(self, session_id: str) -> float:
-        return self._of_session.get(session_id, self._frame).value
+        return self._needs(session_id).work.value
 
     def _work(self, key: str, session_id: str, due: float) -> Work:
         return Work(key, session_id, due, self._cost(session_id))
@@ -184,7 +195,7 @@ class Admission:
                 end += work.left_s
                 if end <= work.due < end + new.expected_s and self._turns.lead(new, work) < MARGIN_S:
                     raise _overloaded("frames in hand would be answered late for it", end - time.perf_counter())
-        if others_s > max(0.0, SHARE * (left_s - new.expected_s - self._rest.value)):
+        if others_s > max(0.0, SHARE * (left_s - new.expected_s - self._needs(new.session_id).rest.value)):
             raise _overloaded("the gateway has more frames in hand than it can answer in time", others_s)
 
 

@@ -129,6 +129,8 @@ class _Write:
         """What the next frame is judged by."""
         asked, live = self.asked, self.asked.caller.live
         live.renewals.clear()
+        live.equivocations.clear()
+        live.team_changes = 0
         live.session.remember(self.result)
         live.answered, live.ego_proof = asked.frame, asked.ego.proof
         live.gathering.close(asked.frame)

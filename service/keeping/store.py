@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import asyncio
 from collections import Counter
 from collections.abc import Callable, Collection, Mapping, Sequence
 from dataclasses import replace
@@ -81,7 +82,8 @@ class Store:
             connection.execute(insert(audit_lines), line_row(kept.session_id, 1, line))
             return kept
 
-        return self._seen.remember(await self._database.write(work, draft.write))
+        await asyncio.to_thread(draft.write)
+        return self._seen.remember(await self._database.write(work))
 
     async def get(self, session_id: str) -> SessionRecord | None:
         """The session as the database has it, ended or not, or None."""
@@ -89,9 +91,9 @@ class Store:
             return None
         asked, before = {"this": session_id}, self._seen.get(session_id)
         row = await self._database.read(lambda connection: connection.execute(GET, asked).first())
-        if row is None:
+        if row is None or row.ended_at is not None:
             self._seen.forget(session_id)
-            return None
+            return None if row is None else read_row(row)
         if self._seen.get(session_id) is before:  # nothing was written meanwhile: the database is right
             self._seen.forget(session_id)
         return self._seen.remember(read_row(row))
@@ -240,6 +242,8 @@ class Store:
             connection.execute(ADD_MESSAGES, {"this": session_id})
 
         await self._append(session_id, event, lambda _: {"ended_at": event.time}, keep)
+        self._seen.forget(session_id)
+        self._sealing.forget(session_id)
 
     async def unused_since(self, moment: float) -> list[str]:
         """Open sessions to which nothing was added, and that were not touched, since then (Unix time)."""
@@ -300,8 +304,14 @@ class Store:
         keep: Callable[[Connection], None] = lambda _: None,
         draft: Draft[Ready] | None = None,
     ) -> SessionRecord:
-        """Change a session and append to its log, in one transaction; what takes long is done before it."""
-        ready = drafted(event) if draft is None else draft
+        """Change a session and append to its log, in one transaction; what takes long is done before it.
+
+        A decision's ``draft`` is made ready on the thread that writes, as each change of threads costs a frame time.
+        Anything else is made ready elsewhere: there decisions would wait for it.
+        """
+        ready = draft or drafted(event)
+        if draft is None:
+            await asyncio.to_thread(ready.write)
 
         def work(connection: Connection) -> SessionRecord:
             after = append(connection, session_id, ready.made.said, change, self.check_room, ready.made.state)
@@ -309,7 +319,7 @@ class Store:
             return after
 
         try:
-            after = await self._database.write(work, ready.write)
+            after = await (self._database.write(work) if draft is None else self._database.write(work, draft.write))
         except (SessionChanged, TokenReplaced):
             self._seen.forget(session_id)
             await self.get(session_id)

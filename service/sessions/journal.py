@@ -14,7 +14,7 @@ from robosac.audit.events import AccessRefused, Equivocation, Event, MessageRefu
 from service.errors import AuditFull, SessionOver, TokenRefused
 from service.keeping.store import Store
 from service.sessions.gathering import Received
-from service.sessions.live import REFUSALS_LOGGED, STRANGERS, Caller, LiveSession
+from service.sessions.live import EQUIVOCATIONS_LOGGED, REFUSALS_LOGGED, STRANGERS, Caller, LiveSession
 from service.watching.metrics import Metrics
 
 logger = structlog.stdlib.get_logger(__name__)
@@ -45,7 +45,9 @@ class Journal:
     async def equivocation(self, caller: Caller, frame: int, first: Proof, second: Received) -> None:
         """A vehicle said two different things about one frame."""
         session_id, vehicle_id = caller.record.session_id, caller.vehicle_id
-        if self._counted(caller.live, vehicle_id, Reason.REPLAYED):
+        caller.live.equivocations[vehicle_id] += 1
+        proven = caller.live.equivocations[vehicle_id] <= EQUIVOCATIONS_LOGGED  # however much was refused before
+        if self._counted(caller.live, vehicle_id, Reason.REPLAYED, logged=proven):
             logger.warning("equivocation", session_id=session_id, vehicle_id=vehicle_id, frame=frame)
             event = Equivocation(vehicle_id=vehicle_id, frame=frame, first=first, second=second.proof)
             await self._append(session_id, event)
@@ -57,11 +59,11 @@ class Journal:
         elif self._counted(live, STRANGERS, Reason.UNAUTHENTICATED):
             await self._append(session_id, AccessRefused(vehicle_id=refused.vehicle_id, detail=refused.detail))
 
-    def _counted(self, live: LiveSession, who: str, reason: Reason) -> bool:
-        """Count a refusal; whether it gets a record."""
+    def _counted(self, live: LiveSession, who: str, reason: Reason, *, logged: bool = False) -> bool:
+        """Count a refusal, unless it is ``logged`` anyway; whether it gets a record."""
         self.metrics.refused(reason.value)
-        live.refusals[who] += 1
-        return live.refusals[who] <= REFUSALS_LOGGED
+        live.refusals[who] += not logged
+        return logged or live.refusals[who] <= REFUSALS_LOGGED
 
     async def _append(self, session_id: str, event: Event) -> None:
         with contextlib.suppress(SessionOver, AuditFull):

@@ -9,6 +9,7 @@ from collections.abc import Mapping
 from dataclasses import dataclass, field
 
 from robosac.audit.events import Proof
+from robosac.defenses import DefenseSettings
 from robosac.detectors import Detector, Role
 from robosac.session import Session
 from service.errors import TokenReplaced
@@ -18,6 +19,8 @@ from service.sessions.motion import Motion
 
 REFUSALS_LOGGED = 16
 """Refused messages of one vehicle between two frames that get a record each; the others are counted."""
+EQUIVOCATIONS_LOGGED = 4
+"""Equivocations of one vehicle between two frames that get a record each whatever else of it was refused."""
 QUIET_S = 30.0
 """After so long without a request it is looked whether what waits is of any use."""
 STRANGERS = "?"
@@ -40,6 +43,8 @@ class LiveSession:
     """
 
     session: Session
+    settings: DefenseSettings
+    """Of its defence."""
     detector: Detector
     team: tuple[str, ...]
     public_keys: Mapping[str, str]
@@ -53,7 +58,9 @@ class LiveSession:
     lock: asyncio.Lock = field(default_factory=asyncio.Lock)
     last_used: float = field(default_factory=time.monotonic)
     refusals: Counter[str] = field(default_factory=Counter)
+    equivocations: Counter[str] = field(default_factory=Counter)
     renewals: Counter[str] = field(default_factory=Counter)
+    team_changes: int = 0
     settling: asyncio.Task[None] | None = None
     """A decision that nobody waits for any more, and of which it is not known yet whether it is kept."""
     held: bool = False

@@ -80,7 +80,7 @@ class Opening:
         )
         kept = await self.store.create(record, await asyncio.to_thread(_first_record, record, info))
         self.sessions.quota.add(kept)
-        self.sessions.begin(record)
+        self.sessions.begin(record, defense)
         self.metrics.sessions.set(already_open + 1)
         team = {"ego_id": record.ego_id, "teammates": len(record.teammates)}
         logger.info("session opened", session_id=session_id, **team, detector=info.name, defense=defense.kind)

@@ -14,7 +14,7 @@ from robosac.answers import Reason
 from robosac.audit import commitment
 from robosac.audit.events import SessionEnded
 from robosac.budget import DomainError
-from robosac.defenses import known, read_settings, suspicion_in
+from robosac.defenses import DefenseSettings, known, read_settings, suspicion_in
 from robosac.session import Session, defense_for
 from service.engine import Engine
 from service.errors import Kind, Refused, SessionOver, StoreTooSlow, TokenRefused
@@ -41,13 +41,18 @@ logger = structlog.stdlib.get_logger(__name__)
 COLD_S = 2.0
 """How long the store may take to tell of a session that is not in use here, whose budget is not known yet."""
 
+FIRST_PAGE = 4
+"""Lines of a log that are read first; then as many at a time as their length allows."""
+PAGE_BYTES = 2**18
+"""What is read of a log at a time, about: whoever stops to read it makes the gateway hold no more."""
+
 
 @dataclass
 class Sessions:
     """All sessions of this gateway.
 
-    ``draw_seed`` gives the seed of a frame's draws, hexadecimal; by default from the operating system, so that nobody
-    can foresee them.
+    ``several_keys`` says whether they may be of more than one API key. ``draw_seed`` gives the seed of a frame's draws,
+    hexadecimal; by default from the operating system, so that nobody can foresee them.
     """
 
     settings: Settings
@@ -56,6 +61,7 @@ class Sessions:
     metrics: Metrics
     tokens: Tokens
     keys: GatewayKeys
+    several_keys: bool = False
     draw_seed: Callable[[], str] = new_seed
 
     def __post_init__(self) -> None:
@@ -66,14 +72,15 @@ class Sessions:
             self.defenses = known(self.settings.extra_defenses)
         except ValueError as fault:
             raise ValueError(f"ROBOSAC_EXTRA_DEFENSES: {fault}") from fault
-        self.backlog = Room(self.settings.max_pending_bytes, name="ROBOSAC_MAX_PENDING_BYTES")
+        of_key = self.settings.max_pending_bytes_per_key if self.several_keys else None  # one key has all to itself
+        self.backlog = Room(self.settings.max_pending_bytes, of_key, "ROBOSAC_MAX_PENDING_BYTES")
         self.journal = Journal(self.store, self.metrics)
         self.moving = Moving(self.store)
         self.quota = LogQuota(self.settings.audit_max_bytes_per_key)
 
-    def begin(self, record: SessionRecord) -> None:
+    def begin(self, record: SessionRecord, defense: DefenseSettings) -> None:
         """Let a session be used whose record is kept now."""
-        self._live[record.session_id] = self._revive(record, moved=False)
+        self._live[record.session_id] = self._revive(record, defense)
 
     def drain(self) -> None:
         """Take nothing new: the process is to end, and another goes on with its sessions."""
@@ -137,12 +144,14 @@ class Sessions:
         return _begun(await anext(pages, ""), pages)  # what fails at once can still be told
 
     async def _pages(self, session_id: str, after: int, last: int) -> AsyncIterator[str]:
+        page = FIRST_PAGE
         while after < last:
-            page = min(PAGE, last - after)
+            page = min(page, last - after)
             lines = await self.store.audit(session_id, after, page)
             if len(lines) < page:  # it is being purged, from its beginning on: what was sent must not look whole
                 raise SessionOver("the log was purged")
             after += len(lines)
+            page = min(PAGE, max(1, PAGE_BYTES // max(map(len, lines))))
             yield "\n".join(lines) + "\n"
 
     async def describe(self, caller: Caller) -> SessionState:
@@ -150,7 +159,7 @@ class Sessions:
         record = await self.current(caller)
         shown = {
             **vars(record),  # of which only what `SessionState` declares is shown: no seed, no token's id
-            "defense": read_settings(record.defense, self.defenses),
+            "defense": caller.live.settings,
             "suspicion": suspicion_in(record.state),
             "next_seed_commitment": commitment(record.seed),
             "receipt": self.keys.receipt(record),
@@ -203,8 +212,9 @@ class Sessions:
         caller.live.follow(record)
         return record
 
-    def _revive(self, record: SessionRecord, *, moved: bool = True) -> LiveSession:
-        """What this process holds of a session; of one that ``moved``, messages may have been sent elsewhere.
+    def _revive(self, record: SessionRecord, opened: DefenseSettings | None = None) -> LiveSession:
+        """What this process holds of a session. If it was not ``opened`` here just now, with this defence, messages may
+        have been sent elsewhere.
 
         Raises
         ------
@@ -223,13 +233,14 @@ class Sessions:
             detail = f"the session's defence {record.defense['kind']} is not served now"
             raise Refused(Kind.DEFENSE_UNAVAILABLE, detail)
         try:
-            kept = read_settings(record.defense, self.defenses).at_period(record.frame_period_ms)
+            kept = opened or read_settings(record.defense, self.defenses).at_period(record.frame_period_ms)
             defense = defense_for(kept, detector.info)
         except DomainError as error:
             detail = f"the session's detector {record.detector} no longer serves its defence: {error}"
             raise Refused(Kind.DETECTOR_UNAVAILABLE, detail) from error
         return LiveSession(
             Session(detector, record.teammates, defense, {"state": record.state}),
+            kept,
             detector,
             record.teammates,
             record.public_keys,
@@ -238,7 +249,7 @@ class Sessions:
                 settings.max_pending_frames,
                 self.backlog.share(record.key_id, record.session_id),
                 closed,
-                moved=moved,
+                moved=opened is None,
             ),
             Motion(settings.max_speed_mps, record.frame_period_ms / 1e3, settings.max_range_m),
             record.latency_budget_ms / 1e3,

@@ -19,6 +19,8 @@ from service.settings import Settings
 
 MAX_RENEWALS = 16
 """Tokens that a vehicle may take between two frames: each leaves a record."""
+MAX_CHANGES = 128
+"""Changes of a team between two frames: each leaves a record with all that the defence remembers."""
 
 
 @dataclass(frozen=True)
@@ -86,6 +88,10 @@ class Teams:
     ) -> None:
         """Keep a new team of the session ``record``. The session's lock is held."""
         check_size(team, self.settings.max_teammates)
+        if caller.live.team_changes >= MAX_CHANGES:
+            detail = f"a team may change {MAX_CHANGES} times between two frames; several may join at once"
+            raise Refused(Kind.TOO_MANY_CHANGES, detail)
+        caller.live.team_changes += 1
         try:
             state = changed_team(caller.live.session.defense, record.state, team)
         except DomainError as error:

@@ -9,7 +9,7 @@ import asyncio
 import contextlib
 import json
 from collections import OrderedDict, deque
-from collections.abc import Awaitable, Callable, Iterator, Mapping
+from collections.abc import Awaitable, Callable, Iterator, Mapping, Sequence
 from dataclasses import dataclass, field
 from typing import Any
 
@@ -210,12 +210,8 @@ class Feed:
             lines = await self._read_log(session.record.session_id, after, TAIL)
         except Refused:  # the database failed; the next time it may not
             return
-        others = [(line, json.loads(line)) for line in lines if _OF_A_FRAME not in line]
-        session.tail += [
-            {"seq": record["seq"], "time": record["time"], "text": sentence(line)}
-            for line, record in others
-            if record["seq"] > session.read  # else it was read for another viewer meanwhile
-        ]
+        told = await asyncio.to_thread(_told, lines)
+        session.tail += [entry for entry in told if entry["seq"] > session.read]  # others were read meanwhile
         session.read = max(session.read, after + len(lines))
 
     async def _batch(
@@ -236,6 +232,12 @@ class Feed:
             if quiet is None:
                 return
             self._frames -= len(self._sessions.pop(quiet).frames)
+
+
+def _told(lines: Sequence[str]) -> list[dict[str, Any]]:
+    """Lines of a log in words, but those of frames."""
+    others = [(line, json.loads(line)) for line in lines if _OF_A_FRAME not in line]
+    return [{"seq": record["seq"], "time": record["time"], "text": sentence(line)} for line, record in others]
 
 
 def _about(record: SessionRecord, least_score: float) -> dict[str, Any]:

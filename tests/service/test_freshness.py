@@ -44,6 +44,19 @@ async def test_two_different_messages_for_a_frame_are_an_equivocation_and_neithe
     assert [record["first"]["digest"], record["second"]["digest"]] == digests
 
 
+async def test_refusals_hide_no_equivocation(served, messages):
+    session = await served.open(gather_ms=50)
+    token = session.teammate_tokens["car-2"]
+    for _ in range(20):
+        await served.post(session, "messages", b"?", token)
+    for message in (messages["car-2"], altered(messages["car-2"])):
+        body = wire.pack_message(0, "car-2", message)
+        answer = await served.post(session, "messages", body, token)
+    problem(answer, 409, "equivocation")
+    (record,) = await events(served.ego(session), "equivocation")
+    assert record["vehicle_id"] == "car-2"
+
+
 async def test_an_equivocation_is_found_after_the_frame_was_answered(served, messages, benign):
     session = await served.open(gather_ms=20, defense=NONE)
     ego, teammate = served.ego(session), served.teammate(session, "rsu")

@@ -288,7 +288,8 @@ async def test_whoever_takes_nothing_is_hung_up_on_and_nobody_else():
         await asyncio.sleep(60)
 
     began = time.perf_counter()
-    await HangingUp(endless, 0.05)({"type": "http", "path": "/v1/live/s"}, None, stuck)
+    for path in ("/v1/live/s", "/v1/sessions/s/audit", "/v1/sessions/s/standby"):
+        await HangingUp(endless, 0.05)({"type": "http", "path": path}, None, stuck)
     assert time.perf_counter() - began < 10
     with pytest.raises(TimeoutError):
         async with asyncio.timeout(0.2):

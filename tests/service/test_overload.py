@@ -43,6 +43,18 @@ def test_frames_are_admitted_as_long_as_they_can_be_answered_in_time():
         pass
 
 
+def test_how_slowly_one_session_sends_is_no_matter_of_others():
+    admission = Admission()
+    for _ in range(20):
+        admission.learn("slow", 0.010, 0.180, 0.001)
+    admission.learn("known", 0.010, 0.002, 0.001)
+    for session_id in ("known", "new"):
+        with taking(admission, "", "another", 0.2), taking(admission, "", session_id, 0.2):
+            pass
+    with taking(admission, "", "another", 0.2), pytest.raises(Refused), taking(admission, "", "slow", 0.2):
+        pass
+
+
 def test_a_frame_that_cannot_be_in_time_anyway_is_admitted_if_nothing_else_is_in_hand():
     admission = Admission()
     for _ in range(200):

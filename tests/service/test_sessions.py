@@ -12,6 +12,7 @@ from service.errors import SessionOver, StoreUnavailable
 from service.keeping.store import PAGE
 from service.keeping.tables import audit_lines
 from service.sessions.idle import Idle
+from service.sessions.sessions import FIRST_PAGE, PAGE_BYTES
 from tests.service.conftest import EGO, TEAM, problem, serve
 
 
@@ -41,11 +42,38 @@ async def test_a_log_that_is_purged_while_it_is_read_never_looks_whole(served):
     await asyncio.gather(*(store.log(session.session_id, note) for _ in range(3 * PAGE)))
     await served.ego(session).close()
     pages = await served.gateway.sessions.audit_log(session.session_id, session.ego_token, 0, 10**6)
-    assert (await anext(pages)).count("\n") == PAGE
-    beginning = delete(audit_lines).where(audit_lines.c.seq <= PAGE + 9)
+    assert (await anext(pages)).count("\n") == FIRST_PAGE
+    beginning = delete(audit_lines).where(audit_lines.c.seq <= FIRST_PAGE + 9)
     await store._database.write(lambda connection: connection.execute(beginning))
     with pytest.raises(SessionOver, match="purged"):
         await anext(pages)
+
+
+async def test_pages_of_a_log_are_as_large_as_their_lines_allow(served):
+    session, store = await served.open(), served.gateway.store
+    for length in [50_000] * 20 + [10] * 2000:
+        await store.log(session.session_id, TokenRenewed(vehicle_id="v" * length, expires_at="2026-01-01T00:00:00Z"))
+    pages = await served.gateway.sessions.audit_log(session.session_id, session.ego_token, 0, 10**6)
+    sizes = [len(page) async for page in pages]
+    assert max(sizes) < PAGE_BYTES + 100_000
+    assert len(sizes) < 60
+
+
+async def test_a_session_that_ended_is_not_kept_in_memory(served):
+    session, store = await served.open(), served.gateway.store
+    assert store.seen(session.session_id) is not None
+    await served.ego(session).close()
+    await served.ego(session).audit()
+    assert store.seen(session.session_id) is None
+
+
+async def test_settings_are_read_once(served, monkeypatch):
+    def unexpected(*_):
+        raise AssertionError
+
+    monkeypatch.setattr("service.sessions.sessions.read_settings", unexpected)
+    session = await served.open(defense={"kind": "conformal", "calibration": [0.25, 0.5]})
+    assert (await served.ego(session).state())["defense"]["calibration"] == [0.25, 0.5]
 
 
 async def test_state_and_end(served, good_frame):

@@ -141,6 +141,24 @@ async def test_renewals_are_bounded_between_two_frames(served, ego_message, beni
     await unit.renew()
 
 
+async def test_changes_of_a_team_are_bounded_between_two_frames(served, ego_message, benign, monkeypatch):
+    monkeypatch.setattr("service.sessions.teams.MAX_CHANGES", 4)
+    session = await served.open()
+    mine, path = {"Authorization": f"Bearer {session.ego_token}"}, f"/v1/sessions/{session.session_id}/teammates"
+
+    async def leave_and_join():
+        left = await served.http.delete(f"{path}/rsu", headers=mine)
+        return left, await served.http.post(path, json={"teammates": ["rsu"]}, headers=mine)
+
+    for _ in range(2):
+        assert [answer.status_code for answer in await leave_and_join()] == [204, 201]
+    left, joined = await leave_and_join()
+    problem(left, 429, "too-many-changes")
+    problem(joined, 409, "already-enrolled")
+    await served.ego(session).post_frame(0, ego_message, benign)
+    assert (await leave_and_join())[0].status_code == 204
+
+
 async def test_the_token_of_a_vehicle_that_left_stays_dead_when_it_comes_back(served, messages):
     session = await served.open()
     ego = served.ego(session)
