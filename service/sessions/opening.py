@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import asyncio
 import secrets
-from dataclasses import dataclass
+from dataclasses import dataclass, field
 from importlib.metadata import version
 
 import structlog
@@ -40,6 +40,8 @@ class Opening:
     metrics: Metrics
     tokens: Tokens
     sessions: Sessions
+    turn: asyncio.Lock = field(default_factory=asyncio.Lock)
+    """To be counted and kept: of two that are counted at once, each would find the last place free."""
 
     async def open(self, request: SessionRequest, key_id: str = "") -> SessionCreated:
         """Begin a session of an API key; the answer is the only place where its tokens are shown.
@@ -55,7 +57,6 @@ class Opening:
         _check_hypotheses(defense, self.settings.max_hypotheses)
         budget_ms, gather_ms = self._times(request)
         self.sessions.quota.check(key_id)
-        already_open = await self._count_if_there_is_room(key_id)
         session_id = secrets.token_hex(16)
         vehicles = (request.ego_id, *request.teammates)
         tokens = {v: self.tokens.issue(session_id, v, is_ego=v == request.ego_id) for v in vehicles}
@@ -78,7 +79,10 @@ class Opening:
             weights_digest=info.weights_digest,
             calibration_digest=calibration_digest(info),
         )
-        kept = await self.store.create(record, await asyncio.to_thread(_first_record, record, info))
+        first = await asyncio.to_thread(_first_record, record, info)
+        async with self.turn:
+            already_open = await self._count_if_there_is_room(key_id)
+            kept = await self.store.create(record, first)
         self.sessions.quota.add(kept)
         self.sessions.begin(record, defense)
         self.metrics.sessions.set(already_open + 1)

@@ -252,6 +252,13 @@ async def test_a_key_has_only_so_many_sessions_and_another_has_its_own():
         assert (await opened("b")).status_code == 201
 
 
+async def test_no_more_sessions_are_opened_at_once_than_there_may_be():
+    async with serve(api_keys="a" * 20, max_sessions_per_key=3) as served:
+        body, headers = {"ego_id": EGO, "teammates": ["rsu"]}, {"Authorization": f"Bearer {'a' * 20}"}
+        asked = (served.http.post("/v1/sessions", json=body, headers=headers) for _ in range(20))
+        assert Counter(answer.status_code for answer in await asyncio.gather(*asked)) == {201: 3, 503: 17}
+
+
 async def test_a_key_keeps_only_so_much_whether_its_sessions_have_ended_or_not(messages, benign):
     async with serve(api_keys="a" * 20 + "," + "b" * 20, audit_max_bytes_per_key=2**20) as served:
         long_record = {"kind": "conformal", "calibration": [i / 7000 for i in range(7000)]}
