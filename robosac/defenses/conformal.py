@@ -41,7 +41,7 @@ class Conformal(Memoryless):
     calibration: tuple[Annotated[float, Field(ge=0, le=1)], ...] | None = Field(
         None,
         min_length=1,
-        max_length=10_000,
+        max_length=2000,
         description="Jaccard indices of honest single teammates; by default those of the shipped detector.",
     )
 

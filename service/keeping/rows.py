@@ -22,6 +22,8 @@ THIS = sessions.c.session_id == bindparam("this")
 OPEN = sessions.c.ended_at.is_(None)
 ENDED = sessions.c.ended_at.is_not(None)
 GET = select(*(sessions.c[name] for name in FIELDS)).where(THIS)
+GET_BUT_KNOWN = select(*(sessions.c[name] for name in FIELDS if name not in {"state", "defense"})).where(THIS)
+"""Without what can be long, and is the same as long as the log ends as it did."""
 GET_TO_CHANGE = GET.with_for_update()  # SQLite, which knows no such clause, has locked everything by then
 GET_BUT_STATE = select(*(sessions.c[name] for name in FIELDS if name != "state")).where(THIS).with_for_update()
 CHANGE = update(sessions).where(THIS)
@@ -39,8 +41,9 @@ NO_CHANGE = update(sessions).where(false()).values(ended_at=None)
 """A database that takes no changes refuses it all the same; PostgreSQL is asked nothing before the first statement."""
 
 
-def read_row(row: Row[Any]) -> SessionRecord:
-    """The session of a row of `FIELDS`; without its state, where that is not in the row.
+def read_row(row: Row[Any], known: SessionRecord | None = None) -> SessionRecord:
+    """The session of a row of `FIELDS`; without its state, where that is not in the row. Of a row of `GET_BUT_KNOWN`
+    the rest is as ``known``.
 
     Raises
     ------
@@ -52,6 +55,8 @@ def read_row(row: Row[Any]) -> SessionRecord:
     except (ValueError, TypeError, RecursionError) as error:
         logger.error("the database failed: the row of session %s is damaged", row.session_id)
         raise StoreUnavailable from error
+    if known is not None and "defense" not in values:
+        values |= {"defense": known.defense, "state": known.state}
     return SessionRecord(**{**values, "teammates": tuple(values["teammates"])})
 
 

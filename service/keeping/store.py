@@ -8,7 +8,7 @@ from collections.abc import Callable, Collection, Mapping, Sequence
 from dataclasses import replace
 from typing import Any
 
-from sqlalchemy import Connection, Delete, Select, Update, func, insert, select, update
+from sqlalchemy import Connection, Delete, Row, Select, Update, func, insert, select, update
 
 from robosac.audit import FULL_EVERY, digest
 from robosac.audit.events import DetectorChanged, Event, FrameAnswered, SessionEnded, TeamChanged, TokenRenewed
@@ -19,7 +19,7 @@ from service.keeping.database import connect
 from service.keeping.limits import Limits
 from service.keeping.patience import Patience
 from service.keeping.record import SessionRecord
-from service.keeping.rows import ADD_MESSAGES, FIELDS, GET, NO_CHANGE, OPEN, TOUCH, columns, read_row
+from service.keeping.rows import ADD_MESSAGES, FIELDS, GET, GET_BUT_KNOWN, NO_CHANGE, OPEN, TOUCH, columns, read_row
 from service.keeping.sealing import Draft, Ready, Sealing, drafted, sealed
 from service.keeping.seen import Seen
 from service.keeping.tables import audit_lines, kept_messages, sessions
@@ -90,13 +90,21 @@ class Store:
         if not (session_id.isascii() and session_id.isprintable()):  # what no database takes for a text
             return None
         asked, before = {"this": session_id}, self._seen.get(session_id)
-        row = await self._database.read(lambda connection: connection.execute(GET, asked).first())
+
+        def look(connection: Connection) -> Row[Any] | None:
+            if before is not None:
+                row = connection.execute(GET_BUT_KNOWN, asked).first()
+                if row is None or (row.revision, row.audit_head) == (before.revision, before.audit_head):
+                    return row
+            return connection.execute(GET, asked).first()
+
+        row = await self._database.read(look)
         if row is None or row.ended_at is not None:
             self._seen.forget(session_id)
-            return None if row is None else read_row(row)
+            return None if row is None else read_row(row, before)
         if self._seen.get(session_id) is before:  # nothing was written meanwhile: the database is right
             self._seen.forget(session_id)
-        return self._seen.remember(read_row(row))
+        return self._seen.remember(read_row(row, before))
 
     def seen(self, session_id: str) -> SessionRecord | None:
         """The session as it was here last, if it is remembered; another process may have changed it since."""

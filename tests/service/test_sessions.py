@@ -240,7 +240,7 @@ async def test_a_damaged_session_is_unavailable_and_no_fault_of_the_gateway(tmp_
         damaged, whole = await served.open(), await served.open()
         database = sqlite3.connect(path)
         with database:
-            database.execute("UPDATE sessions SET defense = '{' WHERE session_id = ?", [damaged.session_id])
+            database.execute("UPDATE sessions SET public_keys = '{' WHERE session_id = ?", [damaged.session_id])
         database.close()
         bearer = {"Authorization": f"Bearer {damaged.ego_token}"}
         answer = await served.http.get(f"/v1/sessions/{damaged.session_id}", headers=bearer)
