@@ -11,13 +11,13 @@ import numpy as np
 from robosac.defenses.group_testing.differences import SAME_LIE_M, blame
 from robosac.defenses.group_testing.findings import UNHEARD, Findings, one_out
 from robosac.defenses.group_testing.lies import AUDIT_FRAMES, Word
-from robosac.defenses.group_testing.model import CELLS, CLEAN, LIE
+from robosac.defenses.group_testing.model import CELLS, CLEAN
 from robosac.defenses.group_testing.objects import Lie
 from robosac.defenses.group_testing.straying import strays
 from robosac.defenses.protocol import Hypothesis
 
 CLEARING = 1.5
-"""What a frame in which nothing is wrong takes off the logarithm of the odds that one of those fused lies."""
+"""What a frame in which nothing is wrong takes off the logarithm of the odds that one of those fused attacks."""
 FEWEST_SEEN = 3
 """Whoever sees so many vehicles against the word of all others is not blind: one or two differ by where they end."""
 CONFLICT_SCORE = 0.5
@@ -217,7 +217,7 @@ def _worth(found: Findings) -> float:
 
 
 def _clear(found: Findings, comparisons: Mapping[tuple[Hypothesis, Hypothesis], str]) -> None:
-    """Where nothing is wrong with any object, whoever is fused is less likely to lie: the most of them that were
+    """Where nothing is wrong with any object, whoever is fused is less likely to attack: the most of them that were
     fused so. Where something is, so is whoever has no part in it (`_harmless`). Holes count only where vehicles were
     taken away.
     """
@@ -229,11 +229,8 @@ def _clear(found: Findings, comparisons: Mapping[tuple[Hypothesis, Hypothesis], 
     cleared = tuple(name for name in unsuspicious if not found.lies.worst(name) and not straying.rising(name))
     if not cleared:
         return
-    model = found.known.model
-    log_likelihood = np.zeros(CLEAN + CELLS * len(model.kinds))
-    log_likelihood[CLEAN:] = -CLEARING * (1.0 - found.known.memory.steadiness.calm)
-    first = CLEAN + CELLS * model.kinds.index(LIE)
-    log_likelihood[first : first + CELLS] = -CLEARING
+    log_likelihood = np.zeros(CLEAN + CELLS * len(found.known.model.kinds))
+    log_likelihood[CLEAN:] = -CLEARING
     nobody, all_of_them = found.known.rows([(), cleared])
     found.known.posterior.update(nobody, all_of_them, log_likelihood)
 
