@@ -57,6 +57,7 @@ class Kind(StrEnum):
     DETECTOR_UNAVAILABLE = "detector-unavailable"
     DEFENSE_UNAVAILABLE = "defense-unavailable"
     AUDIT_FULL = "audit-full"
+    KEY_FULL = "key-full"
     STORE_UNAVAILABLE = "store-unavailable"
     STORE_TOO_SLOW = "store-too-slow"
 

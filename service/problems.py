@@ -77,6 +77,7 @@ ANSWERS: Mapping[Kind, tuple[int, Mapping[str, str]]] = {
     Kind.DETECTOR_UNAVAILABLE: (503, {}),
     Kind.DEFENSE_UNAVAILABLE: (503, {}),
     Kind.AUDIT_FULL: (507, {}),
+    Kind.KEY_FULL: (507, {}),
     Kind.STORE_UNAVAILABLE: (503, {"Retry-After": "1"}),
     Kind.STORE_TOO_SLOW: (503, {"Retry-After": "1"}),
 }

@@ -8,8 +8,9 @@ A message is refused only on evidence that cannot be turned against somebody hon
 - its values are far beyond all that honest messages of the detector were seen to hold (``implausible``);
 - it is what its sender sent from another place, byte for byte or closer than two scans of one unchanged place ever are
   (``repeated``). A parked vehicle cannot fail that;
-- it is, byte for byte, what another vehicle had sent in an earlier frame in which this one sent something else, or the
-  ego has sent (``copied``). Whoever was silent then may have been overheard, and its message sent in its place.
+- it is, byte for byte, what another vehicle had sent first in a frame of which it is remembered that this one sent
+  something else in it, or what the ego has sent (``copied``). Whoever was silent then may have been overheard, and its
+  message sent in its place.
 
 Two messages that are merely alike are told, and stay in. Nobody can know from the maps who copied. And the maps of an
 honest vehicle that drives on an empty road, between walls or in a platoon are as alike as .99.

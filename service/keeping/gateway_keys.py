@@ -90,9 +90,21 @@ def _make(file: Path) -> None:
             made.flush()
             os.fsync(made.fileno())
         with contextlib.suppress(FileExistsError):
-            os.link(name, file)
+            _link(name, file)
     finally:
         Path(name).unlink()
+
+
+def _link(name: str, file: Path) -> None:
+    """Let a file be found by another name, too, unless there is one of that name."""
+    try:
+        os.link(name, file)
+    except FileExistsError:
+        raise
+    except OSError:  # a file system that knows no links
+        descriptor = os.open(file, os.O_CREAT | os.O_EXCL | os.O_WRONLY, 0o600)
+        with os.fdopen(descriptor, "w") as made:
+            made.write(Path(name).read_text())
 
 
 def _key(line: str, where: str) -> Ed25519PrivateKey:

@@ -6,6 +6,8 @@ from dataclasses import dataclass
 
 UNBOUND = {
     "application_name": "robosac",
+    "statement_timeout": "0",
+    "idle_in_transaction_session_timeout": "0",
     "tcp_keepalives_idle": "5",
     "tcp_keepalives_interval": "2",
     "tcp_keepalives_count": "3",

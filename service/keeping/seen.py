@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from collections import OrderedDict
+from dataclasses import replace
 
 from service.keeping.record import SessionRecord
 
@@ -29,7 +30,9 @@ class Seen:
         self._sessions.pop(session_id, None)
 
     def remember(self, record: SessionRecord) -> SessionRecord:
-        """Keep the newest that is known of a session, and give it."""
+        """Keep the newest that is known of a session, and give it; of an ended one without what can be long."""
+        if record.ended_at is not None:
+            record = replace(record, defense={}, state={})
         before = self._sessions.get(record.session_id)
         if before is None or record.audit_seq > before.audit_seq:
             self._sessions[record.session_id] = record

@@ -12,7 +12,7 @@ from sqlalchemy import Connection, Delete, Row, Select, Update, func, insert, se
 
 from robosac.audit import FULL_EVERY, digest
 from robosac.audit.events import DetectorChanged, Event, FrameAnswered, SessionEnded, TeamChanged, TokenRenewed
-from service.errors import AuditFull, FrameDecided, SessionChanged, TokenReplaced
+from service.errors import AuditFull, FrameDecided, SessionChanged, SessionOver, TokenReplaced
 from service.keeping import migrations, once, partitions, purging, usage
 from service.keeping.appending import Change, append, check_revision, line_row, renewal
 from service.keeping.database import connect
@@ -92,19 +92,21 @@ class Store:
         asked, before = {"this": session_id}, self._seen.get(session_id)
 
         def look(connection: Connection) -> Row[Any] | None:
-            if before is not None:
+            if before is not None and before.ended_at is None:
                 row = connection.execute(GET_BUT_KNOWN, asked).first()
                 if row is None or (row.revision, row.audit_head) == (before.revision, before.audit_head):
                     return row
             return connection.execute(GET, asked).first()
 
         row = await self._database.read(look)
-        if row is None or row.ended_at is not None:
+        if row is None:
             self._seen.forget(session_id)
-            return None if row is None else read_row(row, before)
+            return None
         if self._seen.get(session_id) is before:  # nothing was written meanwhile: the database is right
             self._seen.forget(session_id)
-        return self._seen.remember(read_row(row, before))
+        record = read_row(row, before)
+        newest = self._seen.remember(record)
+        return newest if record.ended_at is None else record
 
     def seen(self, session_id: str) -> SessionRecord | None:
         """The session as it was here last, if it is remembered; another process may have changed it since."""
@@ -250,7 +252,6 @@ class Store:
             connection.execute(ADD_MESSAGES, {"this": session_id})
 
         await self._append(session_id, event, lambda _: {"ended_at": event.time}, keep)
-        self._seen.forget(session_id)
         self._sealing.forget(session_id)
 
     async def unused_since(self, moment: float) -> list[str]:
@@ -328,7 +329,7 @@ class Store:
 
         try:
             after = await (self._database.write(work) if draft is None else self._database.write(work, draft.write))
-        except (SessionChanged, TokenReplaced):
+        except (SessionChanged, SessionOver, TokenReplaced):
             self._seen.forget(session_id)
             await self.get(session_id)
             raise

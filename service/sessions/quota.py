@@ -12,7 +12,8 @@ from service.keeping.store import Store
 class LogQuota:
     """Counts what is kept of the sessions of each API key, those included that have ended.
 
-    What all processes keep is looked up now and then (`look`). Until then it is known what this one has added since.
+    What all processes keep is looked up now and then (`look`). Until then, what sessions that are opened here and teams
+    that change here add is counted, and what frames add is not.
 
     Parameters
     ----------
@@ -30,14 +31,14 @@ class LogQuota:
         Raises
         ------
         Refused
-            With the kind ``audit-full``.
+            With the kind ``key-full``.
         """
         if key_id and self._kept[key_id] >= self._most:
             detail = (
                 f"the audit logs of this key's sessions hold {self._kept[key_id]} bytes; from {self._most} on "
                 "(ROBOSAC_AUDIT_MAX_BYTES_PER_KEY) none is opened and nobody joins, until the oldest logs are purged"
             )
-            raise Refused(Kind.AUDIT_FULL, detail)
+            raise Refused(Kind.KEY_FULL, detail)
 
     def add(self, after: SessionRecord, before: SessionRecord | None = None) -> None:
         """Count what a session has grown by."""

@@ -5,8 +5,10 @@ from __future__ import annotations
 import asyncio
 import contextlib
 import time
-from collections.abc import AsyncIterator, Callable, Iterator
+from bisect import bisect_right
+from collections.abc import AsyncIterator, Awaitable, Callable, Iterator, Sequence
 from dataclasses import dataclass
+from itertools import accumulate
 
 import structlog
 
@@ -17,7 +19,7 @@ from robosac.budget import DomainError
 from robosac.defenses import DefenseSettings, known, read_settings, suspicion_in
 from robosac.session import Session, defense_for
 from service.engine import Engine
-from service.errors import Kind, Refused, SessionOver, StoreTooSlow, TokenRefused
+from service.errors import Kind, Refused, SessionOver, StoreTooSlow, StoreUnavailable, TokenRefused
 from service.keeping.gateway_keys import GatewayKeys
 from service.keeping.patience import GRACE_S, within
 from service.keeping.record import SessionRecord, new_seed
@@ -42,9 +44,9 @@ COLD_S = 2.0
 """How long the store may take to tell of a session that is not in use here, whose budget is not known yet."""
 
 FIRST_PAGE = 4
-"""Lines of a log that are read first; then as many at a time as their length allows."""
+"""Lines of a log that are read first; then at most twice as many as were sent before."""
 PAGE_BYTES = 2**18
-"""What is read of a log at a time, about: whoever stops to read it makes the gateway hold no more."""
+"""What is sent of a log at a time, or one line: whoever stops to read it makes the gateway hold no more."""
 
 
 @dataclass
@@ -150,9 +152,10 @@ class Sessions:
             lines = await self.store.audit(session_id, after, page)
             if len(lines) < page:  # it is being purged, from its beginning on: what was sent must not look whole
                 raise SessionOver("the log was purged")
-            after += len(lines)
-            page = min(PAGE, max(1, PAGE_BYTES // max(map(len, lines))))
-            yield "\n".join(lines) + "\n"
+            total = list(accumulate(map(len, lines)))
+            fitting = max(1, bisect_right(total, PAGE_BYTES))
+            after, page = after + fitting, min(PAGE, 2 * fitting)
+            yield "\n".join(lines[:fitting]) + "\n"
 
     async def describe(self, caller: Caller) -> SessionState:
         """The session's state."""
@@ -188,17 +191,23 @@ class Sessions:
         """
         with _going_on("logs could not be purged"):  # first, as it makes room for the lines of a new day
             await self.store.purge(time.time() - self.settings.audit_retention_s)
-        unused: list[str] = []
-        with _going_on("idle sessions could not be found"):
-            unused = await self._idle.unused()
-        for session_id in unused:
-            with _going_on("an idle session could not be ended", session_id=session_id):
-                await self._end(session_id, "expired")
-        for session_id in [one for one in self._live if self._idle.may_be_over(one)]:
-            with _going_on("it is unknown whether a session is over", session_id=session_id):
-                await self._forget_if_over(session_id)
+        with _going_on("idle sessions could not be ended"):
+            await self._each(await self._idle.unused(), self._expire)
+        with _going_on("it is unknown which sessions are over"):
+            await self._each([one for one in self._live if self._idle.may_be_over(one)], self._forget_if_over)
         with _going_on("it is unknown what is kept for whom"):
             await self.quota.look(self.store)
+
+    async def _each(self, session_ids: Sequence[str], do: Callable[[str], Awaitable[None]]) -> None:
+        """Do something for each session, as long as the database answers."""
+        for session_id in session_ids:
+            with _going_on("a session could not be looked after", session_id=session_id) as failed:
+                await do(session_id)
+            if failed:
+                await self.store.ping()
+
+    async def _expire(self, session_id: str) -> None:
+        await self._end(session_id, "expired")
 
     async def current(self, caller: Caller) -> SessionRecord:
         """The session as it is now; it may have moved on, or ended, since the caller was authenticated.
@@ -323,12 +332,14 @@ async def _begun(first: str, others: AsyncIterator[str]) -> AsyncIterator[str]:
 
 
 @contextlib.contextmanager
-def _going_on(fault: str, **what: str) -> Iterator[None]:
-    """Log what is raised in the block, and go on after it."""
+def _going_on(fault: str, **what: str) -> Iterator[list[str]]:
+    """Log what is raised in the block, and go on after it; what it gives is empty unless something was."""
+    failed: list[str] = []
     try:
-        yield
-    except Exception:
-        logger.exception(fault, **what)
+        yield failed
+    except Exception as error:
+        failed.append(fault)
+        logger.error(fault, exc_info=not isinstance(error, StoreUnavailable), **what)  # which is logged already
 
 
 def _ego_only(vehicle_id: str) -> Refused:

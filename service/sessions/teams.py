@@ -91,7 +91,6 @@ class Teams:
         if caller.live.team_changes >= MAX_CHANGES:
             detail = f"a team may change {MAX_CHANGES} times between two frames; several may join at once"
             raise Refused(Kind.TOO_MANY_CHANGES, detail)
-        caller.live.team_changes += 1
         try:
             state = changed_team(caller.live.session.defense, record.state, team)
         except DomainError as error:
@@ -104,6 +103,7 @@ class Teams:
             state=dict(state),
         )
         kept = await self.store.change_team(record, event, token_ids)
+        caller.live.team_changes += 1
         self.sessions.quota.add(kept, record)
         caller.live.follow(await self.sessions.current(caller))
 

@@ -180,6 +180,16 @@ def test_a_parked_vehicle_that_comes_back_is_not_accused_of_what_it_sent_itself(
     assert "owner" not in play(owner=at(0.0, parked), thief=at(9.0, parked)).refused
 
 
+def test_a_copy_is_found_as_long_as_it_is_remembered_what_its_sender_sent_then(draw):
+    play, parked = Frames(draw), draw()
+    for _ in range(KEPT_FRAMES - 1):
+        assert play(owner=at(0.0, parked), thief=at(9.0, draw())).refused == {}
+    assert set(play(owner=at(0.0, parked), thief=at(9.0, parked)).refused) == {"thief"}
+    for _ in range(KEPT_FRAMES):
+        assert play(owner=at(0.0, parked), thief=at(9.0, draw())).refused == {}
+    assert play(owner=at(0.0, parked), thief=at(9.0, parked)).refused == {}  # nobody knows any more who sent it first
+
+
 def test_what_was_sent_by_somebody_who_is_silent_now_is_copied_too(draw):
     play, first = Frames(draw), draw()
     play(owner=at(0.0, first), thief=at(9.0, draw()))

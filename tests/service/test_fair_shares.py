@@ -273,10 +273,10 @@ async def test_a_key_keeps_only_so_much_whether_its_sessions_have_ended_or_not(m
             mine = {"Authorization": f"Bearer {answer.json()['ego_token']}"}
             await served.http.delete(f"/v1/sessions/{answer.json()['session_id']}", headers=mine)
             ended += 1
-        assert "ROBOSAC_AUDIT_MAX_BYTES_PER_KEY" in problem(answer, 507, "audit-full")["detail"]
+        assert "ROBOSAC_AUDIT_MAX_BYTES_PER_KEY" in problem(answer, 507, "key-full")["detail"]
         mine = {"Authorization": f"Bearer {going_on['ego_token']}"}
         path = f"/v1/sessions/{going_on['session_id']}/teammates"
-        problem(await served.http.post(path, json={"teammates": ["car-9"]}, headers=mine), 507, "audit-full")
+        problem(await served.http.post(path, json={"teammates": ["car-9"]}, headers=mine), 507, "key-full")
         assert (await opened("b")).status_code == 201
         ego = served.ego(SessionCreated.model_validate(going_on))
         frame = await ego.post_frame(0, messages[EGO], {"rsu": benign["rsu"]})

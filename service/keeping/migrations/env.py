@@ -30,7 +30,7 @@ async def _by_hand() -> None:
     except (MissingExtra, SettingsError) as wrong:
         raise SystemExit(f"Error: {wrong}") from wrong
     try:
-        await database.write(_run_locked)
+        await database.prepare(_run_locked)
     finally:
         await database.close()
 
