@@ -15,7 +15,7 @@ logger = structlog.stdlib.get_logger(__name__)
 
 PATIENCE_S = 30.0
 """How long a socket may take nothing. Meanwhile `service.viewing.viewers` bounds what waits for a viewer's, and
-`service.sessions.sessions` what of a log.
+`service.sessions.pages` what of a log.
 """
 _STREAMED = re.compile(r"/v1/(live/|sessions/[^/]*/(audit|standby)$)")
 

@@ -31,6 +31,7 @@ from robosac.extras import need
 from robosac.faults import describe
 from service.errors import StoreUnavailable
 from service.keeping.limits import UNBOUND, Limits
+from service.keeping.place import Place
 from service.keeping.together import Piece, Work, do_each, prepare_each
 from service.keeping.urls import read_url
 
@@ -169,7 +170,7 @@ class Sqlite(_Failing):
 
     def __init__(self, url: URL) -> None:
         in_memory = url.database in (None, "", ":memory:")
-        place = _Place(None if in_memory else Path(str(url.database)))
+        place = Place(None if in_memory else Path(str(url.database)))
         self._writer = _SqliteThreads(url, 1, place)
         event.listen(self._writer.engine, "begin", _begin_immediate)
         self._readers = None if in_memory else _SqliteThreads(url, READERS, place)
@@ -219,37 +220,10 @@ class Sqlite(_Failing):
         self._writing = None
 
 
-class _Place:
-    """Where a database's file is, if it has one. What is written to one that is not there any more is lost."""
-
-    def __init__(self, path: Path | None) -> None:
-        self._path = path
-        self._file: tuple[int, int] | None = None
-
-    def remember(self) -> None:
-        """The file is open."""
-        if self._file is None and self._path is not None:
-            self._file = self._found(self._path)
-
-    def check(self) -> None:
-        """Refuse to go on if the file that was opened is not in its place.
-
-        Raises
-        ------
-        FileNotFoundError
-        """
-        if self._file is not None and self._path is not None and self._file != self._found(self._path):
-            raise FileNotFoundError("the database's file was moved, and another one put in its place")
-
-    def _found(self, path: Path) -> tuple[int, int]:
-        status = path.stat()
-        return status.st_dev, status.st_ino
-
-
 class _SqliteThreads:
     """Connections to a SQLite database with as many threads to use them."""
 
-    def __init__(self, url: URL, number: int, place: _Place) -> None:
+    def __init__(self, url: URL, number: int, place: Place) -> None:
         self.engine: Engine = create_engine(
             url.update_query_dict({"timeout": str(BUSY_TIMEOUT_S), **url.query}),
             poolclass=QueuePool,

@@ -5,10 +5,8 @@ from __future__ import annotations
 import asyncio
 import contextlib
 import time
-from bisect import bisect_right
 from collections.abc import AsyncIterator, Awaitable, Callable, Iterator, Sequence
 from dataclasses import dataclass
-from itertools import accumulate
 
 import structlog
 
@@ -23,7 +21,7 @@ from service.errors import Kind, Refused, SessionOver, StoreTooSlow, StoreUnavai
 from service.keeping.gateway_keys import GatewayKeys
 from service.keeping.patience import GRACE_S, within
 from service.keeping.record import SessionRecord, new_seed
-from service.keeping.store import PAGE, Store
+from service.keeping.store import Store
 from service.schemas import SessionState
 from service.sessions.detectors import OTHER_WEIGHTS, detector_changed, has_changed
 from service.sessions.gathering import Gathering
@@ -33,6 +31,7 @@ from service.sessions.journal import Journal
 from service.sessions.live import Caller, LiveSession
 from service.sessions.motion import Motion
 from service.sessions.moving import Moving
+from service.sessions.pages import begun, pages
 from service.sessions.quota import LogQuota
 from service.sessions.room import Room
 from service.settings import Settings
@@ -42,11 +41,6 @@ logger = structlog.stdlib.get_logger(__name__)
 
 COLD_S = 2.0
 """How long the store may take to tell of a session that is not in use here, whose budget is not known yet."""
-
-FIRST_PAGE = 4
-"""Lines of a log that are read first; then at most twice as many as were sent before."""
-PAGE_BYTES = 2**18
-"""What is sent of a log at a time, or one line: whoever stops to read it makes the gateway hold no more."""
 
 
 @dataclass
@@ -142,20 +136,7 @@ class Sessions:
             await self.authenticate_ego(session_id, token)
         elif (vehicle := await self._holder(record, token)) != record.ego_id:
             raise _ego_only(vehicle)
-        pages = self._pages(session_id, after, min(record.audit_seq, after + limit))
-        return _begun(await anext(pages, ""), pages)  # what fails at once can still be told
-
-    async def _pages(self, session_id: str, after: int, last: int) -> AsyncIterator[str]:
-        page = FIRST_PAGE
-        while after < last:
-            page = min(page, last - after)
-            lines = await self.store.audit(session_id, after, page)
-            if len(lines) < page:  # it is being purged, from its beginning on: what was sent must not look whole
-                raise SessionOver("the log was purged")
-            total = list(accumulate(map(len, lines)))
-            fitting = max(1, bisect_right(total, PAGE_BYTES))
-            after, page = after + fitting, min(PAGE, 2 * fitting)
-            yield "\n".join(lines[:fitting]) + "\n"
+        return await begun(pages(self.store, session_id, after, min(record.audit_seq, after + limit)))
 
     async def describe(self, caller: Caller) -> SessionState:
         """The session's state."""
@@ -322,13 +303,6 @@ class Sessions:
             live = self._live_session(record) if record.ended_at is None and self._is_served(record) else None
             await self.journal.stranger(record.session_id, live, refused)
             raise
-
-
-async def _begun(first: str, others: AsyncIterator[str]) -> AsyncIterator[str]:
-    if first:
-        yield first
-    async for page in others:
-        yield page
 
 
 @contextlib.contextmanager

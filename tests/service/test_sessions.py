@@ -12,7 +12,7 @@ from service.errors import SessionOver, StoreUnavailable
 from service.keeping.store import PAGE
 from service.keeping.tables import audit_lines
 from service.sessions.idle import Idle
-from service.sessions.sessions import FIRST_PAGE, PAGE_BYTES
+from service.sessions.pages import FIRST_PAGE, PAGE_BYTES
 from tests.service.conftest import EGO, TEAM, problem, serve
 
 

@@ -1,0 +1,46 @@
+"""A log as it is sent, some lines at a time."""
+
+from __future__ import annotations
+
+from bisect import bisect_right
+from collections.abc import AsyncIterator
+from itertools import accumulate
+
+from service.errors import SessionOver
+from service.keeping.store import PAGE, Store
+
+FIRST_PAGE = 4
+"""Lines of a log that are read first; then at most twice as many as were sent before."""
+PAGE_BYTES = 2**18
+"""What is sent of a log at a time, or one line: whoever stops to read it makes the gateway hold no more."""
+
+
+async def pages(store: Store, session_id: str, after: int, last: int) -> AsyncIterator[str]:
+    """The lines of a session's log with the numbers after ``after``, up to ``last``.
+
+    Raises
+    ------
+    SessionOver
+        If the log is purged meanwhile.
+    """
+    page = FIRST_PAGE
+    while after < last:
+        page = min(page, last - after)
+        lines = await store.audit(session_id, after, page)
+        if len(lines) < page:  # it is being purged, from its beginning on: what was sent must not look whole
+            raise SessionOver("the log was purged")
+        fitting = max(1, bisect_right(list(accumulate(map(len, lines))), PAGE_BYTES))
+        after, page = after + fitting, min(PAGE, 2 * fitting)
+        yield "\n".join(lines[:fitting]) + "\n"
+
+
+async def begun(pages: AsyncIterator[str]) -> AsyncIterator[str]:
+    """The same pages, of which the first is read already: what fails at once can still be told."""
+    return _after(await anext(pages, ""), pages)
+
+
+async def _after(first: str, others: AsyncIterator[str]) -> AsyncIterator[str]:
+    if first:
+        yield first
+    async for page in others:
+        yield page
