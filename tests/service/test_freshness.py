@@ -55,6 +55,10 @@ async def test_refusals_hide_no_equivocation(served, messages):
     problem(answer, 409, "equivocation")
     (record,) = await events(served.ego(session), "equivocation")
     assert record["vehicle_id"] == "car-2"
+    for frame in range(1, 5):
+        for message in (messages["car-2"], altered(messages["car-2"])):
+            await served.post(session, "messages", wire.pack_message(frame, "car-2", message), token)
+    assert [record["frame"] for record in await events(served.ego(session), "equivocation")] == [0, 1, 2, 3]
 
 
 async def test_an_equivocation_is_found_after_the_frame_was_answered(served, messages, benign):

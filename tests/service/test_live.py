@@ -2,6 +2,7 @@ import asyncio
 import gc
 import json
 import re
+import threading
 import time
 from contextlib import suppress
 from types import SimpleNamespace
@@ -50,6 +51,20 @@ def events_of(text):
 
 def told_by(batch):
     return json.loads(batch.event.decode().removeprefix("event: frames\ndata: "))
+
+
+async def test_a_log_is_put_into_words_off_the_event_loop(served, ego_message, benign, monkeypatch):
+    session, threads = await served.open(), []
+
+    def noting(line):
+        threads.append(threading.current_thread())
+        return "words"
+
+    monkeypatch.setattr("service.viewing.feed.sentence", noting)
+    await served.ego(session).post_frame(0, ego_message, benign)
+    await watched(served, session.session_id)
+    assert threads
+    assert threading.current_thread() not in threads
 
 
 async def test_what_is_watched_is_what_was_answered(served, ego_message, attacked):

@@ -13,6 +13,7 @@ from robosac.defenses.group_testing.findings import Findings
 from robosac.defenses.group_testing.knowledge import Knowledge
 from robosac.defenses.group_testing.lies import RULES, Lies
 from robosac.defenses.group_testing.memory import Memory
+from robosac.defenses.group_testing.model import CELLS, CLEAN
 from robosac.defenses.group_testing.posterior import Posterior
 from robosac.defenses.group_testing.steadiness import Steadiness
 from tests.robosac.defenses.group_testing.conversing import TEAM
@@ -168,6 +169,23 @@ def test_what_is_wrong_in_what_the_ego_sees_alone_is_nobodys_doing(aside, nobody
     before, after = suspected(world, ("car-2", "rsu"))
     assert (after < before) == nobodys
     assert bool(concluded(world, ("car-2", "rsu")).lies_in(("car-2", "rsu"))) != nobodys
+
+
+@pytest.mark.parametrize("kind", MODEL.kinds)
+def test_whoever_is_fused_where_nothing_is_wrong_is_cleared_of_every_kind_of_attack(kind):
+    """Also where the ego is steady, and by whatever its suspicion came."""
+    world, answer = World({}, lambda _: SEEN), ("car-2", "rsu")
+    found = Findings(knowledge(), Lies(), tuple(TEAM), ())
+    assert found.known.memory.steadiness.calm == 1.0
+    speaks = np.zeros(CLEAN + CELLS * len(MODEL.kinds))
+    first = CLEAN + CELLS * MODEL.kinds.index(kind)
+    speaks[first : first + CELLS] = 6.0
+    found.known.posterior.update(*found.known.rows([(), ("rsu",)]), speaks)
+    before = found.known.suspicion()["rsu"]
+    found.learn(world.judge(answer, None, 0))
+    conclude(found, answer)
+    after = found.known.suspicion()["rsu"]
+    assert np.log(before / (1 - before)) - np.log(after / (1 - after)) > 1.0
 
 
 def test_a_hole_that_nothing_fills_keeps_nobody_from_being_cleared():
