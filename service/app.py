@@ -107,6 +107,7 @@ def create_app(
         lifespan=lifespan,
         redirect_slashes=False,
         openapi_tags=TAGS,
+        openapi_url=None,  # FastAPI makes it on the loop; `api_pages` serves it
         docs_url=None,  # these pages load from elsewhere; `api_pages` are the same from here
         redoc_url=None,
     )

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import asyncio
 import json
 from collections.abc import AsyncIterator, Mapping
 from importlib.resources import files
@@ -11,7 +12,7 @@ from typing import Annotated, Any
 
 from fastapi import APIRouter, Depends, FastAPI, Query, Request
 from fastapi.openapi.docs import get_redoc_html, get_swagger_ui_html
-from fastapi.responses import HTMLResponse, Response
+from fastapi.responses import HTMLResponse, JSONResponse, Response
 from fastapi.security import HTTPAuthorizationCredentials, HTTPBearer
 from fastapi.sse import KEEPALIVE_COMMENT, EventSourceResponse, format_sse_event
 from fastapi.staticfiles import StaticFiles
@@ -44,6 +45,7 @@ API_HEADERS = {
 }
 """Both pages of the API hold inline scripts and styles; ReDoc would load a logo from its maker."""
 API_FILES = "/api-pages"
+OPENAPI = "/openapi.json"
 
 pages = APIRouter(tags=["live"])
 _bearer = HTTPBearer(
@@ -122,15 +124,21 @@ def _event(name: str, data: Mapping[str, Any]) -> bytes:
 
 
 def api_pages(app: FastAPI) -> None:
-    """Serve the pages that describe an app's API, with all that they load."""
+    """Serve what describes an app's API: as OpenAPI, and the pages for people, with all that they load."""
     static = str(files("fastapi_offline") / "static")
     app.mount(API_FILES, StaticFiles(directory=static), name="api-pages")
+
+    @app.get(OPENAPI, include_in_schema=False)
+    async def openapi(request: Request) -> Response:
+        root = request.scope.get("root_path", "")
+        # in a thread: to make it takes a tenth of a second, and to write it milliseconds
+        return await asyncio.to_thread(_described, app, {"servers": [{"url": root}]} if root else {})
 
     @app.get("/docs", include_in_schema=False)
     async def docs(request: Request) -> Response:
         root = request.scope.get("root_path", "")
         page = get_swagger_ui_html(
-            openapi_url=f"{root}{app.openapi_url}",
+            openapi_url=f"{root}{OPENAPI}",
             title=app.title,
             swagger_js_url=f"{root}{API_FILES}/swagger-ui-bundle.js",
             swagger_css_url=f"{root}{API_FILES}/swagger-ui.css",
@@ -142,13 +150,17 @@ def api_pages(app: FastAPI) -> None:
     async def redoc(request: Request) -> Response:
         root = request.scope.get("root_path", "")
         page = get_redoc_html(
-            openapi_url=f"{root}{app.openapi_url}",
+            openapi_url=f"{root}{OPENAPI}",
             title=app.title,
             redoc_js_url=f"{root}{API_FILES}/redoc.standalone.js",
             redoc_favicon_url=f"{root}/live/icon.svg",
             with_google_fonts=False,
         )
         return _framed(page)
+
+
+def _described(app: FastAPI, more: Mapping[str, Any]) -> Response:
+    return JSONResponse({**app.openapi(), **more})
 
 
 def _framed(page: HTMLResponse) -> Response:

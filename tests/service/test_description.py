@@ -2,11 +2,13 @@
 
 import asyncio
 import base64
+import threading
 from dataclasses import replace
 
 import jsonschema_rs
 import msgpack
 import pytest
+from fastapi import FastAPI
 
 from robosac import wire
 from robosac.audit.events import event_on
@@ -218,6 +220,14 @@ def as_text(value):
     if isinstance(value, list):
         return [as_text(item) for item in value]
     return {name: as_text(item) for name, item in value.items()} if isinstance(value, dict) else value
+
+
+async def test_it_is_made_off_the_event_loop(served, monkeypatch):
+    threads, made = [], FastAPI.openapi
+    monkeypatch.setattr(FastAPI, "openapi", lambda app: threads.append(threading.get_ident()) or made(app))
+    await served.http.get("/openapi.json")
+    assert threads
+    assert threading.get_ident() not in threads
 
 
 def conforms(value, schema, document=None):
