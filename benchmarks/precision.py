@@ -1,4 +1,4 @@
-"""What a narrower precision changes: verdicts, boxes and average precision, and how long a fusion takes.
+"""What a narrower precision changes: verdicts, boxes, average precision and testimony, and the time that they take.
 
 Every subset of teammates is decoded in float32 and in the other precision, in frames of validation scenes with one
 attacker of five, and compared with the ego's own boxes in the same precision.
@@ -16,11 +16,15 @@ from rich.progress import track
 from rich.table import Table
 
 from robosac.attacks import load_campaign
+from robosac.boxes import FloatArray
+from robosac.calibrated import witness_of
 from robosac.consensus import at_least, compare
-from robosac.detectors import DEFAULT_DETECTOR, load
+from robosac.defenses import EGO
+from robosac.detectors import DEFAULT_DETECTOR, Detector, load
 from robosac.evaluation.average_precision import AveragePrecision
-from robosac.evaluation.frames import evaluation_frames
+from robosac.evaluation.frames import EvaluationFrame, evaluation_frames
 from robosac.scenes import DEFAULT_DATA, SOURCES, Split
+from robosac.testimony import LIKELIHOOD
 
 PRECISIONS = ("float32", "bfloat16")
 
@@ -44,10 +48,15 @@ def main(
     likeness: list[float] = []
     precision = {name: {"alone": AveragePrecision(), "honest": AveragePrecision()} for name in rivals}
     times: dict[str, list[float]] = {name: [] for name in rivals}
+    reading: dict[str, list[float]] = {name: [] for name in rivals}
+    differs: list[float] = []
     total = len(chosen) * frames
     for frame in track(filter(None, played), "frames", total=total, console=console, transient=True):
         prepared = {name: rival.prepare(frame.ego, frame.teammates) for name, rival in rivals.items()}
         alone = {name: own.detect() for name, own in prepared.items()}
+        said_by = {name: testimony(rival, frame, reading[name]) for name, rival in rivals.items()}
+        if all(said is not None for said in said_by.values()):
+            differs.append(float(np.abs(np.subtract(*said_by.values())).mean()))
         subsets = chain.from_iterable(combinations(frame.team, n) for n in range(1, len(frame.team) + 1))
         for subset in subsets:
             found, sure = {}, {}
@@ -72,9 +81,24 @@ def main(
             table.add_row(f"AP{iou * 100:.0f}, {what}", *row)
     medians = [float(np.median(times[p])) for p in PRECISIONS]
     table.add_row("CPU time of a fusion, of that in float32", *(f"{m / medians[0]:.2f}" for m in medians))
+    if differs:
+        medians = [float(np.median(reading[p])) for p in PRECISIONS]
+        table.add_row("CPU time of testimony, of that in float32", *(f"{m / medians[0]:.2f}" for m in medians))
+        table.add_row("L of testimony: mean difference", "", f"{np.mean(differs):.3f}")
     table.add_row("verdicts that flip", "", f"{flips} of {verdicts}")
     table.add_row("Jaccard index of boxes: mean, least", "", f"{np.mean(likeness):.4f}, {min(likeness):.2f}")
     console.print(table)
+
+
+def testimony(detector: Detector, frame: EvaluationFrame, times: list[float]) -> FloatArray | None:
+    """L (agents, H, W) of what the messages of a frame say; None without a witness. Its time is added to the others."""
+    witness = witness_of(detector.info)
+    if witness is None:
+        return None
+    began = time.process_time()
+    said = witness.testify(EGO, {EGO: frame.ego, **frame.teammates})
+    times.append(time.process_time() - began)
+    return said.maps[:, LIKELIHOOD]
 
 
 if __name__ == "__main__":

@@ -10,6 +10,7 @@ from pathlib import Path
 
 from robosac.defenses.group_testing import Calibration, CalibrationError
 from robosac.detectors import DetectorInfo
+from robosac.detectors.base import Precision
 from robosac.detectors.weights_file import WeightsError
 from robosac.detectors.witness import Witness
 from robosac.screening import Bounds, Screening
@@ -82,13 +83,14 @@ def _read(path: Path, changed: int) -> Calibration:  # noqa: ARG001 (a changed f
     return Calibration.read(path)
 
 
-_witnesses: dict[tuple[Path, str], tuple[int, str, Witness]] = {}
+_witnesses: dict[tuple[Path, str, Precision], tuple[int, str, Witness]] = {}
 
 
 def _open(path: Path, changed: int, info: DetectorInfo) -> Witness:
-    known = _witnesses.get((path, info.device))
+    where = path, info.device, info.precision
+    known = _witnesses.get(where)
     if known is None or known[:2] != (changed, info.weights_digest):
-        known = _witnesses[path, info.device] = (changed, info.weights_digest, Witness.open(path, info))
+        known = _witnesses[where] = (changed, info.weights_digest, Witness.open(path, info))
     return known[2]
 
 

@@ -22,9 +22,8 @@ from robosac.detectors.base import (
     witness_beside,
 )
 from robosac.detectors.decoding import cell_centres, decode_all
-from robosac.detectors.device import CPU
 from robosac.detectors.map_fusion import FEATURES, Decode, Finder, Heads, MapFusionDetector, Maps, combined
-from robosac.detectors.network import CHANNELS, MAP, MeanFusionNetwork, fold_batchnorm
+from robosac.detectors.network import CHANNELS, MAP, FastDecoder, MeanFusionNetwork, fold_batchnorm
 from robosac.detectors.voxels import AREA_M, occupancy
 from robosac.detectors.weights_file import WeightsError, read_weights
 
@@ -109,7 +108,7 @@ class EmbeddedDetector(MapFusionDetector):
 
     def place(self) -> None:
         """As `MapFusionDetector.place`."""
-        self._placed = self._narrow if self.device == CPU else deepcopy(self._narrow).to(self.device)
+        self._placed = FastDecoder(self._narrow).to(self.device)
 
     def encode(self, points: FloatArray, pose: FloatArray) -> Message:
         """As `robosac.detectors.base.Encoder.encode`; the z of the pose is the sensor's height above ground, metres."""

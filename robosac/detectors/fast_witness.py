@@ -6,6 +6,7 @@ It computes what `robosac.detectors.witness_network.WitnessNetwork` does, which 
   height.
 - Its first weights are divided by the scale, and not the maps.
 - The channels of a cell lie side by side in memory, as convolutions are fastest.
+- Where the detector decodes in bfloat16, the convolutions between the first layer and the last do so too.
 """
 
 from __future__ import annotations
@@ -15,7 +16,7 @@ from collections.abc import Sequence
 import torch
 from torch.nn import functional
 
-from robosac.detectors.base import Message
+from robosac.detectors.base import Message, Precision
 from robosac.detectors.device import stacked
 from robosac.detectors.witness_network import DILATIONS, WIDTH, Layout, WitnessNetwork, told
 from robosac.testimony import LAYERS
@@ -29,10 +30,12 @@ class FastWitness:
     network : WitnessNetwork
         On the device where messages are to be read.
     layout : Layout
+    precision : str
     """
 
-    def __init__(self, network: WitnessNetwork, layout: Layout) -> None:
+    def __init__(self, network: WitnessNetwork, layout: Layout, precision: Precision = "float32") -> None:
         self._layout = layout
+        self._dtype = dtype = getattr(torch, precision)
         self._device = network.read.weight.device
         with torch.no_grad():
             read = network.read.weight[:, :, 0, 0].T / layout.scale
@@ -42,8 +45,8 @@ class FastWitness:
             self._height = network.place.weight[:, -1, 0, 0].repeat(1, layout.height * layout.width)
             self._blocks = [
                 (
-                    block.get_parameter("weight").clone(memory_format=torch.channels_last),
-                    block.get_parameter("bias").clone(),
+                    block.get_parameter("weight").to(dtype, memory_format=torch.channels_last, copy=True),
+                    block.get_parameter("bias").to(dtype, copy=True),
                     dilation,
                 )
                 for block, dilation in zip(network.blocks, DILATIONS, strict=True)
@@ -60,8 +63,8 @@ class FastWitness:
         hidden = torch.bmm(sent.mT, self._read.expand(len(sent), -1, -1)).flatten(1)
         hidden.add_(self._place).addmm_(heights[:, None], self._height).relu_()
         cells = hidden.view(-1, layout.height, layout.width, WIDTH)
-        maps = (cells.flip(2) if layout.mirrored else cells).permute(0, 3, 1, 2)
+        maps = (cells.flip(2) if layout.mirrored else cells).permute(0, 3, 1, 2).to(self._dtype)
         for weight, bias, dilation in self._blocks:
             maps = functional.conv2d(maps, weight, bias, 1, dilation, dilation).relu_().add_(maps)
-        said = torch.addmm(self._head[0], maps.permute(0, 2, 3, 1).flatten(0, 2), self._head[1])
+        said = torch.addmm(self._head[0], maps.permute(0, 2, 3, 1).flatten(0, 2).float(), self._head[1])
         return said.view(-1, layout.height, layout.width, LAYERS, u, u).permute(0, 3, 1, 4, 2, 5)

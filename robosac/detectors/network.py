@@ -7,9 +7,12 @@ convolutions of the decoder act on the fused map; the first one follows the mean
 from __future__ import annotations
 
 import math
+from collections.abc import Sequence
+from copy import deepcopy
 
 import torch
 from torch import nn
+from torch.nn import functional
 
 from robosac.detectors.voxels import LAYERS
 
@@ -18,6 +21,8 @@ MAP = 32
 HEAD = 64
 BOX_CHANNELS = 6
 """Offset x, y (m), log length, log width, cos and sin of twice the yaw."""
+AT_A_TIME = 16
+"""Numbers of 32 bits that a processor works on at a time."""
 
 
 def _block(inputs: int, outputs: int, stride: int = 1) -> nn.Sequential:
@@ -59,6 +64,43 @@ class MeanFusionNetwork(nn.Module):
         """Fused features (n, 64, 32, 32) -> class logits (n, 64, 64) and box codes (n, 6, 64, 64)."""
         shared = self.decoder(fused)
         return self.class_head(shared)[:, 0], self.box_head(shared)
+
+
+class FastDecoder(nn.Module):
+    """What `MeanFusionNetwork.decode` does, in less time; for inference only.
+
+    The two heads are one convolution. Outputs are filled up with zeros to multiples of `AT_A_TIME`: a processor makes
+    48 channels faster than 40.
+
+    Parameters
+    ----------
+    network : MeanFusionNetwork
+        Its batch norms folded.
+    """
+
+    def __init__(self, network: MeanFusionNetwork) -> None:
+        super().__init__()
+        *first, block = deepcopy(network.decoder).children()
+        last = _filled_up([next(block.children())], 0)
+        heads = _filled_up([network.class_head, network.box_head], last.out_channels)
+        self.steps = nn.Sequential(*first, last, nn.ReLU(inplace=True), heads)
+        self.requires_grad_(False).to(memory_format=torch.channels_last)  # type: ignore[call-overload]
+
+    def decode(self, fused: torch.Tensor) -> tuple[torch.Tensor, torch.Tensor]:
+        """As `MeanFusionNetwork.decode`."""
+        heads = self.steps(fused)
+        return heads[:, 0].contiguous(), heads[:, 1 : 1 + BOX_CHANNELS]
+
+
+def _filled_up(convolutions: Sequence[nn.Module], inputs: int) -> nn.Conv2d:
+    """Convolutions of the same map as one, its outputs filled up; it may have more inputs than they."""
+    weight, bias = (torch.cat([conv.get_parameter(name) for conv in convolutions]) for name in ("weight", "bias"))
+    outputs, known, size, _ = weight.shape
+    spare, more = max(0, inputs - known), -outputs % AT_A_TIME
+    conv = nn.Conv2d(known + spare, outputs + more, size, padding=size // 2)
+    conv.weight = nn.Parameter(functional.pad(weight, (0, 0, 0, 0, 0, spare, 0, more)))
+    conv.bias = nn.Parameter(functional.pad(bias, (0, more)))
+    return conv
 
 
 def fold_batchnorm(module: nn.Module) -> nn.Module:

@@ -15,7 +15,7 @@ import numpy as np
 import torch
 
 from robosac.boxes import FloatArray
-from robosac.detectors.base import DetectorInfo, Message
+from robosac.detectors.base import DetectorInfo, Message, Precision
 from robosac.detectors.device import as_device
 from robosac.detectors.fast_witness import FastWitness
 from robosac.detectors.warp import sampling_matrices, warp
@@ -42,12 +42,14 @@ class Witness:
         On the device where messages are to be read. What `testify` does with it is made ready here: a network that
         learns more needs another witness.
     layout : Layout
+    precision : str
+        That of the detector, see `FastWitness`.
     """
 
-    def __init__(self, network: WitnessNetwork, layout: Layout) -> None:
+    def __init__(self, network: WitnessNetwork, layout: Layout, precision: Precision = "float32") -> None:
         self.network = network.eval().requires_grad_(False)
         self.layout = layout
-        self._fast = FastWitness(self.network, layout)
+        self._fast = FastWitness(self.network, layout, precision)
 
     def testify(
         self,
@@ -137,7 +139,7 @@ class Witness:
 
     @classmethod
     def open(cls, path: Path, info: DetectorInfo) -> Witness:
-        """Read what `write` wrote for this detector, to its device.
+        """Read what `write` wrote for this detector, to its device and in its precision.
 
         Raises
         ------
@@ -156,7 +158,7 @@ class Witness:
             network.load_state_dict({name: tensor.float() for name, tensor in tensors.items()})
         except RuntimeError as error:
             raise WeightsError(f"{path} does not fit the messages of {info.name}: {error}") from error
-        return cls(network.to(as_device(info.device)), layout)
+        return cls(network.to(as_device(info.device)), layout, info.precision)
 
 
 def as_testimony(agents: tuple[str, ...], maps: Float16Array, from_ego: FloatArray, half_extent_m: float) -> Testimony:

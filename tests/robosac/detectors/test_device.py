@@ -76,7 +76,7 @@ def test_nothing_is_shared_with_the_detector_that_was_placed(there, detector, eg
     assert isinstance(detector, Placeable)
     near = far.on_device("cpu")
     with torch.inference_mode():
-        near._network.class_head.bias += 5.0
+        near._placed.steps[-1].bias += 5.0
     np.testing.assert_array_equal(detector.prepare(ego_message, {}).detect(), far.prepare(ego_message, {}).detect())
     assert (detector.info.device, far.info.device, near.info.device) == ("cpu", there, "cpu")
 
@@ -85,7 +85,7 @@ def test_precision_and_device_go_together(there, ego_message, benign):
     narrow = load("intersection-mean@bfloat16")
     for far in (load("intersection-mean@bfloat16", device=there), load(device=there).in_precision("bfloat16")):
         assert (far.info.name, far.info.device) == ("intersection-mean@bfloat16", there)
-        assert far._placed.class_head.weight.device.type == there
+        assert far._placed.steps[-1].weight.device.type == there
         found, expected = (each.prepare(ego_message, benign).detect(list(benign)) for each in (far, narrow))
         np.testing.assert_allclose(found[:10], expected[:10], atol=0.05)
 

@@ -12,7 +12,7 @@ from robosac.boxes import pairwise_iou, pose_matrix
 from robosac.detectors import EmbeddedDetector, Message, WeightsError, available, load
 from robosac.detectors.base import in_precision
 from robosac.detectors.embedded import SHIPPED_WEIGHTS
-from robosac.detectors.network import CHANNELS, MAP, MeanFusionNetwork, fold_batchnorm
+from robosac.detectors.network import CHANNELS, MAP, FastDecoder, MeanFusionNetwork, fold_batchnorm
 from robosac.detectors.weights_file import read_weights
 from robosac.scenes.splits import TRAINING_SEEDS, VALIDATION_SEEDS
 
@@ -61,6 +61,17 @@ def test_a_folded_network_computes_the_same(rng):
     maps = torch.from_numpy(rng.random((1, CHANNELS, MAP, MAP))).float()
     with torch.inference_mode():
         torch.testing.assert_close(folded.decode(maps), plain.decode(maps), atol=1e-5, rtol=1e-4)
+
+
+@pytest.mark.parametrize(("dtype", "near"), [(torch.float32, 1e-5), (torch.bfloat16, 0.1)])
+def test_the_fast_decoder_computes_the_same(dtype, near, rng):
+    tensors, _ = read_weights(SHIPPED_WEIGHTS)
+    network = MeanFusionNetwork()
+    network.load_state_dict({name: tensor.float() for name, tensor in tensors.items()})
+    fold_batchnorm(network.eval()).to(dtype)
+    maps = torch.from_numpy(rng.random((2, CHANNELS, MAP, MAP))).to(dtype)
+    with torch.inference_mode():
+        torch.testing.assert_close(FastDecoder(network).decode(maps), network.decode(maps), atol=near, rtol=near)
 
 
 def test_in_bfloat16_it_sees_the_same(detector, ego_message, benign):

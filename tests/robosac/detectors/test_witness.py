@@ -8,12 +8,13 @@ import pytest
 import torch
 
 from robosac.boxes import pose_matrix
+from robosac.calibrated import witness_of
 from robosac.detectors import DetectorInfo, Message, TensorSpec
 from robosac.detectors.fast_witness import FastWitness
 from robosac.detectors.weights_file import WeightsError
 from robosac.detectors.witness import AT_ONCE, LARGEST, Witness
 from robosac.detectors.witness_network import GEOMETRY, HIGHEST_M, USUAL_M, Layout, WitnessNetwork
-from robosac.testimony import LAYERS
+from robosac.testimony import LAYERS, LIKELIHOOD, X
 
 MAP = {"other": TensorSpec("float16", (2, 8, 8)), "map": TensorSpec("float32", (4, 16, 16))}
 INFO = DetectorInfo("fake", {"ego": {}, "teammate": MAP}, (-32, -32, 32, 32), 4.0, "d" * 64, 0.5)
@@ -80,6 +81,17 @@ def test_messages_are_read_as_the_network_reads_maps(mirrored, rng):
         np.testing.assert_allclose(reader.read_message(sent[name]), maps, rtol=1e-3, atol=1e-3)
         found = FastWitness(reader.network, reader.layout).read([sent[name]]).flatten(4).flatten(2, 3)[0]
         np.testing.assert_allclose(found, maps, atol=1e-5 * np.abs(maps).max())
+
+
+def test_with_a_narrow_detector_messages_are_read_in_its_precision(detector, ego_message, benign):
+    """As the same, but for rounding."""
+    sent = [ego_message, *benign.values()]
+    wide, narrow = (witness_of(each.info) for each in (detector, detector.in_precision("bfloat16")))
+    assert witness_of(detector.info) is wide
+    wide_maps, maps = (np.stack([reader.read_message(each) for each in sent]) for reader in (wide, narrow))
+    off = np.abs(maps.astype(np.float64) - wide_maps).max(axis=(0, 2, 3))
+    assert 0.01 < off[LIKELIHOOD] < 0.3
+    assert (off[X:] < 0.1).all()
 
 
 def test_what_there_is_no_time_for_says_nothing(rng):
