@@ -7,7 +7,8 @@ A message is refused only on evidence that cannot be turned against somebody hon
 
 - its values are far beyond all that honest messages of the detector were seen to hold (``implausible``);
 - it is what its sender sent from another place, byte for byte or closer than two scans of one unchanged place ever are
-  (``repeated``). A parked vehicle cannot fail that;
+  (``repeated``). A parked vehicle cannot fail that. Nor can one in a tunnel, where all places look the same: it has to
+  be closer, too, than what the ego itself sends from two places;
 - it is, byte for byte, what another vehicle had sent first in a frame of which it is remembered that this one sent
   something else in it, or what the ego has sent (``copied``). Whoever was silent then may have been overheard, and its
   message sent in its place.
@@ -37,7 +38,7 @@ MARGIN = 2.0
 MOVED_M = 3.0
 """From this far on a sender is somewhere else: well beyond what the error of a parked vehicle's pose makes of it."""
 STEADIER = 4.0
-"""A repetition differs so many times less than two maps of a sender that stands still."""
+"""A repetition differs so many times less than two maps of a sender that stands still, or of the ego as it drives."""
 NEAR = 0.9
 """From this correlation on a map that was sent elsewhere is told to be alike; honest ones in traffic reach .65."""
 ALIKE = 0.8
@@ -120,13 +121,15 @@ class Screening:
             name: _Seen(frame, _at(told.get(name, ego)), one, text, pasts[name], before.get(name))
             for (name, one), text in zip(prints.items(), texts, strict=True)
         }
+        differs = None if EGO not in seen else seen[EGO].differing
+        bound = self._repeating(differs)
         silent = {name: past for name, past in memory.items() if name not in seen and recent(past, frame)}
         refused, earlier = {}, _earlier({**pasts, **{name: Past.from_json(past) for name, past in silent.items()}})
         for name, one in seen.items():
-            if name != EGO and (why := self._implausible(one) or _copied(name, seen, earlier) or self._repeated(one)):
+            if name != EGO and (why := self._implausible(one) or _copied(name, seen, earlier) or _repeated(one, bound)):
                 often = one.past.refused + 1 >= NAMED_AFTER
                 refused[name] = replace(why, distrust=Distrust.NAMED) if often else why
-        kept = {name: one.remembered(self, name in refused) for name, one in seen.items()}
+        kept = {name: one.remembered(bound, name in refused, name == EGO) for name, one in seen.items()}
         return Screened(refused, _alike(seen), {**silent, **kept})
 
     def _implausible(self, seen: _Seen) -> Rejection | None:
@@ -139,21 +142,14 @@ class Screening:
             return Rejection(Reason.IMPLAUSIBLE, {"tensor": name, **shown, **most})
         return None
 
-    def _repeated(self, seen: _Seen) -> Rejection | None:
-        """A map that its sender sent from elsewhere."""
-        for sent in seen.past.sent:
-            if sent.digest == seen.print.digest and seen.moved_from(sent.place) > MOVED_M:
-                return _repetition(seen, sent.first, sent.place, 1.0)
-        anchor = seen.past.anchor
-        if seen.print.blank:
-            return None
-        if anchor is not None and self.bounds and seen.moved_from(anchor.place) > MOVED_M:
-            assert seen.anchored is not None
-            correlation = likeness(seen.anchored, seen.print.sketch)
-            still = max(bounds.still for bounds in self.bounds.values())
-            if 1.0 - correlation < (1.0 - still) / STEADIER:
-                return _repetition(seen, anchor.frame, anchor.place, correlation)
-        return None
+    def _repeating(self, differs: float | None) -> float:
+        """By how much less two maps from different places have to differ for the later to be a repetition, where those
+        of the ego differ by so much; 0 where nothing is known of honest ones.
+        """
+        if not self.bounds:
+            return 0.0
+        still = 1.0 - max(bounds.still for bounds in self.bounds.values())
+        return (still if differs is None else min(still, differs)) / STEADIER
 
 
 @dataclass(frozen=True)
@@ -181,7 +177,20 @@ class _Seen:
     def moved_from(self, place: Place) -> float:
         return math.dist(self.place, place)
 
-    def remembered(self, screening: Screening, refused: bool) -> dict[str, Any]:
+    @property
+    def differs(self) -> float | None:
+        """1 less the correlation of its map with its anchor; None if that is not from elsewhere."""
+        if self.past.anchor is None or self.print.blank or self.moved_from(self.past.anchor.place) <= MOVED_M:
+            return None
+        assert self.anchored is not None
+        return 1.0 - likeness(self.anchored, self.print.sketch)
+
+    @property
+    def differing(self) -> float | None:
+        """The same of its latest map whose anchor was from elsewhere."""
+        return self.past.differs if self.differs is None else round(self.differs, 6)
+
+    def remembered(self, bound: float, refused: bool, is_ego: bool) -> dict[str, Any]:
         digest, again = self.print.digest, False
         sent = []
         for each in self.past.sent:
@@ -192,16 +201,28 @@ class _Seen:
                 sent.append(each)
         if not again and not self.print.blank:
             sent.append(Sent(digest, self.frame, self.frame, self.place))
-        return Past(tuple(sent), self._anchor(screening), self.past.refused + refused).as_json()
+        differs = self.differing if is_ego else None
+        return Past(tuple(sent), self._anchor(bound), self.past.refused + refused, differs).as_json()
 
-    def _anchor(self, screening: Screening) -> Anchor:
+    def _anchor(self, bound: float) -> Anchor:
         """The one of before while it is recent and not far; one that repeats itself is kept, to be found out again."""
         before = self.past.anchor
         if before is not None and is_kept(before.frame, self.frame):
             far = self.moved_from(before.place) > MOVED_M
-            if not far or screening._repeated(self) is not None:
+            if not far or _repeated(self, bound) is not None:
                 return before
         return Anchor(self.frame, self.place, self.text)
+
+
+def _repeated(seen: _Seen, bound: float) -> Rejection | None:
+    """A map that its sender sent from elsewhere: the same, or one that differs by less than a bound."""
+    for sent in seen.past.sent:
+        if sent.digest == seen.print.digest and seen.moved_from(sent.place) > MOVED_M:
+            return _repetition(seen, sent.first, sent.place, 1.0)
+    anchor, differs = seen.past.anchor, seen.differs
+    if anchor is None or differs is None or differs >= bound:
+        return None
+    return _repetition(seen, anchor.frame, anchor.place, 1.0 - differs)
 
 
 def _earlier(pasts: Mapping[str, Past]) -> dict[str, list[tuple[str, int]]]:

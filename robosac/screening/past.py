@@ -42,6 +42,8 @@ class Past:
     anchor: Anchor | None = None
     refused: int = 0
     """Messages that were refused."""
+    differs: float | None = None
+    """Of the ego: 1 less the correlation of its latest two maps from different places; None before there are such."""
 
     @classmethod
     def from_json(cls, fields: Mapping[str, Any] | None) -> Past:
@@ -50,7 +52,7 @@ class Past:
             return cls()
         sent = tuple(Sent(digest, first, last, (x, y)) for digest, first, last, x, y in fields["sent"])
         frame, x, y, sketch = fields["anchor"]
-        return cls(sent, Anchor(frame, (x, y), sketch), int(fields.get("refused", 0)))
+        return cls(sent, Anchor(frame, (x, y), sketch), int(fields.get("refused", 0)), fields.get("differs"))
 
     def as_json(self) -> dict[str, Any]:
         """JSON values; there must be an anchor."""
@@ -59,6 +61,7 @@ class Past:
             "sent": [[each.digest, each.first, each.last, *each.place] for each in self.sent],
             "anchor": [self.anchor.frame, *self.anchor.place, self.anchor.text],
             **({"refused": self.refused} if self.refused else {}),
+            **({} if self.differs is None else {"differs": self.differs}),
         }
 
 

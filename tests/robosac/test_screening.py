@@ -37,7 +37,7 @@ class Frames:
         self.draw, self.screening, self.memory, self.frame = draw, screening, {}, 0
 
     def __call__(self, ego=None, /, **teammates):
-        ego = at(0.0, self.draw() if ego is None else ego)
+        ego = ego if isinstance(ego, Message) else at(0.0, self.draw() if ego is None else ego)
         screened = self.screening.screen(self.memory, self.frame, ego, teammates)
         self.memory = json.loads(json.dumps(screened.memory))
         self.frame += 1
@@ -151,6 +151,18 @@ def test_a_near_repetition_is_only_told_where_honest_scans_are_as_close(draw, rn
             assert screened.refused == {}
             told = [(each.vehicle, each.other, each.of_frame) for each in screened.alike]
             assert told == ([("a", "a", frame - 1)] if frame else [])
+
+
+def test_in_a_tunnel_where_the_ego_repeats_itself_as_much_nobody_does(draw, rng):
+    """With clean scanners all places look the same there; whoever sends one map again is closer than that."""
+    play, walls, frozen, repeated = Frames(draw), draw(), draw(), 0
+    for frame in range(24):  # the ego is somewhere else in every second frame only
+        ego = at(2.0 * frame, noisy(walls, 0.02, rng))
+        sent = {"a": at(4.0 * frame, noisy(walls, 0.02, rng)), "b": at(4.0 * frame, noisy(frozen, 0.005, rng))}
+        refused = set(play(ego, **sent).refused)
+        assert "a" not in refused or frame == 1  # before the ego was anywhere else
+        repeated += "b" in refused
+    assert repeated >= 20
 
 
 def test_what_another_had_sent_before_is_copied(draw):
