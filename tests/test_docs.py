@@ -1,5 +1,6 @@
 import asyncio
 import csv
+import hashlib
 import itertools
 import json
 import re
@@ -14,6 +15,8 @@ from clients.local_gateway import local_gateway
 from clients.simulation import Fleet
 from robosac import attacks, defenses, detectors, plugins
 from robosac.cli import app
+from robosac.detectors import Message
+from robosac.wire import content_digest
 from service.errors import Kind
 from service.problems import ANSWERS
 from service.settings import Settings
@@ -37,6 +40,22 @@ async def test_the_session_of_the_api_page_can_be_opened():
     async with serve() as served:
         response = await served.http.post("/v1/sessions", json=json.loads(block))
         assert response.status_code == 201, response.text
+
+
+def test_the_digest_of_the_api_page_is_what_is_computed():
+    text = (ROOT / "docs" / "api.md").read_text()
+    (block,) = re.findall(r"^```text\n(0000.*?)\nsha256 ([0-9a-f]{64})\n```", text, re.MULTILINE | re.DOTALL)
+    hashed, told = block
+    pose = np.eye(4)
+    pose[2, 3] = 2.0
+    message = Message(pose, {"map": np.array([[[0.5, -1.0], [0.0, 2.0]]], dtype=np.float16)})
+    assert told == content_digest(7, "car-2", message)
+    assert told == hashlib.sha256(bytes.fromhex(hashed.replace("\\", ""))).hexdigest()
+
+
+def test_every_attack_that_ships_has_its_row():
+    text = (ROOT / "docs" / "own-attack.md").read_text()
+    assert not {name for name in attacks.ATTACKS if f"`{name}`" not in text}
 
 
 def test_links_between_pages_lead_somewhere():
