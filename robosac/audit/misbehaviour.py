@@ -40,6 +40,10 @@ class NothingToReport(ValueError):
     """A log that says nothing against a vehicle."""
 
 
+class NeverThere(NothingToReport):
+    """A log of a session in which the vehicle never was."""
+
+
 def report(lines: Iterable[bytes], vehicle: str, now: datetime) -> dict[str, Any]:
     """A misbehaviour report on one vehicle.
 
@@ -62,12 +66,15 @@ def report(lines: Iterable[bytes], vehicle: str, now: datetime) -> dict[str, Any
     Raises
     ------
     NothingToReport
+        Or `NeverThere`, which is one.
     RecordError
         If a record is not what its event has to be.
     """
     case = _Case(vehicle)
     for line in lines:
         case.take(line.removesuffix(b"\n"))
+    if vehicle not in case.team:
+        raise NeverThere(f"{vehicle} was never in the session; these were: {', '.join(case.team)}")
     if not case.observations:
         raise NothingToReport(f"the log holds neither a dissensus nor an equivocation of {vehicle}")
     return {
@@ -106,6 +113,8 @@ class _Case:
     vehicle: str
     session: SessionOpened | None = None
     session_id: str = ""
+    team: dict[str, None] = field(default_factory=dict)
+    """All who ever were in the session, the ego first."""
     last_seq: int = 0
     head: str = GENESIS
     key: str | None = None
@@ -123,8 +132,10 @@ class _Case:
         match event_of(record):
             case SessionOpened() as opened:
                 self.session = opened
+                self.team |= dict.fromkeys([opened.ego_id, *opened.teammates])
                 self.key = opened.public_keys.get(self.vehicle)
             case TeamChanged() as change:
+                self.team |= dict.fromkeys(change.teammates)
                 self.key = change.public_keys.get(self.vehicle)
             case FrameAnswered() as answer:
                 self._take_answer(answer)

@@ -119,9 +119,11 @@ def _why(entry: RejectedTeammate) -> str:
 
 
 def _refused(event: MessageRefused) -> str:
+    no_message = event.frame is None and event.reason is Reason.UNAUTHENTICATED  # such as a teammate's DELETE
+    what = "A request" if no_message else "A message"
     frame = "" if event.frame is None else f" for frame {event.frame}"
-    field = "" if event.field is None else f"{event.field}: "
-    return f"A message of {event.vehicle_id}{frame} was refused ({REASONS[event.reason]}): {field}{event.detail}"
+    field = f"{event.field}: " if event.field else ""
+    return f"{what} of {event.vehicle_id}{frame} was refused ({REASONS[event.reason]}): {field}{event.detail}"
 
 
 def _no_access(event: AccessRefused) -> str:

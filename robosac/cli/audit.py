@@ -27,6 +27,8 @@ from robosac.files import write_text
 
 app = typer.Typer(no_args_is_help=True, add_completion=False, help=__doc__)
 
+MOST_FINDINGS = 20
+"""That are told one by one: of a file that is no log at all, every line is one."""
 Log = Annotated[Path, typer.Argument(help="The audit log (JSON Lines).", metavar="FILE")]
 
 
@@ -50,8 +52,10 @@ def verify(
     with blaming("FILE", OSError), file.open("rb") as lines:
         log = _Counted(lines_in(lines))
         findings = verification.verify(log, head, promised)
-    for finding in findings:
+    for finding in findings[:MOST_FINDINGS]:
         _say(finding)
+    if len(findings) > MOST_FINDINGS:
+        _say(f"... and {len(findings) - MOST_FINDINGS} more")
     for doubt in promised.doubts if promised else ():
         _say(f"{receipts}: {doubt}", err=True)
     if findings:
@@ -66,8 +70,11 @@ def verify(
 
 @app.command()
 def show(file: Log) -> None:
-    """Tell what a log says, a sentence a record; 1 if a line is no record. It proves nothing: that is for `verify`."""
-    broken = 0
+    """Tell what a log says, a sentence a record; 1 if a line is no record, or if there is none.
+
+    It proves nothing: that is for `verify`.
+    """
+    number = broken = 0
     for number, line in enumerate(_lines(file), 1):
         try:
             record, told = read(line.removesuffix(b"\n")), sentence(line)
@@ -76,7 +83,9 @@ def show(file: Log) -> None:
             _say(f"line {number}: {error}", err=True)
         else:
             _say(f"{record.get('seq', '?')} {record.get('time', '')} {told}")
-    if broken:
+    if not number:
+        _say(f"{file}: the log is empty", err=True)
+    if broken or not number:
         raise typer.Exit(1)
 
 
@@ -131,7 +140,10 @@ def report(
     out: Annotated[Path | None, typer.Option(help="Where to write it; by default to standard output.")] = None,
     force: Force = False,
 ) -> None:
-    """Write what a log says against a vehicle, in the terms of ETSI TS 103 759; 1 if it says nothing or is broken."""
+    """Write what a log says against a vehicle, in the terms of ETSI TS 103 759; 1 if it says nothing or is broken.
+
+    2 if the vehicle was never in the session.
+    """
     if out is not None:
         check_file(out, "--out", force)
     try:
@@ -146,14 +158,15 @@ def report(
             fields = misbehaviour.report(checked, vehicle, datetime.now(UTC))
     except misbehaviour.NothingToReport as nothing:
         _say(f"{file}: {nothing}", err=True)
-        raise typer.Exit(1) from nothing
+        raise typer.Exit(2 if isinstance(nothing, misbehaviour.NeverThere) else 1) from nothing
     text = json.dumps(fields, indent=2) + "\n"
     if out is None:
         typer.echo(text, nl=False)
         return
     with blaming("--out", OSError):
         write_text(out, text)
-    _say(f"{out}: {len(fields['report']['content']['v2xPduEvidence'])} observations of {vehicle}")
+    count = len(fields["report"]["content"]["v2xPduEvidence"])
+    _say(f"{out}: {count} observation{'' if count == 1 else 's'} of {vehicle}")
 
 
 @dataclass

@@ -140,6 +140,11 @@ def test_the_command_writes_a_report_from_a_sound_log_only(lines, tmp_path):
     code, said = run(log, "--vehicle", "car-3")
     assert code == 1
     assert "neither a dissensus nor an equivocation of car-3" in said
+    code, said = run(log, "--vehicle", "car-9")
+    assert code == 2
+    assert "car-9 was never in the session; these were: car-1, car-2, rsu, car-3, car-4" in said
+    one = tmp_path / "one.json"
+    assert run(log, "--vehicle", "rsu", "--out", one) == (0, f"{one}: 1 observation of rsu\n")
     assert run(log, "--vehicle", "car-2", "--out", tmp_path)[0] == 2
     log.write_bytes(b"".join(lines[1:]))
     code, said = run(log, "--vehicle", "car-2")

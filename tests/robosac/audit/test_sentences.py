@@ -71,6 +71,9 @@ def test_a_frame_is_told_with_who_was_left_out_and_why(events):
         ("session_ended", {"why": "of old"}, "The session ended: of old."),
         ("message_refused", {"frame": None, "field": None, "detail": "it said"}, " was refused ("),
         ("message_refused", {"frame": 3, "field": "pose", "detail": "it said"}, "for frame 3 was refused ("),
+        ("message_refused", {"frame": None, "reason": "malformed", "field": "", "detail": "it said"}, "A message of "),
+        ("message_refused", {"frame": None, "reason": "unauthenticated", "field": ""}, "A request of "),
+        ("message_refused", {"reason": "unauthenticated", "field": "", "detail": "it said"}, "cated): it said."),
     ],
 )
 def test_a_record_is_told_as_it_is(kind, changes, said, events):
@@ -114,6 +117,9 @@ def test_the_command_shows_a_log_and_obeys_no_word_of_it(events, tmp_path):
     assert broken.exit_code == 1
     assert "line 3: not JSON" in broken.output
     assert broken.output.splitlines()[-1].endswith(sentence(lines[1]))
+    path.write_bytes(b"")
+    empty = CliRunner().invoke(app, ["audit", "show", str(path)])
+    assert (empty.exit_code, empty.output) == (1, f"{path}: the log is empty\n")
     assert CliRunner().invoke(app, ["audit", "show", "/nowhere"]).exit_code == 2
 
 

@@ -1,8 +1,10 @@
 import json
 
 import pytest
+from typer.testing import CliRunner
 
 from robosac.audit import Fault, digest, seal, verify
+from robosac.cli import app
 from tests.robosac.audit.conftest import head, proof, seal_all
 
 
@@ -258,3 +260,13 @@ def test_records_that_lack_something_are_told(events, index, name, value):
 def test_a_finding_says_where_and_what(events):
     finding, _ = verify(change(events, 2, frame=0))
     assert str(finding) == "line 3 (seq 3): frame-order: frame 0 after frame 0"
+
+
+def test_the_command_stops_after_twenty_findings(tmp_path):
+    log = tmp_path / "log.jsonl"
+    log.write_bytes(b"x\n" * 30)
+    result = CliRunner().invoke(app, ["audit", "verify", str(log)])
+    *findings, more, total = result.output.splitlines()
+    assert result.exit_code == 1
+    assert len(findings) == 20
+    assert (more, total) == ("... and 10 more", f"{log}: findings: 30")
