@@ -56,6 +56,8 @@ def replay(
         If messages were not recorded, are none for the detector, or the recorded settings make no defence.
     """
     as_it_was = defense is None
+    for frame in session.frames[:1]:  # a detector of another layout lacks more than what the defence needs
+        _messages(frame, detector, session.opening.ego_id)
     chosen = _recorded_defense(session, detector, kinds) if defense is None else defense
     running: Session | None = None
     team: tuple[str, ...] = ()

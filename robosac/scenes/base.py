@@ -129,9 +129,13 @@ def encoded(view: View, detector: Encoder) -> Message:
         return detector.encode(view.points, view.pose)
     held = {name: TensorSpec(array.dtype.name, array.shape) for name, array in message.tensors.items()}
     if not any(wanted.items() <= held.items() for wanted in detector.info.tensors.values()):
-        shown = ", ".join(f"{name} of {spec.dtype} {list(spec.shape)}" for name, spec in held.items())
-        raise SceneError(f"the recorded messages hold {shown}: they are none for the detector {detector.info.name}")
+        wanted, found = map(_listed, (detector.info.tensors["ego"], held))
+        raise SceneError(f"the detector {detector.info.name} takes {wanted}; the recorded messages hold {found}")
     return Message(view.pose, message.tensors)
+
+
+def _listed(specs: Mapping[str, TensorSpec]) -> str:
+    return ", ".join(f"{name} of {spec.dtype} {list(spec.shape)}" for name, spec in specs.items())
 
 
 def first_scenes(source: SceneSource, split: Split, count: int, frames: int = 1, team: int = 1) -> list[Scene]:

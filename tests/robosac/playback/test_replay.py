@@ -1,8 +1,10 @@
 import dataclasses
+from types import SimpleNamespace
 
 import pytest
 
 from robosac.defenses import build, read_settings
+from robosac.detectors.base import DetectorInfo, TensorSpec
 from robosac.playback.comparing import Compared
 from robosac.playback.replay import replay
 from robosac.recording.reading import RecordingError, sessions
@@ -56,6 +58,13 @@ def test_a_defence_that_is_not_known_is_named(session, detector):
     opening = session.opening.model_copy(update={"defense": {"kind": "nonesuch"}})
     with pytest.raises(RecordingError, match="make no defence"):
         list(replay(dataclasses.replace(session, opening=opening), detector))
+
+
+def test_the_layout_of_messages_is_compared_before_the_defence(session):
+    tensors = {"map": TensorSpec("float32", (2, 3))}
+    info = DetectorInfo("other", {"ego": tensors, "teammate": tensors}, (0, 0, 1, 1), 1.0, "", 0.1)
+    with pytest.raises(RecordingError, match=r"other takes map of float32 \[2, 3\]; the recorded messages hold feat"):
+        next(replay(session, SimpleNamespace(info=info)))
 
 
 def test_a_team_that_changed_is_the_one_that_decides(detector, some, tmp_path):
