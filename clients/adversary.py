@@ -39,6 +39,7 @@ from clients.load_test import WARM_UP_FRAMES, Bodies, new_ego, prepare
 from clients.local_gateway import GatewayProcess
 
 REPORT = "adversary.json"
+ONLY_HELP = f"Attacks to play, such as --only '{Attack.IDLE}' --only '{Attack.LONG}'; by default all."
 HONEST_HZ = 5.0
 CLOCK_MS = 5.0
 """What the ego's clock sees more than the gateway's, on one machine: the way there and back."""
@@ -202,13 +203,13 @@ def show(console: Console, results: Sequence[Result], plan: Plan) -> None:
             f"{result.memory_mib:.0f}",
             "-" if result.recovered_after is None else f"{result.recovered_after} frames",
         )
-    console.print(table)
+    trial.print_whole(console, table)
 
 
 def main(
     out: trial.Out = None,
     force: trial.Force = False,
-    only: Annotated[list[Attack] | None, typer.Option(help="Attacks to play; by default all.")] = None,
+    only: Annotated[list[Attack] | None, typer.Option(help=ONLY_HELP)] = None,
     seconds: trial.Seconds = 4.0,
     budget_ms: trial.Budget = 200.0,
     at_least: Annotated[

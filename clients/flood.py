@@ -202,7 +202,7 @@ def show(console: Console, results: Results) -> None:
     table = trial.a_table(f"Budget {BUDGET_MS:g} ms", ["strangers", *(strangers.value for strangers in results)])
     for name in columns[0]:
         table.add_row(name, *(column[name] for column in columns))
-    console.print(table)
+    trial.print_whole(console, table)
 
 
 def main(

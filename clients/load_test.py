@@ -202,8 +202,8 @@ def show(console: Console, results: Sequence[Figures], bytes_a_frame: int, budge
             str(sum(figures.errors.values())),
         )
         stages.add_row(*label, *(trial.shown(values["stages_ms"].get(name), 1) for name in names))
-    console.print(table)
-    console.print(stages)
+    trial.print_whole(console, table)
+    trial.print_whole(console, stages)
 
 
 _HEADINGS = {"receive": "recv", "prepare": "prep", "ego_only": "ego", "hypotheses": "fused", "consensus": "match"}

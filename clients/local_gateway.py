@@ -20,6 +20,8 @@ from clients.errors import GatewayUnreachable
 
 START_TIMEOUT_S = 120.0
 STOP_TIMEOUT_S = 20.0
+ENDING_S = 1.0
+"""How long a process may take to end after its connections have."""
 KEY_SETTINGS = ("ROBOSAC_API_KEYS", "ROBOSAC_API_KEYS_FILE", "ROBOSAC_VIEWER_TOKENS")
 
 
@@ -87,6 +89,20 @@ class GatewayProcess:
                     raise GatewayUnreachable(f"the gateway {why}; its log ends:\n{self._log.read_text()[-2000:]}")
                 await asyncio.sleep(0.05)
 
+    @contextlib.asynccontextmanager
+    async def watched(self) -> AsyncIterator[None]:
+        """Let what cannot reach the gateway in the block say that the gateway has ended, if it has."""
+        try:
+            yield
+        except GatewayUnreachable as error:
+            with contextlib.suppress(subprocess.TimeoutExpired):
+                status = await asyncio.to_thread(self._process.wait, ENDING_S)
+                raise GatewayUnreachable(
+                    f"the gateway that this command started has ended with status {status}; its log, {self._log}, "
+                    f"ends:\n{self._log.read_text()[-2000:]}"
+                ) from error
+            raise
+
     def peak_memory_mib(self) -> float:
         """The most physical memory that it held, MiB; NaN where the system does not tell."""
         try:
@@ -140,7 +156,7 @@ async def local_gateway(
     Raises
     ------
     GatewayUnreachable
-        As `GatewayProcess.ready`.
+        As `GatewayProcess.ready`, or out of the block, if the gateway ends in it.
     """
     with tempfile.TemporaryDirectory(prefix="robosac-") as folder:
         database_url = os.environ.get("ROBOSAC_DATABASE_URL", f"sqlite:///{folder}/robosac.db")
@@ -148,7 +164,8 @@ async def local_gateway(
         try:
             with cancelled_by_sigterm():
                 await process.ready()
-                yield process.url
+                async with process.watched():
+                    yield process.url
         finally:
             await process.stop()
 

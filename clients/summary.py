@@ -117,7 +117,7 @@ class FleetSummary:
             self.attacked_from.setdefault((frame.scene, frame.ego_id, vehicle), answer.frame)
         for vehicle in answer.named:
             self.named_in.setdefault((frame.scene, frame.ego_id, vehicle), answer.frame)
-        self.names |= answer.suspicion is not None
+        self.names |= answer.suspicion is not None or bool(answer.named)
         self.lies.add(frame, answer, received, undefended)
         self.standings.add(answer)
         for role, members in (("attackers", frame.attackers), ("honest", set(team) - frame.attackers)):
@@ -188,7 +188,7 @@ class FleetSummary:
             f"Answers: {sources}. Sampling steps: {steps['mean']:.2f} a frame, at most {steps['max']}.\n"
             f"Latency over HTTP: median {latency['p50']:.1f} ms, 95 % {latency['p95']:.1f} ms, "
             f"99 % {latency['p99']:.1f} ms; "
-            f"{values['deadline_met_share']:.1%} within the budget."
+            f"{values['deadline_met_share']:.1%} in time by the gateway's clock."
         )
         if count := self.refused.total():
             requests = "request was" if count == 1 else "requests were"

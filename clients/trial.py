@@ -153,3 +153,9 @@ def a_table(title: str, columns: Sequence[str]) -> Table:
     for number, heading in enumerate(columns):
         table.add_column(heading, justify="right" if number else "left", no_wrap=not number)
     return table
+
+
+def print_whole(console: Console, table: Table) -> None:
+    """Print a table without cutting what is in it, however few columns there are: a terminal then breaks the lines."""
+    table.width = console.measure(table, options=console.options.update(max_width=1000)).maximum
+    console.print(table, crop=False)

@@ -104,8 +104,9 @@ class Rounds:
         await self._start()
         for number in range(sessions):
             defense = DEFENSES[number % len(DEFENSES)]
-            client = self._up[0].client
-            opened = await client.open_session(EGO, TEAM, defense=defense, latency_budget_ms=BUDGET_MS)
+            process, client = self._up[0].process, self._up[0].client
+            async with process.watched():
+                opened = await client.open_session(EGO, TEAM, defense=defense, latency_budget_ms=BUDGET_MS)
             self.sessions.append(Driven(defense["kind"], opened))
 
     async def play(self, incident: Incident) -> Kill:
@@ -136,7 +137,8 @@ class Rounds:
         kill.restart_s = time.perf_counter() - started
         for number, session in enumerate(self.sessions):
             try:
-                complaints = await session.check(self._up[0].client, self._bodies)
+                async with self._up[0].process.watched():
+                    complaints = await session.check(self._up[0].client, self._bodies)
             except GatewayError as error:
                 complaints = [f"it could not be checked: {error}"]
             kill.wrong += [f"session {number} ({session.defense}): {complaint}" for complaint in complaints]

@@ -46,7 +46,7 @@ FramesOfSequence = Annotated[int, typer.Option(min=1, help="Of the sequence, fro
 def frame(  # the options of a command line
     out: Picture,
     number: Annotated[
-        int, typer.Option("--frame", min=0, help="Which frame, counted from 0; the defence remembers those before.")
+        int, typer.Option("--frame", min=0, help="Which frame, counted from 0; all before it are played first.")
     ] = 1,
     attack: AttackName = "pgd",
     attackers: Attackers = 1,

@@ -21,10 +21,11 @@ from clients.client import GatewayClient, OpenedSession
 from clients.demo import main as demo_main
 from clients.errors import FrameConflict, GatewayUnavailable, GatewayUnreachable
 from clients.fleet import FleetOptions, _asked, _patiently, _Vehicle, close_run, main, run_fleet
-from clients.local_gateway import local_gateway
+from clients.local_gateway import GatewayProcess, local_gateway
 from clients.simulation import Fleet
 from clients.summary import FleetSummary
 from robosac import wire
+from robosac.answers import Distrust, Reason, RejectedTeammate
 from robosac.attacks import PGD, load_campaign
 from robosac.defenses.halving import Halving
 from robosac.detectors.embedded import ADVERSARIAL_WEIGHTS
@@ -59,6 +60,7 @@ async def test_a_fleet_of_independent_clients_end_to_end(tmp_path):
     text = console.file.getvalue()
     for expected in ("what the gateway answered", "No attacker accepted in", "dissensus", "Latency over HTTP"):
         assert expected in text
+    assert "in time by the gateway's clock" in " ".join(text.split())
 
 
 def test_attackers_are_never_the_ego_and_send_each_ego_its_own(detector):
@@ -285,6 +287,28 @@ def test_the_summary_tells_what_was_refused_first(refused, said, detector):
     text = console.file.getvalue()
     assert said in text if said else "refused first" not in text
     assert summary.as_dict()["refused_first"] == refused
+
+
+def test_a_defence_that_names_without_suspicion_is_told_to_name(detector):
+    (frame,) = Fleet(IntersectionScene(3), detector, 1, 1, PGD(steps=1), seed=0).sense(0)
+    (attacker,) = frame.attackers
+    result = fuse(detector, Halving(), frame.message, frame.sent, rng=np.random.default_rng(0))
+    answer = result.answer(0, {}, {"total": 1.0}, frame.ego_id)
+    named = RejectedTeammate(vehicle_id=attacker, reason=Reason.DISTRUSTED, distrust=Distrust.NAMED)
+    accepted = tuple(name for name in answer.accepted if name != attacker)
+    answer = answer.model_copy(update={"accepted": accepted, "rejected": {**answer.rejected, attacker: named}})
+    assert answer.suspicion is None
+    summary = FleetSummary(detector)
+    summary.add(frame, answer, 10.0)
+    assert summary.naming["attackers_named"] == 1
+
+
+async def test_a_gateway_that_ends_in_the_block_is_told_of_with_its_log(tmp_path, monkeypatch):
+    log = tmp_path / "gateway.log"
+    monkeypatch.setattr(GatewayProcess, "ready", GatewayProcess.kill)
+    with pytest.raises(GatewayUnreachable, match=f"this command started has ended with status -9; its log, {log}"):
+        async with local_gateway(log):
+            raise GatewayUnreachable("is the gateway running?")
 
 
 @pytest.mark.parametrize(

@@ -1,11 +1,13 @@
+import io
 import json
 import sys
 
 import pytest
 import typer
+from rich.console import Console
 from typer.testing import CliRunner
 
-from clients.load_test import Bodies, _placed, main
+from clients.load_test import Bodies, _placed, main, show
 from clients.measured import Figures, Load
 from robosac import wire
 
@@ -55,6 +57,20 @@ def test_a_short_run_measures_every_load(tmp_path):
         assert {"receive", "queue", "prepare", "hypotheses", "total"} <= set(load["stages_ms"])
         if load["loop"] == "open":
             assert load["frames"] == load["egos"] * 3
+
+
+def test_no_figure_is_cut_off_in_a_narrow_terminal():
+    figures = Figures(Load("open", 8, attacked=True, rate_hz=5.0), budget_ms=200.0, seconds=2.0)
+    figures.latencies_ms += [123.0] * 3
+    figures.steps += [1] * 3
+    figures.engine_ms += [9.0] * 3
+    for number in range(12):
+        figures.stages[f"stage{number}"].append(1234.5)
+    console = Console(file=io.StringIO(), width=40)
+    show(console, [figures], 788_000, 200.0)
+    text = console.file.getvalue()
+    assert "…" not in text
+    assert [line.count("1234.5") for line in text.splitlines() if "1234.5" in line] == [12]
 
 
 def test_egos_are_placed_where_their_first_frames_were_answered():
