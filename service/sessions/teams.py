@@ -111,4 +111,5 @@ class Teams:
 def check_size(team: Sequence[str], most: int) -> None:
     """Refuse a team of more than so many."""
     if len(team) > most:
-        raise Refused(Kind.TOO_MANY_TEAMMATES, f"at most {most} teammates are allowed", "teammates")
+        detail = f"ROBOSAC_MAX_TEAMMATES allows at most {most} teammates, got {len(team)}"
+        raise Refused(Kind.TOO_MANY_TEAMMATES, detail, "teammates")

@@ -161,7 +161,8 @@ async def test_impossible_changes_of_the_team_are_refused_and_change_nothing(ser
     problem(await enrol(served, session, "x", "x"), 422, "invalid-request")
     problem(await enrol(served, session), 422, "invalid-request")
     problem(await enrol(served, session, "a b"), 422, "invalid-request")
-    problem(await enrol(served, session, *(f"v{i}" for i in range(64))), 422, "too-many-teammates")
+    refused = problem(await enrol(served, session, *(f"v{i}" for i in range(64))), 422, "too-many-teammates")
+    assert refused["detail"] == "ROBOSAC_MAX_TEAMMATES allows at most 63 teammates, got 69"
     problem(await enrol(served, session, "x"), 422, "impossible-defense")
     problem(await dismiss(served, session, "nobody"), 404, "unknown-teammate")
     problem(await dismiss(served, session, "rsu", session.teammate_tokens["car-2"]), 403, "ego-only")
