@@ -44,6 +44,13 @@ def describe(error: BaseException) -> str:
     return in_short(f"{type(error).__name__}: {message}")
 
 
+def told(error: Exception) -> str:
+    """The message of an exception, without the number that the system has for it."""
+    if isinstance(error, OSError) and error.strerror and error.filename is not None:
+        return f"{error.filename}: {error.strerror}"
+    return str(error)
+
+
 def in_words(fault: Mapping[str, Any]) -> str:
     """What is wrong with a value by one of `pydantic.ValidationError.errors`, without where it stands."""
     return _PLAIN.get(fault["type"]) or str(fault["msg"]).removeprefix("Value error, ")

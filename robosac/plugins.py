@@ -104,7 +104,8 @@ class Kind(Generic[T]):
     def _foreign(self, name: str, arguments: list[str], text: str) -> T:
         offered = next((f"{point.module}:{point.attr}" for point in entry_points(group=self.package, name=name)), None)
         if offered is None and not _REFERENCE.fullmatch(text):
-            raise self.error(f"no {self.noun} {text!r}: give one of {', '.join(sorted(self.shipped))}, {self.forms}")
+            names = [each for each in sorted(self.shipped) if f"{each}:" not in self.forms]  # the others are in these
+            raise self.error(f"no {self.noun} {text!r}: give one of {', '.join(names)}, {self.forms}")
         try:
             made: T = pkgutil.resolve_name(text)() if offered is None else pkgutil.resolve_name(offered)(*arguments)
         except (Exception, SystemExit) as error:  # the user's code may raise anything, or be a script that ends

@@ -37,6 +37,7 @@ from service.keeping.gateway_keys import GatewayKeys  # noqa: E402
 from service.keeping.limits import Limits  # noqa: E402
 from service.keeping.record import new_seed  # noqa: E402
 from service.keeping.store import Store  # noqa: E402
+from service.keeping.urls import file_of, read_url  # noqa: E402
 from service.operations import operations  # noqa: E402
 from service.pages import api_pages, frames_event, pages  # noqa: E402
 from service.recording.recorder import Recorder  # noqa: E402
@@ -184,7 +185,7 @@ async def _running(gateway: Gateway, settings: Settings, tokens: Tokens, tracing
     try:
         await blamed_on("ROBOSAC_DEVICE", engine.find_device())
         await asyncio.gather(
-            blamed_on("ROBOSAC_DATABASE_URL", store.start()),
+            blamed_on("ROBOSAC_DATABASE_URL", store.start(), file_of(read_url(settings.database_url))),
             blamed_on("ROBOSAC_EXTRA_DETECTORS", engine.start()),
         )
         gateway.recorder.start()

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import os
+import socket
 from typing import Annotated
 
 import typer
@@ -42,6 +43,11 @@ def main(
         except MissingExtra as missing:
             raise typer.BadParameter(str(missing), param_hint="--cluster") from missing
         return
+    try:
+        socket.getaddrinfo(host or None, port, flags=socket.AI_PASSIVE)
+    except (OSError, UnicodeError) as error:
+        why = error.strerror if isinstance(error, OSError) else "no name of a host"
+        raise typer.BadParameter(f"{host}: {why}", param_hint="--host") from error
     workers = os.environ.get(WORKERS, "")
     if workers.isdecimal() and int(workers) > 1:
         typer.echo(

@@ -8,6 +8,8 @@ from contextlib import contextmanager
 
 import typer
 
+from robosac.faults import told
+
 
 @contextmanager
 def blaming(option: str, *errors: type[Exception]) -> Iterator[None]:
@@ -15,7 +17,7 @@ def blaming(option: str, *errors: type[Exception]) -> Iterator[None]:
     try:
         yield
     except errors as error:
-        raise typer.BadParameter(_told(error), param_hint=option) from error
+        raise typer.BadParameter(told(error), param_hint=option) from error
 
 
 @contextmanager
@@ -24,7 +26,7 @@ def failing(*errors: type[Exception]) -> Iterator[None]:
     try:
         yield
     except errors as error:
-        typer.secho(f"Error: {error}", fg="red", err=True)
+        typer.secho(f"Error: {told(error)}", fg="red", err=True)
         raise typer.Exit(1) from error
 
 
@@ -38,10 +40,3 @@ def check_known(names: Collection[str], known: Collection[str], option: str) -> 
 def listed(names: Iterable[str]) -> str:
     """Names as one types them, one after the other."""
     return ", ".join(map(shlex.quote, names))
-
-
-def _told(error: Exception) -> str:
-    """An error without the number that the system has for it."""
-    if isinstance(error, OSError) and error.strerror and error.filename is not None:
-        return f"{error.filename}: {error.strerror}"
-    return str(error)

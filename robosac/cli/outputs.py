@@ -14,8 +14,8 @@ from typing import Annotated
 
 import typer
 
+from robosac import files
 from robosac.cli.blame import blaming
-from robosac.files import is_special
 
 Force = Annotated[bool, typer.Option("--force", help="Overwrite what an earlier run has written.")]
 
@@ -41,11 +41,11 @@ def make_folder(path: Path, option: str, force: bool = False, *reports: str) -> 
     for report in reports:
         _refuse_existing(path / report, option, force)
     with blaming(option, OSError):
-        path.mkdir(parents=True, exist_ok=True)
+        files.make_folder(path)
         if not os.access(path, os.W_OK | os.X_OK):
             raise PermissionError(f"{path} cannot be written to")
 
 
 def _refuse_existing(path: Path, option: str, force: bool) -> None:
-    if not force and os.path.lexists(path) and not path.is_dir() and not is_special(path):
+    if not force and os.path.lexists(path) and not path.is_dir() and not files.is_special(path):
         raise typer.BadParameter(f"{path} is there already; --force overwrites it", param_hint=option)

@@ -11,6 +11,7 @@ import numpy as np
 
 from robosac.boxes import FloatArray
 from robosac.extras import MissingExtra
+from robosac.faults import told
 from robosac.recording.reading import RecordedFrame, RecordedSession, RecordingError, sessions
 from robosac.scenes.base import SceneError, Split, View
 
@@ -112,7 +113,7 @@ class Recording:
         try:
             self._sessions = sessions(self.path)
         except (RecordingError, MissingExtra, OSError) as error:
-            raise SceneError(str(error)) from error
+            raise SceneError(told(error)) from error
 
     @property
     def name(self) -> str:

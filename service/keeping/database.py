@@ -33,7 +33,7 @@ from service.errors import StoreUnavailable
 from service.keeping.limits import UNBOUND, Limits
 from service.keeping.place import Place
 from service.keeping.together import Piece, Work, do_each, prepare_each
-from service.keeping.urls import read_url
+from service.keeping.urls import file_of, read_url
 
 logger = logging.getLogger(__name__)
 
@@ -169,11 +169,11 @@ class Sqlite(_Failing):
     """One SQLite file in WAL mode, or a database in memory, which has a single connection."""
 
     def __init__(self, url: URL) -> None:
-        in_memory = url.database in (None, "", ":memory:")
-        place = Place(None if in_memory else Path(str(url.database)))
+        file = file_of(url)
+        place = Place(None if file is None else Path(file))
         self._writer = _SqliteThreads(url, 1, place)
         event.listen(self._writer.engine, "begin", _begin_immediate)
-        self._readers = None if in_memory else _SqliteThreads(url, READERS, place)
+        self._readers = None if file is None else _SqliteThreads(url, READERS, place)
         self._waiting: list[tuple[Piece, asyncio.Future[Any]]] = []
         self._writing: asyncio.Task[None] | None = None
 

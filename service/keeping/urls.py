@@ -55,6 +55,12 @@ def read_url(text: str) -> URL:
     return url
 
 
+def file_of(url: URL) -> str | None:
+    """The file of a SQLite database; None of one in memory, and of PostgreSQL."""
+    path = url.database if url.get_backend_name() == "sqlite" else None
+    return None if path in (None, "", ":memory:") else path
+
+
 def _number(value: object) -> int | None:
     return int(value) if isinstance(value, str) and value.isdecimal() else None
 

@@ -9,6 +9,7 @@ from dataclasses import dataclass, field
 from importlib.metadata import version
 from pathlib import Path
 
+from robosac.files import make_folder
 from robosac.interfaces.ros2 import Ros2
 from robosac.recording.content import Moment, Opening
 from robosac.recording.writing import RecordingFile
@@ -63,7 +64,7 @@ class Folder:
         ------
         OSError
         """
-        self.root.mkdir(parents=True, exist_ok=True)
+        make_folder(self.root)
         probe = self.root / ".probe"
         probe.touch()
         probe.unlink()

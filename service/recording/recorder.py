@@ -15,7 +15,7 @@ import structlog
 
 from robosac.answers import FrameAnswer
 from robosac.extras import need
-from robosac.faults import describe
+from robosac.faults import describe, told
 from robosac.recording.content import Moment
 from service.deciding.asked import Answered
 from service.errors import Kind, Refused
@@ -88,7 +88,7 @@ class Recorder:
             self._folder.make()
             self._asked = self._folder.recorded()
         except OSError as fault:
-            raise ValueError(f"ROBOSAC_RECORD: {describe(fault)}") from fault
+            raise ValueError(f"ROBOSAC_RECORD: {told(fault)}") from fault
         self._thread.start()
 
     def stop(self) -> None:

@@ -15,8 +15,8 @@ from service.settings import PREFIX
 T = TypeVar("T")
 
 
-async def blamed_on(variable: str, starting: Awaitable[T]) -> T:
-    """Wait for a part of the gateway to start, or for what it needs to.
+async def blamed_on(variable: str, starting: Awaitable[T], file: str | None = None) -> T:
+    """Wait for a part of the gateway to start, or for what it needs to, such as the database in a file.
 
     Raises
     ------
@@ -31,7 +31,8 @@ async def blamed_on(variable: str, starting: Awaitable[T]) -> T:
         raise ValueError(f"{variable}: {fault}") from fault
     except StoreUnavailable as fault:
         cause = fault.__cause__ or fault
-        raise ValueError(f"{variable}: {describe(getattr(cause, 'orig', None) or cause)}") from fault
+        where = variable if file is None else f"{variable}: {file}"
+        raise ValueError(f"{where}: {describe(getattr(cause, 'orig', None) or cause)}") from fault
 
 
 class Starting:

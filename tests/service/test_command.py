@@ -9,8 +9,11 @@ import time
 
 import httpx
 import pytest
+import typer
+from typer.testing import CliRunner
 
 from service.arriving.connections import HEAD_BYTES
+from service.command import main
 
 PROGRAM = "import typer; from service.command import main; typer.run(main)"
 
@@ -39,6 +42,14 @@ def test_serve_runs_the_gateway_where_it_is_told_until_it_is_terminated(tmp_path
     assert "gateway stopped" in events
     assert events[0].startswith("Started server process")
     assert events[-1].startswith("Finished server process")
+
+
+def test_a_host_that_there_is_not_is_named_before_anything_starts():
+    own = typer.Typer()
+    own.command()(main)
+    result = CliRunner().invoke(own, ["--host", "999.1.1.1"], env={"COLUMNS": "300"})
+    assert result.exit_code == 2
+    assert "Invalid value for --host: 999.1.1.1: " in result.output
 
 
 @pytest.mark.parametrize(

@@ -124,7 +124,7 @@ async def test_a_truth_that_is_none_is_refused_with_its_field(served, ego_messag
 
 async def test_a_folder_that_cannot_be_used_keeps_the_gateway_from_starting(tmp_path):
     (tmp_path / "file").touch()
-    with pytest.raises(ValueError, match=r"^ROBOSAC_RECORD: "):
+    with pytest.raises(ValueError, match=rf"^ROBOSAC_RECORD: {tmp_path}/file is a file; a folder is wanted$"):
         async with serve(record=tmp_path / "file"):
             pass
 

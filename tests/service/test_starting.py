@@ -33,7 +33,7 @@ async def started(app):
         ({"extra_detectors": "pyproject.toml"}, "ROBOSAC_EXTRA_DETECTORS: pyproject.toml is not a readable "),
         ({"device": "nonesuch"}, "ROBOSAC_DEVICE: torch cannot compute on the device 'nonesuch' here: "),
         ({"detector": "nonesuch"}, "ROBOSAC_DETECTOR: unknown detector 'nonesuch'"),
-        ({"database_url": "sqlite:////nowhere/x.db"}, "ROBOSAC_DATABASE_URL: OperationalError: unable to open "),
+        ({"database_url": "sqlite:////nowhere/x.db"}, "ROBOSAC_DATABASE_URL: /nowhere/x.db: OperationalError: "),
         ({"gateway_key_file": "/nowhere/key"}, "ROBOSAC_GATEWAY_KEY_FILE: /nowhere/key cannot be read: "),
     ],
 )

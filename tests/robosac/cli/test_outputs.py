@@ -97,6 +97,24 @@ def test_a_place_that_cannot_be_written_to_is_refused_before_the_work(name, plac
     assert "Invalid value for --out" in result.output
 
 
+@pytest.mark.parametrize(
+    "words",
+    [
+        ("evaluate", "--out"),
+        ("compare", "--out"),
+        ("fleet", "--report"),
+        ("record", "export", "none.mcap", "--to", "cpm", "--out"),
+    ],
+)
+def test_a_file_in_the_place_of_a_folder_is_called_one(words, tmp_path):
+    file = tmp_path / "file"
+    file.write_text("")
+    place = file / "x" if words[0] == "record" else file
+    result = runner.invoke(app, [*words, str(place)], env={"COLUMNS": "400"})
+    assert result.exit_code == 2
+    assert f"Invalid value for {words[-1]}: {file} is a file; a folder is wanted" in result.output
+
+
 def test_a_folder_with_the_rest_of_an_interrupted_run_is_taken(tmp_path):
     (tmp_path / "precision.png").write_text("")
     arguments = ["compare", "--only", "no defence", "--setting", "honest:0", "--scenes", "1", "--frames", "6", "--live"]

@@ -57,6 +57,11 @@ def test_a_comparison_runs_on_it(path, tmp_path):
     assert float(got["oracle"]["ap50"]) > float(got["no defence"]["ap50"])
 
 
+def test_a_recording_that_is_not_there_is_told_as_other_files_are():
+    with pytest.raises(SceneError, match=r"^nope: No such file or directory$"):
+        SOURCES.make("recording:nope")
+
+
 def test_without_truth_it_is_said_what_is_missing(detector, tmp_path):
     path = write(tmp_path / "blind.mcap", detector, moments(detector, range(1), truth=False))
     (scene,) = SOURCES.make(f"recording:{path}").scenes("test")
