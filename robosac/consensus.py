@@ -2,12 +2,13 @@
 
 from __future__ import annotations
 
+from collections.abc import Callable
 from dataclasses import dataclass
 
 import numpy as np
 
 from robosac.answers import Verdict
-from robosac.boxes import FloatArray, IntArray, as_boxes, pairwise_iou
+from robosac.boxes import BoolArray, FloatArray, IntArray, as_boxes, pairwise_iou
 
 MATCH_IOU = 0.5
 DEFAULT_THRESHOLD = 0.3
@@ -64,7 +65,12 @@ def match(reference: FloatArray, candidate: FloatArray, iou_threshold: float = M
     return rows[kept], columns[kept]
 
 
-def compare(reference: FloatArray, candidate: FloatArray, threshold: float = DEFAULT_THRESHOLD) -> Comparison:
+def compare(
+    reference: FloatArray,
+    candidate: FloatArray,
+    threshold: float = DEFAULT_THRESHOLD,
+    known: Callable[[FloatArray], BoolArray] | None = None,
+) -> Comparison:
     """Compare a candidate perception with a reference.
 
     ``jaccard_index = matched / (n + m - matched)``; consensus if it reaches the threshold. (The paper writes a
@@ -78,13 +84,21 @@ def compare(reference: FloatArray, candidate: FloatArray, threshold: float = DEF
         Boxes in the same frame.
     threshold : float
         In (0, 1].
+    known : callable, optional
+        Of places (k, 2), of which the reference knows whether anything is there. Where there would be no consensus,
+        candidates that match nothing count only if they are in such places: whoever sees little is no judge of the
+        rest. By default all places are known.
     """
     _check_unit("threshold", threshold)
     reference, candidate = as_boxes(reference, "reference"), as_boxes(candidate, "candidate")
     if len(reference) == 0 and len(candidate) == 0:
         return Comparison(1.0, 0, Verdict.NO_EVIDENCE)
-    matched = len(match(reference, candidate)[0])
-    index = matched / (len(reference) + len(candidate) - matched)
+    pairs = match(reference, candidate)[1]
+    matched, others = len(pairs), len(candidate) - len(pairs)
+    index = matched / (len(reference) + others)
+    if matched and index < threshold and known is not None:
+        others = int(np.count_nonzero(known(np.delete(candidate[:, :2], pairs, axis=0))))
+        index = matched / (len(reference) + others)
     return Comparison(index, matched, Verdict.CONSENSUS if index >= threshold else Verdict.DISSENSUS)
 
 

@@ -97,3 +97,16 @@ def test_no_matching_of_the_golden_data_is_larger_than_the_largest():
     assert ours.tolist() == matched.tolist()
     assert (ours <= largest).all()
     assert set(branch[ours < largest]) == {3}
+
+
+@pytest.mark.parametrize(
+    ("knows", "index", "verdict"),
+    [(None, 0.2, "dissensus"), (100.0, 0.2, "dissensus"), (45.0, 0.4, "consensus"), (0.0, 1.0, "consensus")],
+)
+def test_of_what_the_reference_cannot_know_it_is_no_judge(knows, index, verdict):
+    known = None if knows is None else lambda places: places[:, 0] < knows
+    comparison = compare(ROW[:2], ROW, known=known)
+    assert (comparison.jaccard_index, comparison.matched, comparison.verdict) == (pytest.approx(index), 2, verdict)
+    away = ROW[2:] + [0.0, 30.0, 0.0, 0.0, 0.0]
+    assert compare(ROW[:2], away, known=known).verdict == "dissensus"
+    assert compare(ROW, ROW[:2], known=known).verdict == "dissensus"  # nor does it forget what it sees itself

@@ -14,7 +14,7 @@ from robosac.deadline import Deadline, Recorded
 from robosac.defenses import EGO
 from robosac.defenses.group_testing import GroupTestingSettings
 from robosac.defenses.group_testing.model import LIE
-from robosac.detectors import EmbeddedDetector
+from robosac.detectors import EmbeddedDetector, Message
 from robosac.detectors.embedded import SHIPPED_WEIGHTS
 from robosac.detectors.weights_file import WeightsError
 from robosac.detectors.witness import AT_ONCE
@@ -62,6 +62,24 @@ def test_with_a_witness_all_outcomes_of_a_frame_have_its_testimony(detector, ego
     unheard = fuse(detector, asked, ego_message, benign, rng=np.random.default_rng(0))
     assert unheard.hypotheses[0].testimony is None
     assert unheard.objects is None
+
+
+def test_an_ego_that_sees_little_is_asked_only_about_that(detector, ego_message, benign):
+    """It keeps nobody out for showing what it cannot see."""
+    (name, features), *_ = ego_message.tensors.items()
+    half_blind = features.copy()
+    half_blind[:, :, :20] = 0
+    ego = Message(ego_message.pose, {name: half_blind})
+
+    def answered(judge_objects):
+        defense = GroupTestingSettings(judge_objects=judge_objects).build(calibration_of(detector.info))
+        return fuse(detector, defense, ego, benign, rng=np.random.default_rng(0))
+
+    asked, unasked = answered(judge_objects=True), answered(judge_objects=False)
+    assert set(asked.accepted) == set(benign)
+    assert len(unasked.accepted) < len(benign)
+    whole = [tested for tested in asked.hypotheses if len(tested.teammates) == len(benign)]
+    assert [tested.verdict for tested in whole] == ["consensus"]
 
 
 def test_the_ego_alone_is_told_with_every_outcome(detector, ego_message, benign):

@@ -23,7 +23,8 @@ DENIES = -3.0
 """An agent denies a place from this L on downwards."""
 EGO_KNOWS = -6.75
 """Where the ego's own L is so low, whoever supports a vehicle is wrong: nobody else has a part in what the ego saw. But
-right behind another vehicle it sees nothing, and its L there may be as low.
+right behind another vehicle it sees nothing, and its L there may be as low. And where `NOT_TOGETHER` teammates support
+one, the ego itself may be late, or see badly.
 """
 HIDING_M = 0.5
 """A vehicle hides what is behind it and so much to its sides."""
@@ -135,11 +136,12 @@ class Claims:
     def contradicted(self) -> BoolArray:
         """Which boxes (n,) are contradicted, whoever supports them.
 
-        Those with an L of -6.75 or less by the ego are, but for what is behind a vehicle that it sees. So are those
+        Those with an L of -6.75 or less by the ego are, but for what is behind a vehicle that it sees, or what three
+        teammates support. So are those
         that are denied for certain (`denied_for_certain`), if the sum of L without the teammate who supports a box most
         is at most -6. What the ego itself supports is not contradicted.
         """
-        return self._contradicted(self.beside <= -WEIGHTY, len(self.witnesses) - 2)
+        return self._contradicted(self.beside <= -WEIGHTY, len(self.witnesses) - 2) & ~self._supported_by_many
 
     def contradicted_by_others(self, suspects: Collection[str]) -> BoolArray:
         """Which boxes (n,) are so contradicted by all but the suspects that somebody is to blame for them.
@@ -150,9 +152,8 @@ class Claims:
         others = self.without(suspects)
         total = others.likelihood.sum(axis=0)
         most = others.likelihood[1:].min(axis=0, initial=0.0)
-        return others._contradicted(
-            (total <= -BLAMED_SUM) & (total - most <= -BLAMED_BESIDE), len(others.witnesses) - 1
-        )
+        enough = (total <= -BLAMED_SUM) & (total - most <= -BLAMED_BESIDE)
+        return others._contradicted(enough, len(others.witnesses) - 1) & ~self._supported_by_many
 
     def _contradicted(self, enough: BoolArray, others: int) -> BoolArray:
         """Which boxes (n,) are contradicted where it is ``enough`` (n,), by so many ``others`` besides the ego."""
@@ -162,6 +163,12 @@ class Claims:
             sure &= ~self._behind_another()
         known: BoolArray = denied | sure
         return known
+
+    @cached_property
+    def _supported_by_many(self) -> BoolArray:
+        """Which boxes (n,) more teammates support than would lie together."""
+        many: BoolArray = self.supporting[1:].sum(axis=0) >= NOT_TOGETHER
+        return many
 
     def _behind_another(self) -> BoolArray:
         """Which boxes (n,) the ego can only look at through another one, which it supports."""

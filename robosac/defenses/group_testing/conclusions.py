@@ -63,6 +63,8 @@ def conclude(found: Findings, answer: Hypothesis) -> None:
     _clear(found, comparisons)
     for name in found.team:
         counts, lies = dict(conflicts.get(name, {})), blamed[name]
+        if lies:
+            found.lies.effects[name] = frame
         if lies and found.late(name):
             lies = [replace(lie, along=True) for lie in lies]
         for kind in {lie.counts_as for lie in lies}:

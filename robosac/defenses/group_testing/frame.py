@@ -130,7 +130,7 @@ class JudgedFrame:
         suspicion = memory.straying.without(name, suspicion)
         if suspicion < CLEARED_BELOW:
             return False
-        if memory.lies.guilt(name) >= (1.0 if memory.steadiness.calm >= CALM else UNSTEADY_LEVELS):
+        if memory.lies.guilt(name, memory.frame) >= (1.0 if memory.steadiness.calm >= CALM else UNSTEADY_LEVELS):
             return True
         return (
             suspicion > naming_bound

@@ -8,7 +8,7 @@ from functools import cached_property
 import numpy as np
 
 from robosac.boxes import FloatArray
-from robosac.defenses.group_testing.claims import CONFLICT_OWN, WEIGHTY, Claims, two_witnesses
+from robosac.defenses.group_testing.claims import CONFLICT_OWN, DENIES, WEIGHTY, Claims, two_witnesses
 from robosac.testimony import Testimony
 
 STANDING_SUM = 10.0
@@ -65,6 +65,23 @@ class Hearing:
         while len(left):
             left, count = left[np.hypot(*(left - left[0]).T) > APART_M], count + 1
         return count
+
+    def seen_near(self, places: FloatArray) -> FloatArray:
+        """Centres (n, 2) of vehicles near places (k, 2) of which somebody is certain, and nobody says the contrary; of
+        one vehicle there may be many. At the edge of the ego's map there are none.
+        """
+        over, cells = self.heard.over_ego, self.heard.ego_places()
+        rows, columns = np.nonzero((over >= CERTAIN).any(axis=0) & (over.min(axis=0) > DENIES))
+        asked = cells[rows, columns]
+        near = np.hypot(*(asked[:, None] - places[None]).transpose(2, 0, 1)).min(axis=1, initial=np.inf) <= REACH_M
+        if not near.any():
+            return np.zeros((0, 2))
+        asked, supporting = asked[near], over[:, rows[near], columns[near]] >= CERTAIN
+        centres = self.heard.centres(asked, supporting)
+        kept = np.hypot(*(centres[:, None] - places[None]).transpose(2, 0, 1)).min(axis=1) <= REACH_M
+        kept &= np.abs(centres).max(axis=1) <= self.heard.half_extent_m - EDGE_M
+        found: FloatArray = centres[kept]
+        return found
 
     @cached_property
     def standing(self) -> FloatArray:

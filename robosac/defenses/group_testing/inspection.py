@@ -7,7 +7,9 @@ from collections.abc import Collection, Iterator, Sequence
 import numpy as np
 
 from robosac.answers import Verdict
+from robosac.boxes import FloatArray
 from robosac.defenses.group_testing.candidates import UNRESOLVED
+from robosac.defenses.group_testing.claims import SUPPORTS
 from robosac.defenses.group_testing.conclusions import conclude
 from robosac.defenses.group_testing.findings import Findings, one_out
 from robosac.defenses.group_testing.lies import AUDIT_FRAMES
@@ -36,6 +38,7 @@ class Inspection:
         self._keep_contradicted = keep_contradicted
         self._whole: Hypothesis | None = None
         self._agreeing: list[Hypothesis] = []
+        self._lost: list[FloatArray] | None = None
 
     @property
     def differences(self) -> list[Difference]:
@@ -56,7 +59,8 @@ class Inspection:
     def _questions(self, answer: Hypothesis) -> Iterator[Hypothesis]:
         """What is worth decoding, in this order: those to be asked again; each alone who knows a vehicle's shape;
         whether what is missing is real; the answer without all that vouch for a lie, if they are several; without each,
-        the likeliest first; without those who may stray, and those whose turn it is.
+        the likeliest first; what tells who made a vehicle vanish; without those who may stray, and those whose turn it
+        is.
         """
         yield from self._again(answer)
         if answer not in self._found.shown:
@@ -76,6 +80,8 @@ class Inspection:
             groups = [self._found.vouching(answer, lie) for lie in lies]
             for group in (*filter(None, groups), *((name,) for name in self._candidates(answer, lies))):
                 yield self._without(answer, *group)
+        if len(self._found.team) <= EXACT and self._whole in self._found.shown:
+            yield from self._vanished(self._whole)
         again = (*self._straying(self._whole), *self._due(self._whole))
         yield from (self._without(self._whole, name) for name in again)
 
@@ -160,6 +166,19 @@ class Inspection:
         if never or one_out(whole, self._found.decoded):
             return never
         return sorted((name for name in whole if frame - last[name] >= AUDIT_FRAMES), key=lambda name: last[name])[:1]
+
+    def _vanished(self, whole: Hypothesis) -> Iterator[Hypothesis]:
+        """Where a vehicle that somebody sees has vanished from a fusion since the frame before: the fusion without each
+        who may have taken it away. Whoever sees it may have done so, too, but not if nobody else sees it.
+        """
+        found, frame = self._found, self._found.known.memory.frame
+        if self._lost is None:
+            self._lost = [place for place in found.lost(whole) if found.lies.search(found.placed(place), frame)]
+        for place in self._lost[:1]:
+            said = found.heard().said(place)
+            seeing = [name for name in whole if said[name] >= SUPPORTS]
+            others = [name for name in whole if name not in seeing]
+            yield from (self._without(whole, name) for name in (*(seeing if len(seeing) > 1 else ()), *others))
 
     def _hardly_explained(self, answer: Hypothesis) -> list[Lie]:
         """What is wrong in the answer, and explained, while only one of those fused was left out: what two do together

@@ -68,6 +68,8 @@ QUIET_M = 3.0
 MOST_QUIET = 32
 AUDIT_FRAMES = 40
 """After so many frames a teammate of the answer is left out again, to see what it does."""
+SEARCHED_FRAMES = 25
+"""So long a place is not searched again."""
 PLACE_FRAMES = 50
 """See `Rule.times`."""
 
@@ -99,6 +101,12 @@ class Lies:
     """By teammate: the frame in which it was last left out of a fusion of enough others to tell what it does."""
     accusers: dict[str, dict[str, int]] = field(default_factory=dict)
     """By teammate: who said that it moves or reshapes vehicles, and how often."""
+    effects: dict[str, int] = field(default_factory=dict)
+    """By teammate: the frame of the session in which it last did something to an object of a fusion."""
+    searched: list[tuple[float, float, int]] = field(default_factory=list)
+    """Places where a vehicle vanished, and everybody was left out to see who took it away: x, y (world, metres), the
+    frame of the session.
+    """
 
     def recently_left_out(self, teammate: str, frame: int) -> bool:
         """Whether it was left out in this frame or one just before."""
@@ -173,10 +181,14 @@ class Lies:
         known = self.levels.get(teammate)
         return max(level / RULES[k].names for k, (level, _) in known.items()) if known else 0.0
 
-    def guilt(self, teammate: str) -> float:
-        """The same of the kinds that somebody is named for: at 1 it is."""
+    def guilt(self, teammate: str, frame: int) -> float:
+        """The same of the kinds that somebody is named for: at 1 it is. Nobody is named for words alone, without having
+        done anything to an object for long: its sensor may be mounted as no other is, or on a bridge.
+        """
+        words = frame - self.effects.get(teammate, -PLACE_FRAMES) >= PLACE_FRAMES
+        kinds = {kind for kind, rule in RULES.items() if rule.malice and not (words and kind == "conflict")}
         known = self.levels.get(teammate, {}).items()
-        return max((level / RULES[k].names for k, (level, _) in known if RULES[k].malice), default=0.0)
+        return max((level / RULES[kind].names for kind, (level, _) in known if kind in kinds), default=0.0)
 
     def is_quiet(self, place: FloatArray, frame: int) -> bool:
         """Whether a place (2,), world, is left alone."""
@@ -189,6 +201,17 @@ class Lies:
         others = [e for e in self.quiet if e not in before and frame - e[2] <= LONGEST_QUIET][-MOST_QUIET + 1 :]
         self.quiet = [*others, (round(float(place[0]), 2), round(float(place[1]), 2), frame + frames, frames)]
 
+    def search(self, place: FloatArray, frame: int) -> bool:
+        """Whether to look for who took a vehicle away from a place (2,), world: not where that was done lately."""
+        self.searched = [entry for entry in self.searched if 0 <= frame - entry[2] < SEARCHED_FRAMES]
+        if any(_near(x, y, place) for x, y, _ in self.searched):
+            return False
+        self.searched = [
+            *self.searched[-MOST_QUIET + 1 :],
+            (round(float(place[0]), 2), round(float(place[1]), 2), frame),
+        ]
+        return True
+
     def forget(self, teammate: str) -> None:
         """It left."""
         self.levels.pop(teammate, None)
@@ -196,6 +219,7 @@ class Lies:
         self.left_out.pop(teammate, None)
         self.audited.pop(teammate, None)
         self.accusers.pop(teammate, None)
+        self.effects.pop(teammate, None)
         for said in self.accusers.values():
             said.pop(teammate, None)
 
@@ -211,6 +235,8 @@ class Lies:
             "left_out": self.left_out,
             "audited": self.audited,
             "accusers": self.accusers,
+            "effects": self.effects,
+            "searched": [list(entry) for entry in self.searched],
         }
 
     @classmethod
@@ -232,6 +258,8 @@ class Lies:
                 str(name): {str(other): int(count) for other, count in by.items()}
                 for name, by in state.get("accusers", {}).items()
             },
+            {str(name): int(frame) for name, frame in state.get("effects", {}).items()},
+            [(float(x), float(y), int(frame)) for x, y, frame in state.get("searched", ())],
         )
 
 

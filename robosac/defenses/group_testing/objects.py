@@ -216,6 +216,12 @@ class Shown:
             left = left[np.hypot(*(left - left[0]).T) > REACH_M]
         return np.array(found).reshape(-1, 2)
 
+    def missing_near(self, places: FloatArray) -> FloatArray:
+        """Centres (n, 2) of vehicles near places (k, 2) of which somebody is certain, and of which nothing is shown."""
+        near = self._hearing.seen_near(places)
+        missing: FloatArray = near[~self._covered(near)]
+        return missing
+
     def stands(self, places: FloatArray) -> BoolArray:
         """Whether a vehicle stands at places (n, 2) by the word of somebody who is not among those fused, or of two."""
         return vouched(self._testimony.likelihood(places) >= SUPPORTS, self._testimony.agents, self.teammates)

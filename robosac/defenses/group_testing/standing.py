@@ -34,8 +34,8 @@ def judge(answer: Shown, decoded: Sequence[Shown], reshaped: Sequence[tuple[int,
        carried off (`differences.carried`), from the part that has it where others say; and one that is ``reshaped``,
        from the part that has it in the shape that others show.
     3. A vehicle that a part of the answer shows, and the answer has lost although it stands by testimony, is taken from
-       there. Of the answer without one teammate the word of one witness is enough, if nobody else denies it. No vehicle
-       is there twice by it.
+       there. Of the answer without one teammate that of the others is enough, and the word of one witness, if nobody
+       else denies it. No vehicle is there twice by it.
     4. Any other box is ``confirmed`` by the ego, if all but the teammate who supports it most support it together
        (`Claims.beside`), and ``disputed`` if they do not. Where the ego does not support it, it is ``disputed`` if
        somebody denies it, or all others together lean against it (`Claims.rest`); ``confirmed`` by two teammates, of
@@ -63,8 +63,10 @@ def judge(answer: Shown, decoded: Sequence[Shown], reshaped: Sequence[tuple[int,
             repairs.append((part, at))
     for part in parts:
         left = [name for name in answer.teammates if name not in part.teammates]
-        alone: list[int] = gone_alone(answer, part, left).tolist() if len(left) == 1 else []
-        for at in (*gone(answer, part).tolist(), *alone):
+        lost = set(gone(answer, part).tolist())
+        if len(left) == 1:  # by the word of the others, too
+            lost.update(gone(answer, part, left).tolist(), gone_alone(answer, part, left).tolist())
+        for at in sorted(lost):
             place = part.boxes[at, :2]
             if all(np.hypot(*(place - other.boxes[i, :2])) > SAME_M for other, i in repairs):
                 repairs.append((part, at))

@@ -50,9 +50,11 @@ class World:
         pose[0, 3] = self.speed * frame
         return Outcome(subset, 0.93, Verdict.CONSENSUS, boxes, SEEN, pose, frame, **told)
 
-    def play(self, frames, defense=DEFENSE, quiet=0):
-        """Decisions, and the boxes of each subset decoded, of frames after some in which nobody lies."""
-        state = HONEST.play(quiet, defense)[-1][0].state if quiet else defense.initial_state(TEAM)
+    def play(self, frames, defense=DEFENSE, quiet=0, before=None):
+        """Decisions, and the boxes of each subset decoded, of frames after some quiet ones in another world, by default
+        one in which nobody lies.
+        """
+        state = (before or HONEST).play(quiet, defense)[-1][0].state if quiet else defense.initial_state(TEAM)
         rng, met = np.random.default_rng(0), []
         for _ in range(frames):
             decision, tested = run_frame(defense, state, TEAM, [], rng, judge=self.judge)

@@ -24,7 +24,9 @@ def claim(ego, *teammates):
     [
         ((NO, YES), True),  # the ego's word is enough
         ((NO, 0.0, YES), True),
-        ((NO, YES, YES, YES), True),
+        ((NO, YES, YES), True),
+        ((NO, YES, YES, YES), False),  # three do not lie together: the ego itself may be late
+        ((NO, NO, YES, YES, YES), False),
         ((-5.0, YES, YES), False),  # if it is clear
         ((0.0, NO, YES), False),  # one against one
         ((0.0, NO, NO, YES), True),

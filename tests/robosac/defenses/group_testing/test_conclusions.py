@@ -338,7 +338,8 @@ def test_who_denies_what_others_see_where_it_shows_nothing_may_be_blind_and_is_n
         )
         conclude(found, tuple(TEAM))
     assert set(found.lies.levels[LIAR]) == {kind}
-    assert (found.lies.guilt(LIAR) > 0) == (kind == "conflict")
+    found.lies.effects[LIAR] = frame
+    assert (found.lies.guilt(LIAR, frame) > 0) == (kind == "conflict")
     assert found.known.suspicion()[LIAR] > 0.5
 
 

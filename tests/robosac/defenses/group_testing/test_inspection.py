@@ -9,6 +9,7 @@ from robosac.answers import Verdict
 from robosac.defenses import EGO
 from robosac.defenses.group_testing import GroupTesting, GroupTestingSettings
 from robosac.defenses.group_testing.findings import Findings
+from robosac.defenses.group_testing.geometry import followed
 from robosac.defenses.group_testing.hearing import Hearing
 from robosac.defenses.group_testing.inspection import Inspection
 from robosac.defenses.group_testing.knowledge import Knowledge
@@ -26,9 +27,14 @@ from tests.robosac.defenses.group_testing.one_place import (
     LIAR,
     MODEL,
     MOVED,
+    NO,
     PLACE,
+    SEEN,
     YES,
     World,
+    seen_by,
+    there,
+    with_liar,
 )
 
 
@@ -139,3 +145,39 @@ def test_everybody_is_left_out_once_although_nothing_is_wrong():
     met = HONEST.play(4)
     left_out = {name for _, tested in met for subset in tested if len(subset) == 4 for name in set(TEAM) - set(subset)}
     assert left_out == set(TEAM)
+
+
+@pytest.mark.parametrize("own", [YES, 0.0])
+def test_who_makes_a_vehicle_vanish_that_one_other_sees_is_found_though_it_was_honest_for_long(own):
+    """By its own word the vehicle may be there."""
+    said = {"car-2": YES, LIAR: own}
+    shown, taken = World(said, seen_by("car-2")), World(said, with_liar(CAR[:0], CAR))
+    met = taken.play(12, quiet=10, before=shown)
+    asked = [set(TEAM) - set(subset) for subset in met[0][1] if len(subset) == len(TEAM) - 1]
+    assert {name for (name,) in asked} >= ({LIAR, "car-2"} if own == YES else set(TEAM) - {"car-2"})
+    assert LIAR not in met[-1][0].accepted
+    assert there(*met[-1], met[-1][0].objects)
+    assert not any(decision.named for decision, _ in met)
+    quiet = shown.play(12, quiet=10, before=shown)
+    assert all(len(tested) <= 2 for _, tested in quiet[2:])
+
+
+@pytest.mark.parametrize(
+    ("said", "boxes", "lost"),
+    [
+        ({"car-2": YES}, CAR[:0], True),
+        ({"car-2": 2.0}, CAR[:0], False),
+        ({}, CAR[:0], False),
+        ({"car-2": YES, "car-3": NO}, CAR[:0], False),
+        ({"car-2": YES}, CAR, False),
+    ],
+    ids=["certain", "unsure", "unseen", "denied", "shown"],
+)
+def test_a_vehicle_has_vanished_if_somebody_sees_it_and_the_fusion_no_longer_shows_it(said, boxes, lost):
+    team = tuple(TEAM)
+    found = Findings(Knowledge(MODEL, Posterior(len(MODEL.kinds), 0.5, 0.25, team), Memory()), Lies(), team, ())
+    found.known.memory.shown = {found.known.key(team): followed(np.vstack([SEEN, CAR]), np.eye(4))}
+    found.learn(World(said, lambda _: boxes).judge(team, None, 1))
+    assert bool(len(found.lost(team))) == lost
+    found.known.memory.shown = {}
+    assert not len(found.lost(team))

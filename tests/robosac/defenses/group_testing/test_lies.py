@@ -14,6 +14,7 @@ from robosac.defenses.group_testing.lies import (
     QUIET_FRAMES,
     QUIET_M,
     RULES,
+    SEARCHED_FRAMES,
     Lies,
     Word,
 )
@@ -83,25 +84,50 @@ def test_each_step_weighs_once_on_the_way_up(kind):
 
 @pytest.mark.parametrize("kind", sorted(kind for kind, rule in RULES.items() if rule.malice))
 def test_who_lies_too_often_in_one_way_is_named(kind):
-    lies, rule = Lies(), RULES[kind]
+    lies, rule = Lies(effects={"a": 0}), RULES[kind]
     enough = int(np.ceil(rule.names / (rule.gain - rule.drift) - 1e-9))
     for number in range(1, enough + 1):
         lies.add("a", {kind: 1})
-        assert (lies.worst("a") >= 1.0, lies.guilt("a") >= 1.0) == (number == enough,) * 2
+        assert (lies.worst("a") >= 1.0, lies.guilt("a", 0) >= 1.0) == (number == enough,) * 2
     assert lies.worst("b") < 1.0
+
+
+def test_nobody_is_named_for_words_alone():
+    """But for those whose message lately did something to an object."""
+    lies = Lies()
+    for _ in range(20):
+        lies.add("a", {"conflict": 3})
+    assert (lies.worst("a") > 1.0, lies.guilt("a", 20)) == (True, 0.0)
+    lies.effects["a"] = 20
+    assert lies.guilt("a", 20) > 1.0
+    assert lies.guilt("a", 20 + PLACE_FRAMES) == 0.0
+    lies.add("a", {"ghost": 1})
+    assert lies.guilt("a", 20 + PLACE_FRAMES) > 0.0
+
+
+def test_a_place_is_searched_again_after_a_while_only():
+    lies, near = Lies(), np.add(HERE, [1.0, 0.0])
+    assert lies.search(HERE, 5)
+    assert not lies.search(near, 5 + SEARCHED_FRAMES - 1)
+    assert lies.search(np.add(HERE, [9.0, 0.0]), 6)
+    assert lies.search(near, 5 + SEARCHED_FRAMES)
+    assert lies.search(HERE, 0)  # frames are counted anew
+    for number in range(100):
+        lies.search(np.array([10.0 * number, 50.0]), 1)
+    assert len(lies.searched) == MOST_QUIET
 
 
 def test_who_shows_another_shape_is_neither_suspected_nor_named():
     lies = Lies()
     assert sum(lies.add("a", {"reshaped": 1}) for _ in range(100)) == 0.0
-    assert (lies.worst("a") > 1.0, lies.guilt("a")) == (True, 0.0)
+    assert (lies.worst("a") > 1.0, lies.guilt("a", 0)) == (True, 0.0)
 
 
 def test_who_is_late_is_suspected_and_never_named():
     lies = Lies()
     weights = [lies.add("a", {"late": 1}) for _ in range(100)]
     assert sum(weights) == sum(weight for _, weight in RULES["late"].weights)
-    assert (lies.worst("a") > 1.0, lies.guilt("a")) == (True, 0.0)
+    assert (lies.worst("a") > 1.0, lies.guilt("a", 0)) == (True, 0.0)
 
 
 def test_lies_of_several_kinds_do_not_add_up():
@@ -191,7 +217,7 @@ def test_no_mistake_about_one_thing_names_anybody(kind, often):
     lies = Lies()
     for frame in range(0, 300, often):
         lies.add("a", {kind: lies.counting("a", kind, [HERE], frame)})
-        assert lies.guilt("a") < 1.0
+        assert lies.guilt("a", frame) < 1.0
         for _ in range(often - 1):
             lies.add("a", {})
 
@@ -203,11 +229,13 @@ def test_what_is_remembered_survives_json():
     lies.add("a", {"ghost": 1, "conflict": 3})
     lies.add("b", {"moved": 1})
     lies.leave_alone(HERE, 7)
+    lies.search(HERE, 7)
+    lies.effects = {"a": 7, "b": 3}
     again = Lies.from_state(json.loads(json.dumps(lies.to_state())))
     assert again == lies
     assert again.add("a", {"ghost": 1}) == lies.add("a", {"ghost": 1})
     again.forget("a")
-    assert set(again.levels) == {"b"}
+    assert set(again.levels) == set(again.effects) == {"b"}
 
 
 def test_two_who_say_the_same_again_and_again_are_not_believed():
