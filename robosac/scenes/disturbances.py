@@ -2,8 +2,8 @@
 
 Each class here takes a scene and is one: the same agents, the same truth, but somebody senses worse, is late, or is
 wrong about its pose. They can be put around each other, and around scenes of one's own data. A *teammate* is any agent
-but the first ego, the one that sequences belong to; only `JumpingEgo` touches that. True boxes stay those of the scene
-itself: what rain hides is there all the same.
+but the first ego, the one that sequences belong to; only `JumpingEgo` and `NarrowEgo` touch that. True boxes stay those
+of the scene itself: what rain hides is there all the same.
 
 What is random follows from the scene's number, the frame's, and the agent, so any frame can be had by itself.
 """
@@ -188,6 +188,22 @@ class JumpingEgo(Disturbed):
         turn = rng.normal(0.0, np.deg2rad(self.error_deg))
         ego = self.egos[0]
         return {name: replaced(view, dx, dy, turn) if name == ego else view for name, view in frame.views.items()}
+
+
+@dataclass(frozen=True)
+class NarrowEgo(Disturbed):
+    """The first ego sees only what is ahead of it."""
+
+    view_deg: float = 120.0
+    """How wide."""
+
+    def views(self, frame: Frame) -> Mapping[str, View]:
+        ego = self.egos[0]
+        if ego not in frame.views:
+            return frame.views
+        view = frame.views[ego]
+        seen = np.abs(np.arctan2(view.points[:, 1], view.points[:, 0])) <= np.deg2rad(self.view_deg / 2)
+        return {**frame.views, ego: View(view.pose, view.points[seen])}
 
 
 def replaced(view: View, dx: float, dy: float, turn: float = 0.0) -> View:

@@ -7,7 +7,7 @@ from dataclasses import dataclass
 from functools import partial
 
 from robosac.scenes.base import Scene
-from robosac.scenes.disturbances import Biased, Dropped, JumpingEgo, Late, NoisyScanner, Rain
+from robosac.scenes.disturbances import Biased, Dropped, JumpingEgo, Late, NarrowEgo, NoisyScanner, Rain
 from robosac.scenes.lidar import Lidar
 from robosac.scenes.worlds.car_park import CarPark
 from robosac.scenes.worlds.crossing import Crossing
@@ -60,4 +60,5 @@ WORLDS: Mapping[str, Recipe] = {
     "crossing-dropped": Recipe(Crossing, (Dropped,)),
     "crossing-biased": Recipe(Crossing, (Biased,)),
     "crossing-jumping-ego": Recipe(Crossing, (JumpingEgo,)),
+    "crossing-narrow-ego": Recipe(Crossing, (NarrowEgo,)),
 }

@@ -2,11 +2,11 @@ import numpy as np
 import pytest
 
 from robosac.scenes import IntersectionScene
-from robosac.scenes.disturbances import Biased, Dropped, JumpingEgo, Late, NoisyScanner, Rain
+from robosac.scenes.disturbances import Biased, Dropped, JumpingEgo, Late, NarrowEgo, NoisyScanner, Rain
 
 SCENE = IntersectionScene(4)
 TEAM = SCENE.agents[1:]
-EVERYTHING = (Rain, NoisyScanner, Late, Dropped, Biased, JumpingEgo)
+EVERYTHING = (Rain, NoisyScanner, Late, Dropped, Biased, JumpingEgo, NarrowEgo)
 
 
 def changed(scene, index, what):
@@ -145,6 +145,16 @@ def test_only_the_ego_jumps_and_anew_in_each_frame():
         np.testing.assert_allclose(pose[:3, :3] @ pose[:3, :3].T, np.eye(3), atol=1e-12)
     np.testing.assert_allclose(np.std(jumps, axis=0), 0.1, rtol=0.15)
     assert np.std(turns) == pytest.approx(0.2, rel=0.15)
+
+
+def test_a_narrow_ego_sees_only_what_is_ahead():
+    scene = NarrowEgo(SCENE, view_deg=90.0)
+    assert changed(scene, 0, "points") == ["car-1"]
+    assert not changed(scene, 0, "pose")
+    plain, seen = (each.frame(0).views["car-1"].points for each in (SCENE, scene))
+    ahead = np.abs(plain[:, 1]) <= plain[:, 0]
+    np.testing.assert_array_equal(seen, plain[ahead])
+    assert 0 < len(seen) < len(plain)
 
 
 def test_disturbances_go_around_each_other():
