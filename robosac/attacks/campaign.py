@@ -34,8 +34,8 @@ Schedule = Callable[[int, Sequence[str]], Sequence[str]]
 """Of the number of a frame and all attackers, those that act; the others send honest messages. All egos of a frame meet
 the same ones.
 """
-Pretence = Callable[[FloatArray], FloatArray]
-"""Of one's true pose, the claimed one: world_from_sensor (4, 4), both."""
+Pretence = Callable[[FloatArray, int], FloatArray]
+"""Of one's true pose, and the frame's number, the claimed pose: world_from_sensor (4, 4), both."""
 
 
 def always(frame: int, attackers: Sequence[str]) -> Sequence[str]:  # noqa: ARG001
@@ -58,11 +58,27 @@ def turns(frame: int, attackers: Sequence[str], frames: int = 5) -> Sequence[str
     return (attackers[frame // frames % len(attackers)],) if attackers else ()
 
 
-def false_pose(pose: FloatArray, forward_m: float = 0.8, left_m: float = 0.6, turn_deg: float = 3.0) -> FloatArray:
+def false_pose(
+    pose: FloatArray,
+    frame: int,  # noqa: ARG001
+    forward_m: float = 0.8,
+    left_m: float = 0.6,
+    turn_deg: float = 3.0,
+) -> FloatArray:
     """A pose that lies so far from the true one along the sender's axes, turned counter-clockwise: the ego puts the
     message in a wrong place.
     """
     return pose @ pose_matrix(forward_m, left_m, 0.0, radians(turn_deg))
+
+
+def turning_pose(pose: FloatArray, frame: int, turn_deg: float = 0.15, most_deg: float = 3.0) -> FloatArray:
+    """A pose that turns counter-clockwise, by so much more in each frame, as far as so much."""
+    return pose @ pose_matrix(0.0, 0.0, 0.0, radians(min(frame * turn_deg, most_deg)))
+
+
+def drifting_pose(pose: FloatArray, frame: int, left_m: float = 0.1, most_m: float = 1.2) -> FloatArray:
+    """A pose that drifts to the sender's left, by so much more in each frame, as far as so much."""
+    return pose @ pose_matrix(0.0, min(frame * left_m, most_m), 0.0, 0.0)
 
 
 @dataclass(frozen=True)
@@ -171,7 +187,7 @@ class Campaign:
             return {}
         sent = {name: benign[name] for name in acting}
         if self.pose is not None:
-            sent = {name: replace(message, pose=self.pose(message.pose)) for name, message in sent.items()}
+            sent = {name: replace(message, pose=self.pose(message.pose, frame)) for name, message in sent.items()}
         if self.attack is None:
             return sent
         met = {**benign, **sent}
@@ -253,6 +269,8 @@ BEHAVIOURS: Mapping[str, Mapping[str, Any]] = {
     "covering": {"alibi": covering},
     "framing": {"alibi": framing},
     "false-pose": {"pose": false_pose},
+    "turning-pose": {"pose": turning_pose},
+    "drifting-pose": {"pose": drifting_pose},
     "soft": {"softness": 1.0},
     "soft3": {"softness": 3.0},
     "denying": {"softness": 1.0, "words": words.denying},

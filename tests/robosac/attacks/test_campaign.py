@@ -18,7 +18,7 @@ from robosac.attacks import (
     load_campaign,
 )
 from robosac.attacks.alibi import covering, framing
-from robosac.attacks.campaign import always, asleep, false_pose, flicker, turns
+from robosac.attacks.campaign import always, asleep, drifting_pose, false_pose, flicker, turning_pose, turns
 from robosac.boxes import from_world, pose_matrix
 from robosac.evaluation.frames import Sensed, under_attack
 from robosac.scenes import IntersectionScene
@@ -50,11 +50,11 @@ def test_attackers_take_turns():
 
 def test_a_false_pose_moves_the_message_along_the_sender_axes():
     true = pose_matrix(10.0, 5.0, 1.7, np.pi / 2)
-    claimed = false_pose(true, forward_m=1.0, left_m=0.0, turn_deg=3.0)
+    claimed = false_pose(true, 0, forward_m=1.0, left_m=0.0, turn_deg=3.0)
     np.testing.assert_allclose(claimed[:3, 3], [10.0, 6.0, 1.7])
     turned = from_world(np.array([[0.0, 0.0, 4.0, 2.0, 0.0]]), claimed)[0, 4]
     assert turned == pytest.approx(-np.pi / 2 - np.radians(3.0))
-    moved = np.linalg.norm(false_pose(true)[:3, 3] - true[:3, 3])
+    moved = np.linalg.norm(false_pose(true, 0)[:3, 3] - true[:3, 3])
     assert moved == pytest.approx(1.0)
 
 
@@ -77,11 +77,25 @@ def test_asleep_all_send_what_is_honest(detector, messages):
     )
 
 
+@pytest.mark.parametrize(("pretence", "most"), [(turning_pose, (0.0, 3.0)), (drifting_pose, (1.2, 0.0))])
+def test_a_pose_that_turns_or_drifts_begins_as_the_true_one(pretence, most):
+    true = pose_matrix(3.0, -2.0, 1.7, 0.8)
+    claimed = [np.linalg.inv(true) @ pretence(true, frame) for frame in range(40)]
+    np.testing.assert_allclose(claimed[0], np.eye(4), atol=1e-12)
+    left = [each[1, 3] for each in claimed]
+    turned = [np.rad2deg(np.arctan2(each[1, 0], each[0, 0])) for each in claimed]
+    for found, end in zip((left, turned), most, strict=True):
+        steps = np.diff(found)
+        assert (steps >= -1e-9).all()
+        assert found[-1] == pytest.approx(end)
+        assert steps.max(initial=0.0) < 0.2
+
+
 def test_a_false_pose_needs_no_perturbation(detector, messages):
     met = under(load_campaign("honest@false-pose"), messages, detector)
     assert met.attackers == {"car-2"}
     assert met.teammates["car-2"].tensors is met.benign["car-2"].tensors
-    np.testing.assert_allclose(met.teammates["car-2"].pose, false_pose(met.benign["car-2"].pose))
+    np.testing.assert_allclose(met.teammates["car-2"].pose, false_pose(met.benign["car-2"].pose, 0))
     honest, lied = (detector.prepare(met.ego, sent).detect(["car-2"]) for sent in (met.benign, met.teammates))
     assert len(honest) != len(lied) or np.abs(honest - lied).max() > 0.1
 
