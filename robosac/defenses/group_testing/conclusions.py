@@ -5,6 +5,7 @@ from __future__ import annotations
 from collections import Counter
 from collections.abc import Mapping, Sequence
 from dataclasses import replace
+from itertools import chain
 
 import numpy as np
 
@@ -58,12 +59,13 @@ def conclude(found: Findings, answer: Hypothesis) -> None:
     for name, lie in _together(found, answer):
         blamed[name].append(lie)
     conflicts = _conflicts(found, answer)
+    having_a_part = _having_a_part(found, answer)
     straying = _straying(found, asked)
     _leave_alone(found, answer)
     _clear(found, comparisons)
     for name in found.team:
         counts, lies = dict(conflicts.get(name, {})), blamed[name]
-        if lies:
+        if lies or name in having_a_part:
             found.lies.effects[name] = frame
         if lies and found.late(name):
             lies = [replace(lie, along=True) for lie in lies]
@@ -126,6 +128,8 @@ def _conflicts(found: Findings, answer: Hypothesis) -> dict[str, dict[str, int]]
         supported, denied = conflicts[name]
         if not (supported | denied).any():
             continue
+        if supported.any() and denied.any():
+            found.lies.effects[name] = frame
         unseen = denied & found.hearing.everybody.is_empty(name, claims.boxes[:, :2])
         if unseen.any() and found.hearing.alone(name, found.unheard) >= FEWEST_SEEN:
             unseen[:] = False
@@ -136,6 +140,14 @@ def _conflicts(found: Findings, answer: Hypothesis) -> dict[str, dict[str, int]]
             places = [found.placed(box[:2]) for box in claims.boxes[(supported | denied) & (kinds == kind)]]
             counts.setdefault(name, {})[kind] = found.lies.counting(name, kind, places, frame, once)
     return counts
+
+
+def _having_a_part(found: Findings, answer: Hypothesis) -> set[str]:
+    """Those of the answer whose own messages go with something that is wrong in it."""
+    if answer not in found.shown:
+        return set()
+    going = (found.shown[answer].going_with(lie) for lie in found.lies_in(answer) if lie.kind != "moved")
+    return set(answer) & set(chain.from_iterable(going))
 
 
 def _leave_alone(found: Findings, answer: Hypothesis) -> None:

@@ -102,7 +102,9 @@ class Lies:
     accusers: dict[str, dict[str, int]] = field(default_factory=dict)
     """By teammate: who said that it moves or reshapes vehicles, and how often."""
     effects: dict[str, int] = field(default_factory=dict)
-    """By teammate: the frame of the session in which it last did something to an object of a fusion."""
+    """By teammate: the frame of the session in which it last did something to an object of a fusion, went with what was
+    wrong in an answer, or saw what nobody else did and denied what all others saw.
+    """
     searched: list[tuple[float, float, int]] = field(default_factory=list)
     """Places where a vehicle vanished, and everybody was left out to see who took it away: x, y (world, metres), the
     frame of the session.
@@ -182,13 +184,14 @@ class Lies:
         return max(level / RULES[k].names for k, (level, _) in known.items()) if known else 0.0
 
     def guilt(self, teammate: str, frame: int) -> float:
-        """The same of the kinds that somebody is named for: at 1 it is. Nobody is named for words alone, without having
-        done anything to an object for long: its sensor may be mounted as no other is, or on a bridge.
+        """The same of the kinds that somebody is named for: at 1 it is. It takes more words of which nothing came for
+        long: a sensor may be mounted as no other is.
         """
         words = frame - self.effects.get(teammate, -PLACE_FRAMES) >= PLACE_FRAMES
-        kinds = {kind for kind, rule in RULES.items() if rule.malice and not (words and kind == "conflict")}
+        most = {kind: rule.names for kind, rule in RULES.items() if rule.malice}
+        most["conflict"] *= MOST_LEVEL if words else 1.0
         known = self.levels.get(teammate, {}).items()
-        return max((level / RULES[kind].names for kind, (level, _) in known if kind in kinds), default=0.0)
+        return max((level / most[kind] for kind, (level, _) in known if kind in most), default=0.0)
 
     def is_quiet(self, place: FloatArray, frame: int) -> bool:
         """Whether a place (2,), world, is left alone."""

@@ -124,12 +124,10 @@ def drive(frames, delay, shown=False):
 
 
 @pytest.mark.parametrize("shown", [False, True])
-@pytest.mark.parametrize("delay", [0, 1, 2, 5])
-def test_who_is_late_is_not_named_and_who_replays_is_if_it_shows(delay, shown):
+@pytest.mark.parametrize(("delay", "names"), [(0, set()), (1, set()), (2, set()), (5, {LIAR})])
+def test_who_is_late_is_not_named_and_who_replays_is(delay, names, shown):
     found = drive(10, delay, shown and delay > 0)
-    names = {LIAR} if delay == 5 and shown else set()
     assert {name for decision in found for name in decision.named} == names
-    assert (found[-1].suspicion[LIAR] > 0.5) == (delay > 0)
     levels = found[-1].state["memory"]["lies"]["levels"].get(LIAR, {})
     assert ("late" in levels) == (0 < delay < 5)
     assert ("conflict" in levels) == (delay == 5)
