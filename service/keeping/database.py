@@ -22,7 +22,7 @@ from pathlib import Path
 from typing import Any, Protocol, TypeVar
 
 from sqlalchemy import Connection, Engine, create_engine, event
-from sqlalchemy.engine import URL
+from sqlalchemy.engine import URL, ExceptionContext
 from sqlalchemy.exc import SQLAlchemyError
 from sqlalchemy.ext.asyncio import create_async_engine
 from sqlalchemy.pool import NullPool, QueuePool
@@ -46,6 +46,8 @@ BUSY_PAUSE_S = 0.01
 COMMAND_TIMEOUT_S = 10.0
 """How long an answer of PostgreSQL is waited for, at least; it gives a statement up itself before (`Limits`)."""
 CONNECT_TIMEOUT_S = 5.0
+READ_ONLY = "25006"
+"""SQLSTATE of a statement that would write where only reading is allowed."""
 READERS = 2
 WRITTEN_TOGETHER = 64
 _creating = threading.Lock()
@@ -138,6 +140,7 @@ class Postgres(_Failing):
                 "server_settings": limits.of_server(),
             },
         )
+        event.listen(self._engine.sync_engine, "handle_error", _leave_what_only_reads)
         self._reader = self._engine.execution_options(isolation_level="AUTOCOMMIT")
 
     async def read(self, work: Work[T]) -> T:
@@ -163,6 +166,12 @@ class Postgres(_Failing):
 
     async def close(self) -> None:
         await self._engine.dispose()
+
+
+def _leave_what_only_reads(context: ExceptionContext) -> None:
+    """Connect anew after a refusal to write: a connection to what has become a standby would stay good for nothing."""
+    if getattr(context.original_exception, "sqlstate", None) == READ_ONLY:
+        context.is_disconnect = True
 
 
 class Sqlite(_Failing):

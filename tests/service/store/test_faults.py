@@ -12,8 +12,9 @@ import subprocess
 import time
 from types import SimpleNamespace
 
+import asyncpg
 import pytest
-from sqlalchemy import event, exc
+from sqlalchemy import event, exc, make_url
 
 from clients.client import AGAIN_FOR_S
 from clients.crash_test.driven import Driven
@@ -98,6 +99,22 @@ async def test_a_server_that_stands_still_or_dies(fault, postgres, good_frame):
                 postgres.send(signal.SIGCONT)
             else:
                 await asyncio.to_thread(postgres.start)
+        await ego.check()
+        assert (await served.http.get("/readyz")).status_code == 200
+
+
+async def test_a_server_that_only_reads_for_a_while(postgres, good_frame):
+    url = await postgres.new_database()
+    name = make_url(url).database
+    async with serve(database_url=url, keep_frames=1) as served:
+        ego = await Ego.of(served, good_frame)
+        connection = await asyncpg.connect(host=str(postgres.folder), user="postgres", database="postgres")
+        await connection.execute(f"ALTER DATABASE {name} SET default_transaction_read_only = on")
+        await connection.execute(f"SELECT pg_terminate_backend(pid) FROM pg_stat_activity WHERE datname = '{name}'")
+        assert await ego.post_for(0.5)
+        problem(await served.http.get("/readyz"), 503, "store-unavailable")
+        await connection.execute(f"ALTER DATABASE {name} RESET default_transaction_read_only")
+        await connection.close()
         await ego.check()
         assert (await served.http.get("/readyz")).status_code == 200
 
