@@ -146,6 +146,10 @@ class StoreTooSlow(Refused):
         super().__init__(Kind.STORE_TOO_SLOW, f"the database {what}")
 
 
+class SessionInUse(Exception):
+    """A session was used meanwhile, so it is not ended for being idle."""
+
+
 class GivenUp(Exception):
     """Nobody waits any more for what was to be kept, so it is not kept."""
 

@@ -9,10 +9,10 @@ from typing import Any
 from sqlalchemy import Connection, insert
 
 from robosac.audit import Unsealed, digest
-from service.errors import SessionChanged, SessionOver, TokenReplaced
+from service.errors import SessionChanged, SessionInUse, SessionOver, TokenReplaced
 from service.keeping.partitions import day
 from service.keeping.record import SessionRecord
-from service.keeping.rows import CHANGE, GET_BUT_STATE, GET_TO_CHANGE, columns, read_row
+from service.keeping.rows import CHANGE, GET_BUT_STATE, GET_TO_CHANGE, GET_TOUCHED, columns, read_row
 from service.keeping.tables import audit_lines
 
 GROWTH = ("audit_seq", "audit_head", "kept_bytes")
@@ -70,6 +70,15 @@ def check_revision(now: SessionRecord, worked_out_from: SessionRecord) -> None:
     """Raise SessionChanged if a session is not of the revision that a change was worked out from."""
     if now.revision != worked_out_from.revision:
         raise SessionChanged
+
+
+def check_unused(connection: Connection, session_id: str, since: float | None) -> None:
+    """Raise SessionInUse if a session was used since then (Unix time), where that is given; nobody uses it from now on
+    to the transaction's end.
+    """
+    touched_at = None if since is None else connection.execute(GET_TOUCHED, {"this": session_id}).scalar()
+    if touched_at is not None and touched_at >= since:
+        raise SessionInUse
 
 
 def renewal(vehicle_id: str, before: str, token_id: str) -> Change:

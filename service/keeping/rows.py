@@ -26,6 +26,7 @@ GET_BUT_KNOWN = select(*(sessions.c[name] for name in FIELDS if name not in {"st
 """Without what can be long, and is the same as long as the log ends as it did."""
 GET_TO_CHANGE = GET.with_for_update()  # SQLite, which knows no such clause, has locked everything by then
 GET_BUT_STATE = select(*(sessions.c[name] for name in FIELDS if name != "state")).where(THIS).with_for_update()
+GET_TOUCHED = select(sessions.c.touched_at).where(THIS).with_for_update()
 CHANGE = update(sessions).where(THIS)
 TOUCH = (
     update(sessions)

@@ -6,6 +6,7 @@ import asyncio
 from collections import Counter
 from collections.abc import Callable, Collection, Mapping, Sequence
 from dataclasses import replace
+from functools import partial
 from typing import Any
 
 from sqlalchemy import Connection, Delete, Row, Select, Update, func, insert, select, update
@@ -14,7 +15,7 @@ from robosac.audit import FULL_EVERY, digest
 from robosac.audit.events import DetectorChanged, Event, FrameAnswered, SessionEnded, TeamChanged, TokenRenewed
 from service.errors import AuditFull, FrameDecided, SessionChanged, SessionOver, TokenReplaced
 from service.keeping import migrations, once, partitions, purging, usage
-from service.keeping.appending import Change, append, check_revision, line_row, renewal
+from service.keeping.appending import Change, append, check_revision, check_unused, line_row, renewal
 from service.keeping.database import connect
 from service.keeping.limits import Limits
 from service.keeping.patience import Patience
@@ -245,13 +246,20 @@ class Store:
         query = select(kept_messages.c.body).where(*of_frame)
         return await self._database.read(lambda connection: connection.execute(query).scalar())
 
-    async def end(self, session_id: str, event: SessionEnded) -> None:
-        """End a session; its log stays until it is purged."""
+    async def end(self, session_id: str, event: SessionEnded, unused_since: float | None = None) -> None:
+        """End a session; its log stays until it is purged.
+
+        Raises
+        ------
+        SessionInUse
+            If it was used since then (Unix time), where that is given.
+        """
 
         def keep(connection: Connection) -> None:
             connection.execute(ADD_MESSAGES, {"this": session_id})
 
-        await self._append(session_id, event, lambda _: {"ended_at": event.time}, keep)
+        first = partial(check_unused, session_id=session_id, since=unused_since)
+        await self._append(session_id, event, lambda _: {"ended_at": event.time}, keep, first=first)
         self._sealing.forget(session_id)
 
     async def unused_since(self, moment: float) -> list[str]:
@@ -312,6 +320,7 @@ class Store:
         change: Change,
         keep: Callable[[Connection], None] = lambda _: None,
         draft: Draft[Ready] | None = None,
+        first: Callable[[Connection], None] = lambda _: None,
     ) -> SessionRecord:
         """Change a session and append to its log, in one transaction; what takes long is done before it.
 
@@ -323,6 +332,7 @@ class Store:
             await asyncio.to_thread(ready.write)
 
         def work(connection: Connection) -> SessionRecord:
+            first(connection)
             after = append(connection, session_id, ready.made.said, change, self.check_room, ready.made.state)
             keep(connection)
             return after

@@ -37,13 +37,20 @@ class Idle:
         used = sorted((one, now - age_s) for one in quiet if (age_s := self._unused_s(one)) < self.idle_s / 2)
         for first in range(0, len(used), NOTED_TOGETHER):  # few at a time, since decisions wait for the database, too
             await self.store.touch(dict(used[first : first + NOTED_TOGETHER]))
-        long_ago = time.time() - self.idle_s - 2 * self.every_s
-        return [one for one in await self.store.unused_since(long_ago) if self._unused_s(one) > self.idle_s]
+        return [one for one in await self.store.unused_since(self.long_ago()) if self.is_unused_here(one)]
+
+    def long_ago(self) -> float:
+        """The moment since which a session must have been used, as the store knows it, to go on (Unix time)."""
+        return time.time() - self.idle_s - 2 * self.every_s
+
+    def is_unused_here(self, session_id: str) -> bool:
+        """Whether nobody has used a session here for too long."""
+        return self._unused_s(session_id) > self.idle_s
 
     def may_be_over(self, session_id: str) -> bool:
         """Whether what is held of a session may be of no use here any more."""
         live = self.live.get(session_id)
-        return live is None or live.is_quiet or self._unused_s(session_id) > self.idle_s
+        return live is None or live.is_quiet or self.is_unused_here(session_id)
 
     def _unused_s(self, session_id: str) -> float:
         """For how long nobody has used a session here; for ever, if it is not in use here."""

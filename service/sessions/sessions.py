@@ -17,7 +17,7 @@ from robosac.budget import DomainError
 from robosac.defenses import DefenseSettings, known, read_settings, suspicion_in
 from robosac.session import Session, defense_for
 from service.engine import Engine
-from service.errors import Kind, Refused, SessionOver, StoreTooSlow, StoreUnavailable, TokenRefused
+from service.errors import Kind, Refused, SessionInUse, SessionOver, StoreTooSlow, StoreUnavailable, TokenRefused
 from service.keeping.gateway_keys import GatewayKeys
 from service.keeping.patience import GRACE_S, within
 from service.keeping.record import SessionRecord, new_seed
@@ -188,7 +188,10 @@ class Sessions:
                 await self.store.ping()
 
     async def _expire(self, session_id: str) -> None:
-        await self._end(session_id, "expired")
+        """End a session, unless it has been used since it was found unused: many may have been ended in between."""
+        if self._idle.is_unused_here(session_id):
+            with contextlib.suppress(SessionInUse):
+                await self._end(session_id, "expired", self._idle.long_ago())
 
     async def current(self, caller: Caller) -> SessionRecord:
         """The session as it is now; it may have moved on, or ended, since the caller was authenticated.
@@ -275,9 +278,9 @@ class Sessions:
         if record is None or record.ended_at is not None or moved:
             self._forget(session_id)
 
-    async def _end(self, session_id: str, why: str) -> None:
+    async def _end(self, session_id: str, why: str, unused_since: float | None = None) -> None:
         with contextlib.suppress(SessionOver):
-            await self.store.end(session_id, SessionEnded(why=why))
+            await self.store.end(session_id, SessionEnded(why=why), unused_since)
             logger.info("session ended", session_id=session_id, why=why)
         self._forget(session_id)  # not before: if the store fails, the session goes on with the messages that wait
         self.metrics.sessions.set(await self.store.count())

@@ -237,7 +237,7 @@ async def test_a_session_that_cannot_be_ended_keeps_no_other_from_it_nor_logs_fr
         await served.ego(over).close()
         damaged, done, end = idle[0].session_id, [], store.end
 
-        async def ended(sid, event):
+        async def ended(sid, event, _):
             if sid == damaged:
                 raise StoreUnavailable
             await end(sid, event)
@@ -249,6 +249,7 @@ async def test_a_session_that_cannot_be_ended_keeps_no_other_from_it_nor_logs_fr
         monkeypatch.setattr(store, "end", ended)
         monkeypatch.setattr(store, "kept_bytes", fails)
         monkeypatch.setattr(Idle, "unused", lambda _: asyncio.sleep(0, [session.session_id for session in idle]))
+        monkeypatch.setattr(Idle, "is_unused_here", lambda *_: True)
         await asyncio.sleep(0.02)
         await served.gateway.sessions.sweep()
         assert done == [idle[1].session_id]

@@ -8,11 +8,14 @@ import sys
 import types
 
 import pytest
+from sqlalchemy import update
 
 from clients.errors import AccessDenied, FrameConflict, SessionNotFound
 from robosac import wire
 from robosac.detectors.base import calibration_beside
 from robosac.detectors.embedded import SHIPPED_WEIGHTS, EmbeddedDetector
+from service.keeping.tables import sessions
+from service.sessions.idle import Idle
 from tests.service.conftest import EGO, HOOKED, TEAM, problem, serve
 
 
@@ -174,6 +177,19 @@ async def test_a_session_that_is_only_read_at_one_gateway_is_not_ended_by_the_ot
         await asyncio.sleep(1.5)
         with pytest.raises(SessionNotFound):
             await one.ego(session).state()
+
+
+async def test_a_session_that_wakes_while_unused_ones_are_ended_goes_on(two, monkeypatch, messages, benign):
+    one, other = two
+    session = await other.open()
+    monkeypatch.setattr(Idle, "unused", lambda _: asyncio.sleep(0, [session.session_id]))
+    await other.ego(session).post_frame(0, messages[EGO], benign)
+    await one.gateway.sessions.sweep()  # it knows of the frame from the database alone
+    long_ago = update(sessions).values(touched_at=0.0)
+    await other.gateway.store._database.write(lambda connection: connection.execute(long_ago))
+    await other.gateway.sessions.sweep()  # it alone knows of the frame
+    await other.ego(session).post_frame(1, messages[EGO], benign)
+    assert answered(await other.ego(session).audit()) == [0, 1]
 
 
 async def test_teams_that_change_at_both_gateways_at_once(two):

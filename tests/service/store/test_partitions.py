@@ -1,6 +1,7 @@
 """The log in a part for each day, in PostgreSQL."""
 
 import asyncio
+import contextlib
 import time
 
 import asyncpg
@@ -9,7 +10,7 @@ from alembic import command
 from alembic.config import Config
 from sqlalchemy import text
 
-from service.errors import SessionOver, StoreUnavailable
+from service.errors import SessionInUse, SessionOver, StoreUnavailable
 from service.keeping import partitions
 from service.keeping.database import connect
 from service.keeping.limits import Limits
@@ -49,6 +50,22 @@ async def written_on(url, sid, number):
         f"CREATE TABLE IF NOT EXISTS {name} PARTITION OF audit_lines {values}",
         f"UPDATE audit_lines SET day = {number} WHERE session_id = '{sid}'",
     )
+
+
+@contextlib.asynccontextmanager
+async def done_while_waited_for(url, statement, waiting):
+    """Somebody else's change, which is not committed before the call waits for a lock."""
+    connection = await asyncpg.connect(url.replace("+asyncpg", ""))
+    try:
+        async with connection.transaction():
+            await connection.execute(statement)
+            call = asyncio.create_task(waiting)
+            while not (await run(url, "SELECT count(*) FROM pg_locks WHERE NOT granted"))[0][0]:
+                assert not call.done()
+                await asyncio.sleep(0.02)
+        yield call
+    finally:
+        await connection.close()
 
 
 async def test_there_are_parts_for_today_and_the_next_days(url):
@@ -187,6 +204,17 @@ async def test_who_stands_still_in_a_transaction_or_takes_too_long_is_hung_up_on
         began = time.monotonic()
         await store.log(sid, note())
         assert time.monotonic() - began < 1.5
+
+
+async def test_a_session_that_is_used_while_its_end_waits_for_its_row_goes_on(url):
+    async with opened(url) as store:
+        sid = await added(store)
+        await run(url, "UPDATE sessions SET touched_at = 0")
+        use = f"UPDATE sessions SET touched_at = {time.time()}"
+        async with done_while_waited_for(url, use, store.end(sid, THE_END, time.time() - 60)) as ending:
+            with pytest.raises(SessionInUse):
+                await ending
+        assert len(await check_chain(store, sid)) == 1
 
 
 def connected(connection):

@@ -9,7 +9,7 @@ import pytest
 import rfc8785
 from sqlalchemy import text
 
-from service.errors import AuditFull, FrameDecided, Refused, SessionChanged, SessionOver, TokenReplaced
+from service.errors import AuditFull, FrameDecided, Refused, SessionChanged, SessionInUse, SessionOver, TokenReplaced
 from service.keeping.once import MOST_PROOFS
 from service.keeping.record import SessionRecord
 from service.keeping.store import PAGE, Store
@@ -188,6 +188,15 @@ async def test_old_messages_are_forgotten(store):
             await store.decide(record, a_decision(frame), "00" * 32, bytes([frame]), keep_frames=kept)
     assert [await store.messages(sid, frame) for frame in range(4)] == [None, None, b"\x02", b"\x03"]
     assert await store.messages(other, 0) == b"\x00"
+
+
+async def test_a_session_that_was_used_since_is_not_ended_for_being_idle(store):
+    sid = await added(store)
+    with pytest.raises(SessionInUse):
+        await store.end(sid, THE_END, time.time() - 60)
+    await store.log(sid, note())
+    await store.end(sid, THE_END, LATER)
+    assert len(await check_chain(store, sid)) == 3
 
 
 async def test_idle_sessions_are_found_and_only_ended_ones_are_purged(store):
