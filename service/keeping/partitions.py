@@ -57,10 +57,17 @@ def old(connection: Connection, before: float) -> list[str]:
 
 
 def drop_if_finished(connection: Connection, name: str) -> None:
-    """Forget a part, if it is still there and no log has a line in it that can still be read."""
+    """Forget a part, if it is still there and no log has a line in it that can still be read.
+
+    From before the look to the end nobody writes to it. It can be read all the same: whoever reads has a lock on the
+    whole log by then, and to drop a part takes one, too.
+    """
     migrations.lock(connection)  # others may be about to do the same
-    if name in connection.execute(_PARTS).scalars().all() and not connection.execute(_any_of(name)).first():
-        _wait_briefly(connection)
+    if name not in connection.execute(_PARTS).scalars().all():
+        return
+    _wait_briefly(connection)
+    connection.execute(text(f"LOCK TABLE {name} IN SHARE MODE"))
+    if not connection.execute(_any_of(name)).first():
         connection.execute(text(f"DROP TABLE {name}"))
 
 

@@ -154,6 +154,18 @@ async def test_parts_go_where_logs_are_kept_for_less_than_a_day(url):
         assert name_of(old) not in await parts(url)
 
 
+async def test_a_line_that_is_written_while_its_day_is_about_to_go_is_kept(url, monkeypatch):
+    monkeypatch.setattr(partitions, "LOCK_MS", 5000)
+    old = day() - 9
+    async with opened(url) as store:
+        sid = await added(store)
+        await written_on(url, "nobody", old)
+        line = f"INSERT INTO audit_lines (session_id, seq, line, day) VALUES ('{sid}', 2, 'late', {old})"
+        async with done_while_waited_for(url, line, store.purge(time.time() - 7 * DAY_S)) as purging:
+            await purging
+        assert await store.audit(sid, 1) == ["late"]
+
+
 async def test_two_may_forget_the_same_days_at_once(url):
     async with opened(url) as one, opened(url) as other:
         for number in range(2, 6):
