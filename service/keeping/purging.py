@@ -32,7 +32,6 @@ async def purge(database: Database, moment: float, *forget: Callable[[str], None
     """
     has_parts = await database.write(partitions.are_there)
     in_parts = has_parts and moment < time.time() - partitions.DAY_S
-    await database.write(partitions.make_ahead)
     ended = select(sessions.c.session_id).where(ENDED, sessions.c.touched_at < moment)
     if in_parts:
         while some := await _ids(database, ended.where(sessions.c.token_ids != "{}").limit(SESSIONS_TOGETHER)):

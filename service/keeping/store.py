@@ -14,7 +14,7 @@ from sqlalchemy import Connection, Delete, Row, Select, Update, func, insert, se
 from robosac.audit import FULL_EVERY, digest
 from robosac.audit.events import DetectorChanged, Event, FrameAnswered, SessionEnded, TeamChanged, TokenRenewed
 from service.errors import AuditFull, FrameDecided, SessionChanged, SessionOver, TokenReplaced
-from service.keeping import migrations, once, partitions, purging, usage
+from service.keeping import clock, migrations, once, partitions, purging, usage
 from service.keeping.appending import Change, append, check_revision, check_unused, line_row, renewal
 from service.keeping.database import connect
 from service.keeping.limits import Limits
@@ -70,7 +70,7 @@ class Store:
     async def start(self) -> None:
         """Bring the database to this version's schema."""
         await self._database.prepare(migrations.upgrade)
-        await self._database.write(partitions.make_ahead)
+        await self.make_ahead()
 
     async def create(self, record: SessionRecord, event: Event) -> SessionRecord:
         """Keep a new session and the first record of its log; the session as it is then."""
@@ -270,6 +270,14 @@ class Store:
         """Note when open sessions were used last (Unix time) where that added nothing to them."""
         await self._execute(TOUCH, [{"this": session_id, "used_at": at} for session_id, at in used.items()])
 
+    async def ahead_s(self) -> float:
+        """As `service.keeping.clock.ahead_s`."""
+        return await self._database.read(clock.ahead_s)
+
+    async def make_ahead(self) -> None:
+        """Make room for the lines of the next days, where it is missing."""
+        await self._database.write(partitions.make_ahead)
+
     async def purge(self, moment: float) -> None:
         """Forget the sessions that ended before then (Unix time), as `service.keeping.purging.purge` does."""
         await purging.purge(self._database, moment, self._seen.forget, self._sealing.forget)
@@ -289,7 +297,7 @@ class Store:
         what changes nothing.
         """
         if self._database.failed:
-            await self._database.write(partitions.make_ahead)
+            await self.make_ahead()
             await self._database.write(once.change)
         else:
             await self._execute(NO_CHANGE)

@@ -23,6 +23,7 @@ from service.keeping.patience import GRACE_S, within
 from service.keeping.record import SessionRecord, new_seed
 from service.keeping.store import Store
 from service.schemas import SessionState
+from service.sessions.clock import Clock
 from service.sessions.detectors import OTHER_WEIGHTS, detector_changed, has_changed
 from service.sessions.gathering import Gathering
 from service.sessions.identity import Tokens
@@ -63,6 +64,7 @@ class Sessions:
     def __post_init__(self) -> None:
         self._live: dict[str, LiveSession] = {}
         self._idle = Idle(self.store, self._live, self.settings.session_idle_s)
+        self._clock = Clock(self.store)
         self._standing: set[str] = set()
         try:
             self.defenses = known(self.settings.extra_defenses)
@@ -168,12 +170,20 @@ class Sessions:
     async def sweep(self) -> None:
         """Purge old logs, end the sessions that nobody has used for too long, and let go of those that are over here.
 
+        Nothing is purged or ended while this machine's clock is wrong: others may be using it.
         What fails for one session, or in one step, keeps nothing else from being done.
         """
-        with _going_on("logs could not be purged"):  # first, as it makes room for the lines of a new day
-            await self.store.purge(time.time() - self.settings.audit_retention_s)
+        with _going_on("there may be no room for the lines of the next days"):
+            await self.store.make_ahead()
+        is_right = False
+        with _going_on("the clock could not be compared with the database's"):
+            is_right = await self._clock.is_right()
+        with _going_on("logs could not be purged"):
+            if is_right:
+                await self.store.purge(time.time() - self.settings.audit_retention_s)
         with _going_on("idle sessions could not be ended"):
-            await self._each(await self._idle.unused(), self._expire)
+            unused = await self._idle.unused()  # which tells the store of what is used here, too
+            await self._each(unused if is_right else [], self._expire)
         with _going_on("it is unknown which sessions are over"):
             await self._each([one for one in self._live if self._idle.may_be_over(one)], self._forget_if_over)
         with _going_on("it is unknown what is kept for whom"):
