@@ -66,7 +66,9 @@ class Database(Protocol):
     """
 
     failed: bool
-    """Whether the last `write` met a fault of the database."""
+    """Whether a `write` has met a fault of the database. It stays so until somebody who saw that all is well says no:
+    what is written next may be small enough where a decision is not.
+    """
 
     async def read(self, work: Work[T]) -> T:
         """Run work that only reads."""
@@ -113,7 +115,6 @@ class _Failing:
         except StoreUnavailable:
             self.failed = True
             raise
-        self.failed = False
 
 
 class Postgres(_Failing):

@@ -7,13 +7,16 @@ from __future__ import annotations
 from collections.abc import Callable
 from secrets import token_hex
 
-from sqlalchemy import Connection, delete, func, select, text
+from sqlalchemy import Connection, delete, func, insert, literal, select, text
 
 from service.errors import Kind, Refused
-from service.keeping.tables import secrets, used_proofs
+from service.keeping.partitions import day
+from service.keeping.tables import audit_lines, secrets, sessions, used_proofs
 
 MOST_PROOFS = 256
 """Proofs of one vehicle that are remembered at a time."""
+LINE_BYTES = 2**16
+"""Of a line of a log, with a whole state in it."""
 
 
 def secret(connection: Connection, name: str, make: Callable[[], str]) -> str:
@@ -25,7 +28,12 @@ def secret(connection: Connection, name: str, make: Callable[[], str]) -> str:
 
 
 def change(connection: Connection) -> None:
-    """Change something that means nothing."""
+    """Change something that means nothing, where there is room for a line of a log."""
+    undone = connection.begin_nested()
+    line = literal(token_hex(LINE_BYTES // 2))  # at random, as it may be compressed
+    of_any = select(sessions.c.session_id, literal(0), line, literal(day())).limit(1)
+    connection.execute(insert(audit_lines).from_select(["session_id", "seq", "line", "day"], of_any))
+    undone.rollback()
     keep = text(
         "INSERT INTO secrets (name, value) VALUES ('changed', :value) ON CONFLICT (name) DO UPDATE SET value = :value"
     )

@@ -294,11 +294,12 @@ class Store:
 
     async def ping(self) -> None:
         """Find out whether the database takes changes. It makes none, but after one that failed: a full disk would take
-        what changes nothing.
+        what changes nothing, or little.
         """
         if self._database.failed:
             await self.make_ahead()
             await self._database.write(once.change)
+            self._database.failed = False
         else:
             await self._execute(NO_CHANGE)
 

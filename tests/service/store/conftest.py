@@ -57,11 +57,15 @@ class Server:
             with contextlib.suppress(ProcessLookupError):
                 os.kill(process, number)
 
-    async def new_database(self) -> str:
-        name = f"gateway{next(NUMBERS)}"
+    async def do(self, *statements: str) -> None:
         connection = await asyncpg.connect(host=str(self.folder), user="postgres", database="postgres")
-        await connection.execute(f"CREATE DATABASE {name}")
+        for statement in statements:
+            await connection.execute(statement)
         await connection.close()
+
+    async def new_database(self, options: str = "") -> str:
+        name = f"gateway{next(NUMBERS)}"
+        await self.do(f"CREATE DATABASE {name} {options}")
         return f"postgresql+asyncpg://postgres@/{name}?host={self.folder}"
 
 

@@ -12,7 +12,6 @@ import subprocess
 import time
 from types import SimpleNamespace
 
-import asyncpg
 import pytest
 from sqlalchemy import event, exc, make_url
 
@@ -108,13 +107,13 @@ async def test_a_server_that_only_reads_for_a_while(postgres, good_frame):
     name = make_url(url).database
     async with serve(database_url=url, keep_frames=1) as served:
         ego = await Ego.of(served, good_frame)
-        connection = await asyncpg.connect(host=str(postgres.folder), user="postgres", database="postgres")
-        await connection.execute(f"ALTER DATABASE {name} SET default_transaction_read_only = on")
-        await connection.execute(f"SELECT pg_terminate_backend(pid) FROM pg_stat_activity WHERE datname = '{name}'")
+        await postgres.do(
+            f"ALTER DATABASE {name} SET default_transaction_read_only = on",
+            f"SELECT pg_terminate_backend(pid) FROM pg_stat_activity WHERE datname = '{name}'",
+        )
         assert await ego.post_for(0.5)
         problem(await served.http.get("/readyz"), 503, "store-unavailable")
-        await connection.execute(f"ALTER DATABASE {name} RESET default_transaction_read_only")
-        await connection.close()
+        await postgres.do(f"ALTER DATABASE {name} RESET default_transaction_read_only")
         await ego.check()
         assert (await served.http.get("/readyz")).status_code == 200
 
@@ -143,15 +142,16 @@ def no_space_left(path):
         filler.unlink()
 
 
-@pytest.fixture
-def small_disk(tmp_path):
-    folder = tmp_path / "disk"
+@contextlib.contextmanager
+def a_small_disk(folder, size="8m"):
     folder.mkdir()
-    mounting = ["mount", "-t", "tmpfs", "-o", "size=8m", "tmpfs", str(folder)]
+    mounting = ["mount", "-t", "tmpfs", "-o", f"size={size},mode=777", "tmpfs", str(folder)]
     if os.geteuid() != 0 or subprocess.run(mounting, check=False, capture_output=True).returncode:
         pytest.skip("no disk of one's own without root")
-    yield folder
-    subprocess.run(["umount", str(folder)], check=True)
+    try:
+        yield folder
+    finally:
+        subprocess.run(["umount", str(folder)], check=True)
 
 
 async def on_a_full_disk(path, full, good_frame):
@@ -169,8 +169,30 @@ async def test_a_file_that_may_not_grow(tmp_path, good_frame):
     await on_a_full_disk(tmp_path / "robosac.db", no_file_may_grow, good_frame)
 
 
-async def test_a_disk_that_is_full(small_disk, good_frame):
-    await on_a_full_disk(small_disk / "robosac.db", no_space_left, good_frame)
+async def test_a_disk_that_is_full(tmp_path, good_frame):
+    with a_small_disk(tmp_path / "disk") as folder:
+        await on_a_full_disk(folder / "robosac.db", no_space_left, good_frame)
+
+
+async def test_a_full_disk_of_a_server_is_told_as_long_as_frames_are_refused(postgres, good_frame):
+    with a_small_disk(postgres.folder / "disk", "32m") as disk:
+        place = disk / "tables"
+        place.mkdir()
+        os.chown(place, postgres.folder.stat().st_uid, postgres.folder.stat().st_gid)
+        await postgres.do(f"CREATE TABLESPACE small LOCATION '{place}'")
+        url = await postgres.new_database("TABLESPACE small")
+        try:
+            async with serve(database_url=url) as served:
+                ego, ready = await Ego.of(served, good_frame), []
+                with no_space_left(disk / "some"):
+                    while len(ready) < 20:
+                        if not await ego.post():
+                            ready.append((await served.http.get("/readyz")).status_code)
+                assert (await served.http.get("/readyz")).status_code == 200
+                await ego.check()
+            assert set(ready) == {503}
+        finally:
+            await postgres.do(f"DROP DATABASE {make_url(url).database}", "DROP TABLESPACE small")
 
 
 class Breaking:
