@@ -7,10 +7,12 @@ import re
 from collections.abc import AsyncIterator
 from typing import Annotated
 
+import structlog
 from fastapi import APIRouter, Depends, Header, Path, Query, Request, Response
 from fastapi.responses import StreamingResponse
 from fastapi.sse import KEEPALIVE_COMMENT, EventSourceResponse, format_sse_event
 from pydantic import BaseModel
+from starlette.types import Send
 
 from robosac import wire
 from service import description
@@ -39,7 +41,19 @@ from service.sessions.live import Caller, Standing
 from service.sessions.moving import news
 from service.sessions.room import Share
 
+logger = structlog.stdlib.get_logger(__name__)
+
 v1 = APIRouter(prefix="/v1", responses=documented(422, 503))
+
+
+class _Log(StreamingResponse):
+    """Left unfinished if a page cannot be read: the server then hangs up, and what was sent does not look whole."""
+
+    async def stream_response(self, send: Send) -> None:
+        try:
+            await super().stream_response(send)
+        except Refused as refused:
+            logger.warning("a log broke off while it was sent", why=refused.detail)
 
 
 async def _session_request(request: Request, gateway: GatewayDep, key_id: KeyId) -> SessionRequest:
@@ -178,7 +192,7 @@ async def get_audit(
 ) -> Response:
     """The audit log as JSON Lines: at most `limit` records with a number above `after`; of an ended session, too."""
     pages = await gateway.sessions.audit_log(sid, token, after, limit)
-    return StreamingResponse(pages, media_type=description.JSONL)
+    return _Log(pages, media_type=description.JSONL)
 
 
 @v1.post(

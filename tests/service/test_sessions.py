@@ -49,6 +49,34 @@ async def test_a_log_that_is_purged_while_it_is_read_never_looks_whole(served):
         await anext(pages)
 
 
+async def test_a_log_that_is_purged_while_it_is_sent_breaks_off_without_a_traceback(served, monkeypatch, caplog):
+    session, sent = await served.open(), []
+    for _ in range(2 * FIRST_PAGE):
+        note = TokenRenewed(vehicle_id=EGO, expires_at="2026-01-01T00:00:00Z")
+        await served.gateway.store.log(session.session_id, note)
+    read = served.gateway.store.audit
+
+    async def purged(sid, after, limit):
+        return [] if after else await read(sid, after, limit)
+
+    async def receive():
+        return {"type": "http.request", "body": b"", "more_body": False}
+
+    async def send(message):
+        sent.append(message)
+
+    monkeypatch.setattr(served.gateway.store, "audit", purged)
+    path = f"/v1/sessions/{session.session_id}/audit"
+    headers = [(b"host", b"gateway"), (b"authorization", f"Bearer {session.ego_token}".encode())]
+    asgi = {"type": "http", "asgi": {"version": "3.0", "spec_version": "2.4"}, "http_version": "1.1"}
+    asked = {"method": "GET", "scheme": "http", "path": path, "raw_path": path.encode(), "query_string": b""}
+    where = {"headers": headers, "client": ("127.0.0.1", 1), "server": ("gateway", 80), "root_path": ""}
+    await served.http._transport.app({**asgi, **asked, **where}, receive, send)
+    assert [message.get("more_body") for message in sent] == [None, True]
+    assert "a log broke off" in caplog.text
+    assert "unhandled" not in caplog.text
+
+
 async def test_pages_of_a_log_are_as_large_as_their_lines_allow(served):
     session, store = await served.open(), served.gateway.store
     for length in [10] * 600 + [50_000] * 20 + [10] * 600:
