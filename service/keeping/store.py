@@ -9,7 +9,7 @@ from dataclasses import replace
 from functools import partial
 from typing import Any
 
-from sqlalchemy import Connection, Delete, Row, Select, Update, func, insert, select, update
+from sqlalchemy import Connection, Delete, Row, Select, Update, insert, select, update
 
 from robosac.audit import FULL_EVERY, digest
 from robosac.audit.events import DetectorChanged, Event, FrameAnswered, SessionEnded, TeamChanged, TokenRenewed
@@ -72,11 +72,19 @@ class Store:
         await self._database.prepare(migrations.upgrade)
         await self.make_ahead()
 
-    async def create(self, record: SessionRecord, event: Event) -> SessionRecord:
-        """Keep a new session and the first record of its log; the session as it is then."""
+    async def create(self, record: SessionRecord, event: Event, most_of_key: int | None = None) -> SessionRecord:
+        """Keep a new session and the first record of its log; the session as it is then.
+
+        Raises
+        ------
+        Refused
+            If its key has ``most_of_key`` open sessions (``too-many-sessions``).
+        """
         draft = Draft(lambda: sealed(event, record.session_id, 1, record.audit_head))
 
         def work(connection: Connection) -> SessionRecord:
+            if most_of_key is not None:
+                usage.check_room(connection, record.key_id, most_of_key)
             line = draft.made
             kept = replace(record, audit_seq=1, audit_head=digest(line), kept_bytes=len(line.encode()))
             connection.execute(insert(sessions), columns(kept, *FIELDS))
@@ -284,8 +292,7 @@ class Store:
 
     async def count(self, key_id: str | None = None) -> int:
         """Open sessions, of all API keys or of one."""
-        of_key = () if key_id is None else (sessions.c.key_id == key_id,)
-        query = select(func.count()).select_from(sessions).where(OPEN, *of_key)
+        query = usage.open_sessions(key_id)
         return await self._database.read(lambda connection: connection.execute(query).scalar_one())
 
     async def kept_bytes(self) -> Counter[str]:

@@ -81,8 +81,8 @@ class Opening:
         )
         first = await asyncio.to_thread(_first_record, record, info)
         async with self.turn:
-            already_open = await self._count_if_there_is_room(key_id)
-            kept = await self.store.create(record, first)
+            already_open = await self._count_if_there_is_room()
+            kept = await self.store.create(record, first, self.settings.max_sessions_per_key if key_id else None)
         self.sessions.quota.add(kept)
         self.sessions.begin(record, defense)
         self.metrics.sessions.set(already_open + 1)
@@ -125,11 +125,9 @@ class Opening:
             raise Refused(Kind.INVALID_REQUEST, detail, "gather_ms")
         return budget_ms, gather_ms
 
-    async def _count_if_there_is_room(self, key_id: str) -> int:
+    async def _count_if_there_is_room(self) -> int:
         """Open sessions."""
-        already_open, most = await self.store.count(), self.settings.max_sessions_per_key
-        if key_id and already_open >= most and await self.store.count(key_id) >= most:
-            raise Refused(Kind.TOO_MANY_SESSIONS, f"a key may have {most} open sessions (ROBOSAC_MAX_SESSIONS_PER_KEY)")
+        already_open = await self.store.count()
         if already_open >= self.settings.max_sessions:
             raise Refused(Kind.TOO_MANY_SESSIONS, "the gateway holds as many sessions as it may")
         return already_open

@@ -9,7 +9,16 @@ import pytest
 import rfc8785
 from sqlalchemy import text
 
-from service.errors import AuditFull, FrameDecided, Refused, SessionChanged, SessionInUse, SessionOver, TokenReplaced
+from service.errors import (
+    AuditFull,
+    FrameDecided,
+    Kind,
+    Refused,
+    SessionChanged,
+    SessionInUse,
+    SessionOver,
+    TokenReplaced,
+)
 from service.keeping.once import MOST_PROOFS
 from service.keeping.record import SessionRecord
 from service.keeping.store import PAGE, Store
@@ -197,6 +206,17 @@ async def test_a_session_that_was_used_since_is_not_ended_for_being_idle(store):
     await store.log(sid, note())
     await store.end(sid, THE_END, LATER)
     assert len(await check_chain(store, sid)) == 3
+
+
+async def test_of_processes_that_open_sessions_of_a_key_at_once_none_opens_too_many(shared_url):
+    async with opened(shared_url) as one, opened(shared_url) as other:
+        await added(one, 9)
+        new = [a_session(number, key_id="key") for number in range(8)]
+        opening = (store.create(record, note(), 3) for record, store in zip(new, 4 * [one, other], strict=True))
+        refused = [outcome for outcome in await all_of(*opening) if isinstance(outcome, Exception)]
+        assert [why.kind for why in refused] == [Kind.TOO_MANY_SESSIONS] * 5
+        assert await one.count("key") == 3
+        await other.create(a_session(8, key_id="another"), note(), 3)
 
 
 async def test_idle_sessions_are_found_and_only_ended_ones_are_purged(store):
