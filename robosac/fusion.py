@@ -7,9 +7,10 @@ detector decodes them, the consensus test judges, and the defence learns, until 
 from __future__ import annotations
 
 import logging
-from collections.abc import Callable, Collection, Iterable, Iterator, Mapping, Sequence
+from collections.abc import Collection, Iterable, Iterator, Mapping, Sequence
 from contextlib import contextmanager
 from dataclasses import dataclass, field, fields
+from functools import partial
 from typing import Any, TypeVar
 
 import numpy as np
@@ -18,7 +19,7 @@ import rfc8785
 from robosac.ahead import Ahead
 from robosac.answers import Reason, Source, Verdict
 from robosac.arguments import check_defense, check_frame, check_rng
-from robosac.boxes import BoolArray, FloatArray
+from robosac.boxes import FloatArray
 from robosac.calibrated import witness_of
 from robosac.consensus import at_least, compare
 from robosac.deadline import Deadline
@@ -52,8 +53,6 @@ logger = logging.getLogger(__name__)
 
 READING_SHARE = 0.5
 """Of the time that is left, for testimony: without it there is an answer, without time for a pass there is none."""
-KNOWS = 3.0
-"""An agent knows of a place whether a vehicle is there if its L is so far from 0."""
 T = TypeVar("T")
 
 
@@ -266,8 +265,9 @@ class FrameRun:
                 break
             boxes = self._decoded(passes, subset, likely_after(batch, i))
             with self._spending("consensus"):
-                threshold = self.defense.consensus_threshold
-                comparison = compare(reference, self._confident(boxes), threshold, self._ego_knows)
+                said = self.testimony if self.defense.reference is Reference.EGO else None
+                known = None if said is None else partial(said.known_to, EGO)
+                comparison = compare(reference, self._confident(boxes), self.defense.consensus_threshold, known)
             index, verdict = comparison.jaccard_index, comparison.verdict
             seen = (boxes, reference, self.ego.pose, self.frame, self.testimony, self.boxes.get(()))
             tested.append(Outcome(subset, index, verdict, *seen))
@@ -288,16 +288,6 @@ class FrameRun:
     def _decoded(self, passes: Passes, subset: Hypothesis, likely: Iterable[Hypothesis]) -> FloatArray:
         with self._spending("hypotheses" if subset else "ego_only"):
             return passes.decode(subset, likely)
-
-    @property
-    def _ego_knows(self) -> Callable[[FloatArray], BoolArray] | None:
-        """Of places (n, 2), of which the ego's own message tells whether a vehicle is there; None without testimony, or
-        where fusions are not compared with what the ego sees now.
-        """
-        if self.testimony is None or self.defense.reference is not Reference.EGO:
-            return None
-        own = self.testimony.of({EGO})
-        return lambda places: np.abs(own.likelihood(places)[0]) >= KNOWS
 
     def _confident(self, boxes: FloatArray) -> FloatArray:
         return at_least(boxes, self.detector.info.consensus_score)

@@ -19,6 +19,8 @@ LIKELIHOOD, X, Y, ALONG, ACROSS = range(5)
 may be off along and across the vehicle (metres).
 """
 LAYERS = 5
+KNOWS = 3.0
+"""An agent knows of a place whether a vehicle is there if its L is so far from 0."""
 MOST = 7.0
 """L is clipped to +- this: beyond it the network has seen too little to know."""
 
@@ -73,6 +75,11 @@ class Testimony:
         if self.empty is None:
             return np.zeros(len(points), dtype=bool)
         return self.empty(agent, self.places(points)[self.agents.index(agent)])
+
+    def known_to(self, agent: str, points: FloatArray) -> BoolArray:
+        """Of which places (n, 2), ego frame, an agent's own message tells whether a vehicle is there."""
+        known: BoolArray = np.abs(self.of({agent}).likelihood(points)[0]) >= KNOWS
+        return known
 
     def likelihood(self, points: FloatArray) -> FloatArray:
         """L at places (n, 2), ego frame: (agents, n), bilinear, within +- `MOST`, 0 outside a map."""

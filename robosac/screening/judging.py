@@ -47,8 +47,6 @@ NAMED_AFTER = 3
 """Refused messages from which on their sender is named as an attacker, while it sends such."""
 MOST_TOLD = 16
 """Likenesses of a frame that are told, the greatest first."""
-MEMORY = "screening"
-"""Under which a session's state holds what was sent."""
 
 
 @dataclass(frozen=True)
@@ -295,15 +293,3 @@ def _comparable(ego: Message, teammates: Mapping[str, Message]) -> dict[str, Map
 
 def _finite(value: float) -> float | None:
     return round(value, 4) if math.isfinite(value) else None
-
-
-def separated(state: Mapping[str, Any]) -> tuple[dict[str, Any], dict[str, Any]]:
-    """A session's state as the defence's alone, and what the tests of messages remember."""
-    alone = dict(state)
-    memory = alone.pop(MEMORY, None)
-    return alone, dict(memory) if isinstance(memory, Mapping) else {}
-
-
-def joined(state: Mapping[str, Any], memory: Mapping[str, Any]) -> dict[str, Any]:
-    """The state of both; the defence's alone where nothing is remembered."""
-    return {**state, MEMORY: dict(memory)} if memory else dict(state)

@@ -6,6 +6,8 @@ from collections.abc import Mapping
 from dataclasses import dataclass
 from typing import Any
 
+MEMORY = "screening"
+"""Under which a session's state holds what was sent."""
 KEPT_FRAMES = 5
 """What was sent is remembered for so many frames; where numbers begin anew, what is as many ahead is forgotten, too."""
 Place = tuple[float, float]
@@ -74,3 +76,15 @@ def recent(past: Mapping[str, Any], frame: int) -> bool:
     """Whether a vehicle that is not in this frame has sent something lately; ``past`` is as JSON."""
     last: int = max((entry[2] for entry in past["sent"]), default=past["anchor"][0])
     return is_kept(last, frame)
+
+
+def separated(state: Mapping[str, Any]) -> tuple[dict[str, Any], dict[str, Any]]:
+    """A session's state as the defence's alone, and what the tests of messages remember."""
+    alone = dict(state)
+    memory = alone.pop(MEMORY, None)
+    return alone, dict(memory) if isinstance(memory, Mapping) else {}
+
+
+def joined(state: Mapping[str, Any], memory: Mapping[str, Any]) -> dict[str, Any]:
+    """The state of both; the defence's alone where nothing is remembered."""
+    return {**state, MEMORY: dict(memory)} if memory else dict(state)

@@ -13,13 +13,13 @@ from functools import cached_property
 import numpy as np
 
 from robosac.boxes import BoolArray, FloatArray
-from robosac.testimony import Testimony
+from robosac.testimony import KNOWS, Testimony
 
-SUPPORTS = 3.0
+SUPPORTS = KNOWS
 """An agent supports a place from this L on."""
 NEARLY_SUPPORTS = 2.5
 """From this L on, an agent is the second to support a box, if all but the first support it together."""
-DENIES = -3.0
+DENIES = -KNOWS
 """An agent denies a place from this L on downwards."""
 EGO_KNOWS = -6.75
 """Where the ego's own L is so low, whoever supports a vehicle is wrong: nobody else has a part in what the ego saw. But

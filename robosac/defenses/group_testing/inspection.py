@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Collection, Iterator, Sequence
+from itertools import islice
 
 import numpy as np
 
@@ -172,9 +173,10 @@ class Inspection:
         who may have taken it away. Whoever sees it may have done so, too, but not if nobody else sees it.
         """
         found, frame = self._found, self._found.known.memory.frame
-        if self._lost is None:
-            self._lost = [place for place in found.lost(whole) if found.lies.search(found.placed(place), frame)]
-        for place in self._lost[:1]:
+        if self._lost is None:  # the first that is to be searched: who took it away shows with others, too
+            places = (place for place in found.lost(whole) if found.lies.search(found.placed(place), frame))
+            self._lost = list(islice(places, 1))
+        for place in self._lost:
             said = found.heard().said(place)
             seeing = [name for name in whole if said[name] >= SUPPORTS]
             others = [name for name in whole if name not in seeing]
