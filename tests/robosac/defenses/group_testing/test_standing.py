@@ -222,3 +222,14 @@ def test_what_one_sees_and_one_takes_away_is_shown_and_nobody_is_named():
     last, _ = met[-1]
     assert LIAR not in last.accepted
     assert "car-2" in last.accepted
+
+
+@pytest.mark.parametrize(("rsu", "repaired"), [(YES, True), (0.0, False)])
+def test_whoever_takes_a_vehicle_away_has_no_say_in_its_repair(rsu, repaired):
+    """By the word of two others; one of them alone who sees it does not outweigh a third who denies it."""
+    said = {"car-2": YES, "rsu": rsu, LIAR: NO, **({} if repaired else {"car-3": NO})}
+    hearing = Hearing(World(said, nothing).testimony, ())
+    part = Shown(("car-2", "car-3", "rsu"), np.vstack([SEEN, CAR]), hearing)
+    answer = Shown(("car-2", "car-3", LIAR, "rsu"), SEEN, hearing)
+    objects, _ = judge(answer, [answer, part])
+    assert [judged.subset for judged in objects[len(SEEN) :]] == [part.teammates] * repaired
