@@ -134,6 +134,12 @@ class Testimony:
     def _to_ego(self) -> FloatArray:
         return np.linalg.inv(self.from_ego)
 
+    @property
+    def origins(self) -> FloatArray:
+        """Where each sender says it is: (agents, 2), ego frame, metres."""
+        origins: FloatArray = -np.einsum("nji,nj->ni", self.from_ego[:, :2, :2], self.from_ego[:, :2, 2])
+        return origins
+
     def sighting(self, points: FloatArray, asked: BoolArray | None = None) -> Sighting:
         """Where each agent sees the vehicles at places (n, 2), ego frame. It means something where L is high.
 

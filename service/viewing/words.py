@@ -58,6 +58,8 @@ def of_rejection(entry: RejectedTeammate) -> str:
         lowest = more.get("lowest_jaccard_index", math.nan)
         which = listed(str(test + 1) for test in tests)
         parts.append(f"{'test' if len(tests) == 1 else 'tests'} {which} of this frame: agreement down to {lowest:.2f}")
+    if isinstance(off := more.get("misplaced_m"), float):
+        parts.append(f"its message is out of place by {off:.1f} m")
     if detail := more.get("detail"):
         parts.append(str(detail))
     if (other := more.get("of")) is not None:

@@ -13,7 +13,8 @@ from robosac.defenses.group_testing.differences import SAME_LIE_M, blame
 from robosac.defenses.group_testing.findings import UNHEARD, Findings, one_out
 from robosac.defenses.group_testing.lies import AUDIT_FRAMES, Word
 from robosac.defenses.group_testing.model import CELLS, CLEAN
-from robosac.defenses.group_testing.objects import Lie
+from robosac.defenses.group_testing.objects import PLACED_SCORE, Lie
+from robosac.defenses.group_testing.placing import misplaced
 from robosac.defenses.group_testing.straying import strays
 from robosac.defenses.protocol import Hypothesis
 
@@ -61,6 +62,7 @@ def conclude(found: Findings, answer: Hypothesis) -> None:
     conflicts = _conflicts(found, answer)
     having_a_part = _having_a_part(found, answer)
     straying = _straying(found, asked)
+    _place(found, answer)
     _leave_alone(found, answer)
     _clear(found, comparisons)
     for name in found.team:
@@ -182,6 +184,22 @@ def _straying(found: Findings, asked: Mapping[str, tuple[Hypothesis, Hypothesis]
             weights[name] = weight
         found.lies.audited[name] = memory.frame
     return weights
+
+
+def _place(found: Findings, answer: Hypothesis) -> None:
+    """Learn whose messages are out of place as a whole, by the answer, or else by the largest fusion."""
+    if not found.shown:
+        return
+    everybody = found.heard().everybody
+    shown = found.shown.get(answer) or found.shown[max(found.shown, key=len)]
+    placed = shown.boxes[:, 5] >= PLACED_SCORE
+    supporting = shown.everybody.supporting[:, placed]
+    centres = everybody.sighting(shown.boxes[placed, :2], supporting).centre
+    heard = np.array([name not in found.unheard for name in everybody.agents])
+    far = misplaced(centres, supporting, everybody.origins, heard).tolist()
+    found.known.memory.placing.learn(
+        {name: by for name, by in zip(everybody.agents, far, strict=True) if not np.isnan(by)}
+    )
 
 
 def _comparisons(found: Findings) -> dict[tuple[Hypothesis, Hypothesis], str]:

@@ -128,7 +128,8 @@ class GroupTesting:
        out, and to see without whom an object is right that is wrong in the answer (`Inspection.next_test`). Lies raise
        a teammate's level (`lies.RULES`) and its probability.
     5. The answer is the decoded subset of greatest utility that is in consensus with the ego, or all trusted. Each box
-       of it is judged by testimony: left out, repaired, or kept with its status (`standing.judge`).
+       of it is judged by testimony: left out, repaired, or kept with its status (`standing.judge`). Whoever is out of
+       place (`placing.misplaced`) has no part in it, nor in step 2.
     6. A teammate is named (``distrusted``) once it lied about objects too often (`Lies.guilt`; where the ego is
        unsteady, twice as much) and its probability is at least a half;
        or once its probability passes ``naming_bound``, at least two different subsets speak against it, and its own

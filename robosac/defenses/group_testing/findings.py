@@ -61,6 +61,7 @@ class Findings:
         self.team = team
         self.named = frozenset(named)
         self.unheard = {name for name, p in known.suspicion().items() if name in self.named or p > UNHEARD}
+        self.unheard |= known.memory.placing.out & set(team)
         self.shown: dict[Hypothesis, Shown] = {}
         self.decoded: set[Hypothesis] = set()
         self.hearing: Hearing | None = None

@@ -52,7 +52,8 @@ class JudgedFrame:
         self._evidence = evidence
         self._team = team
         self._trusted = trusted
-        self._best: tuple[tuple[int, int], tuple[Hypothesis, float, Source]] | None = None
+        self._out = known.memory.placing.out
+        self._best: tuple[tuple[int, int, frozenset[str]], tuple[Hypothesis, float, Source]] | None = None
 
     def next_test(self, rng: np.random.Generator, passes: int) -> Hypothesis | None:
         """The subset most worth decoding, ties broken at random; None if none is worth its pass.
@@ -70,7 +71,9 @@ class JudgedFrame:
             return None
         known, outcomes = self._known, self._evidence.outcomes
         decoded = known.rows([o.teammates for o in outcomes])
-        options = candidates(known.posterior, known.rows([self._team])[0], decoded)
+        # somebody is tested even if all are out of place, or nobody would ever be seen to be back
+        tested = tuple(name for name in self._team if name not in self._out) or self._team
+        options = candidates(known.posterior, known.rows([tested])[0], decoded)
         if not len(options):
             return None
         ego_sees = self._evidence.ego_witnesses
@@ -139,15 +142,19 @@ class JudgedFrame:
         )
 
     def _best_answer(self) -> tuple[Hypothesis, float, Source]:
-        """Of the decoded subsets that may be answered, the most useful; the ego alone if none is of use."""
-        known = self._known.posterior.version, len(self._evidence.outcomes)
+        """Of the decoded subsets that may be answered, the most useful; the ego alone if none is of use. Nobody is in
+        it who was out of place before this frame, nor, if possible, who is since.
+        """
+        known = self._known.posterior.version, len(self._evidence.outcomes), self._known.memory.placing.out
         if self._best is None or self._best[0] != known:
             self._best = known, self._choose_answer()
         return self._best[1]
 
     def _choose_answer(self) -> tuple[Hypothesis, float, Source]:
         allowed = [o for o in self._evidence.outcomes if self._verified(o) or self._trusted.issuperset(o.teammates)]
-        if allowed:
+        allowed = [o for o in allowed if self._out.isdisjoint(o.teammates)]
+        out = self._known.memory.placing.out
+        if allowed := [o for o in allowed if out.isdisjoint(o.teammates)] or allowed:
             worth = choice.utility(self._known.posterior, self._known.rows([o.teammates for o in allowed]))
             best = int(np.argmax(worth.round(_DIGITS)))
             if worth[best] > 0:
@@ -156,8 +163,8 @@ class JudgedFrame:
         return (), 0.0, Source.EGO_ONLY
 
     def _untested_answer(self) -> tuple[Hypothesis, Source]:
-        """Without time for any test: all that are trusted."""
-        present = tuple(name for name in self._team if name in self._trusted)
+        """Without time for any test: all that are trusted, and in place."""
+        present = tuple(name for name in self._team if name in self._trusted - self._out)
         if present and choice.utility(self._known.posterior, self._known.rows([present]))[0] > 0:
             return present, Source.TRUSTED
         return (), Source.EGO_ONLY
@@ -167,12 +174,14 @@ class JudgedFrame:
         return self._evidence.ego_sees and outcome.verdict is Verdict.CONSENSUS
 
     def _explain(self, accepted: Hypothesis, named: set[str], suspicion: Mapping[str, float]) -> dict[str, Rejection]:
-        rejected = {}
+        rejected, memory = {}, self._known.memory
         for name, rejection in explain_rejections(self._team, accepted, self._evidence.outcomes).items():
             evidence: dict[str, Any] = {**rejection.evidence, "suspicion": round(suspicion[name], 6)}
             reason = rejection.reason
+            if name in memory.placing.out:
+                evidence["misplaced_m"] = round(memory.placing.off[name], 2)
             if name in named:
                 reason = Reason.DISTRUSTED
-                evidence["evidence"] = [dict(item) for item in self._known.memory.evidence.get(name, ())]
+                evidence["evidence"] = [dict(item) for item in memory.evidence.get(name, ())]
             rejected[name] = Rejection(reason, evidence)
         return rejected

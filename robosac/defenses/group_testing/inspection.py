@@ -114,13 +114,14 @@ class Inspection:
         """What is to be decoded to ask those again that are neither in the answer nor named: of those only in doubt,
         beside the answer, in one frame as many together as are more likely all honest than not, in the next the least
         suspected, in a large team of those who are not as good as cleared; each of the two most suspected ones, or that
-        lied lately, alone and beside the answer.
+        lied lately, alone and beside the answer. Whoever is only out of place is in no doubt.
         """
         posterior, suspicion = self._found.known.posterior, self._found.known.suspicion()
         left = [name for name in self._found.team if name not in answer and name not in self._found.named]
         left.sort(key=lambda name: round(suspicion[name], 9))
         suspects = [name for name in left if suspicion[name] > SUSPECT or self._found.lies.worst(name)]
-        doubtful = [name for name in left if name not in suspects]
+        out = self._found.known.memory.placing.out
+        doubtful = [name for name in left if name not in suspects and name not in out]
         large = len(self._found.team) > EXACT
         alone = [name for name in doubtful if not large or suspicion[name] >= UNRESOLVED[0]][:1]
         asked = [self._with(answer, alone)] if alone else []

@@ -64,9 +64,7 @@ def _fits(testimony: Testimony, centres: FloatArray, off: FloatArray) -> bool:
 
 def senders(testimony: Testimony, pose: FloatArray) -> dict[str, Place]:
     """Where in the world each sender is, metres, rounded to 1 cm; ``pose`` is the ego's."""
-    turns, moves = testimony.from_ego[:, :2, :2], testimony.from_ego[:, :2, 2]
-    origins = -np.einsum("nji,nj->ni", turns, moves)
-    placed = (origins @ pose[:2, :2].T + pose[:2, 3]).round(2)
+    placed = (testimony.origins @ pose[:2, :2].T + pose[:2, 3]).round(2)
     return {name: (x, y) for name, (x, y) in zip(testimony.agents, placed.tolist(), strict=True)}
 
 

@@ -13,6 +13,7 @@ import numpy as np
 from robosac import decimals
 from robosac.boxes import FloatArray
 from robosac.defenses.group_testing.lies import Lies
+from robosac.defenses.group_testing.placing import Placing
 from robosac.defenses.group_testing.steadiness import Steadiness
 from robosac.defenses.group_testing.strangeness import Strangeness
 from robosac.defenses.group_testing.straying import Straying
@@ -83,6 +84,7 @@ class Memory:
     lies: Lies = field(default_factory=Lies)
     """About objects."""
     straying: Straying = field(default_factory=Straying)
+    placing: Placing = field(default_factory=Placing)
     vigilance: Vigilance = field(default_factory=Vigilance)
     steadiness: Steadiness = field(default_factory=Steadiness)
     strangeness: Strangeness = field(default_factory=Strangeness)
@@ -131,6 +133,7 @@ class Memory:
         self.evidence.pop(teammate, None)
         self.lies.forget(teammate)
         self.straying.forget(teammate)
+        self.placing.forget(teammate)
         self.steadiness.levels.pop(teammate, None)
         self.left[teammate] = (suspicion, self.frame)
         while len(self.left) > MAX_LEFT:  # not by their order, which a state that was stored has lost
@@ -155,6 +158,7 @@ class Memory:
             "senders": {name: list(place) for name, place in self.senders.items()},
             "lies": self.lies.to_state(),
             "straying": self.straying.to_state(),
+            "placing": self.placing.to_state(),
             "vigilance": self.vigilance.to_state(),
             "steadiness": self.steadiness.to_state(),
             "strangeness": self.strangeness.to_state(),
@@ -174,6 +178,7 @@ class Memory:
             senders={name: (float(x), float(y)) for name, (x, y) in state.get("senders", {}).items()},
             lies=Lies.from_state(state["lies"]) if "lies" in state else Lies(),
             straying=Straying.from_state(state.get("straying", {})),
+            placing=Placing.from_state(state.get("placing", {})),
             vigilance=Vigilance.from_state(state.get("vigilance", ())),
             steadiness=Steadiness.from_state(state["steadiness"]) if "steadiness" in state else Steadiness(),
             strangeness=Strangeness.from_state(state.get("strangeness", ())),

@@ -1,0 +1,245 @@
+"""Whose messages lie in a wrong place as a whole."""
+
+import json
+
+import numpy as np
+import pytest
+
+from robosac.answers import Reason
+from robosac.attacks import load_campaign
+from robosac.boxes import pose_matrix
+from robosac.defenses import EGO
+from robosac.defenses.group_testing import GroupTestingSettings
+from robosac.defenses.group_testing.memory import Memory
+from robosac.defenses.group_testing.placing import (
+    EXPECTED_M,
+    FEWEST,
+    MEAN_M,
+    ONCE,
+    ONCE_M,
+    RATE,
+    Placing,
+    misplaced,
+)
+from robosac.detectors import load
+from robosac.evaluation.frames import encode_all
+from robosac.scenes import IntersectionScene
+from robosac.session import Session, defense_for
+from tests.robosac.defenses.group_testing.conversing import TEAM, run_frame
+from tests.robosac.defenses.group_testing.one_place import DEFENSE, HONEST, LIAR, SEEN, World, nothing
+from tests.robosac.testifying import saying
+
+AGENTS, VEHICLES = 6, 20
+WRONG = 3
+"""The agent that is out of place."""
+RNG = np.random.default_rng(5)
+PLACES = RNG.uniform(-30, 30, (VEHICLES, 2))
+ORIGINS = RNG.uniform(-20, 20, (AGENTS, 2))
+HEARD = np.ones(AGENTS, dtype=bool)
+
+
+def sees(noise_m=0.0):
+    """Where everybody sees all vehicles."""
+    return PLACES + np.random.default_rng(7).normal(0, noise_m, (AGENTS, VEHICLES, 2))
+
+
+def turned(places, origin, degrees):
+    return (places - origin) @ pose_matrix(0, 0, 0, np.radians(degrees))[:2, :2].T + origin
+
+
+def everywhere(shape=(AGENTS, VEHICLES)):
+    return np.ones(shape, dtype=bool)
+
+
+def test_a_shift_and_a_turn_are_told_and_blame_nobody_else():
+    centres = sees(0.1)
+    centres[WRONG] = turned(centres[WRONG], ORIGINS[WRONG], 2.0) + [0.6, -0.5]
+    moved = turned(PLACES, ORIGINS[WRONG], 2.0) + [0.6, -0.5] - PLACES
+    off = misplaced(centres, everywhere(), ORIGINS, HEARD)
+    assert off[WRONG] == pytest.approx(np.sqrt((moved**2).sum(axis=1).mean()), abs=0.08)
+    assert np.isnan(off[0])
+    assert (np.delete(off, [0, WRONG]) < 0.1).all()
+
+
+@pytest.mark.parametrize("shift", [np.zeros(2), np.array([0.7, 0.0])])
+def test_what_a_few_vehicles_say_does_not_place_a_message(shift):
+    """Somebody that carries two vehicles off by 2 m is where it says, and is not where it does not."""
+    centres = sees()
+    centres[WRONG] += shift
+    centres[WRONG, :2] += [0, 2.0]
+    assert misplaced(centres, everywhere(), ORIGINS, HEARD)[WRONG] == pytest.approx(np.hypot(*shift), abs=0.05)
+
+
+def test_two_out_of_place_together_are_told_and_blame_nobody_else():
+    centres = sees(0.1)
+    centres[[1, WRONG]] += [0.8, 0.0]
+    off = misplaced(centres, everywhere(), ORIGINS, HEARD)
+    assert (off[[1, WRONG]] > 0.6).all()
+    assert (off[[2, 4, 5]] < 0.2).all()
+
+
+def test_two_together_outweigh_no_ego():
+    """Of vehicles that one other sees beside the two and the ego, the median is theirs."""
+    centres, supporting = sees(0.1), everywhere()
+    supporting[[2, 4]] = False
+    centres[[1, WRONG]] += [0.8, 0.0]
+    off = misplaced(centres, supporting, ORIGINS, HEARD)
+    assert (off[[1, WRONG]] > 0.6).all()
+    assert off[5] < 0.2
+
+
+def test_each_counts_what_it_sees_itself():
+    """What others do not see, or one teammate alone, tells nothing; where nobody looks there may be any number."""
+    centres, supporting = sees(), everywhere()
+    centres[WRONG] += [0.5, 0.0]
+    supporting[:, 8:] = False
+    supporting[WRONG, 8:] = True
+    supporting[1, 8:12] = True
+    centres[~supporting] = np.nan
+    centres[1, 8:12] += 5.0
+    assert misplaced(centres, supporting, ORIGINS, HEARD)[WRONG] == pytest.approx(0.5, abs=0.05)
+
+
+@pytest.mark.parametrize(("count", "told"), [(FEWEST - 1, False), (FEWEST, True)])
+def test_a_few_vehicles_tell_nothing(count, told):
+    off = misplaced(sees()[:, :count], everywhere((AGENTS, count)), ORIGINS, HEARD)
+    assert (~np.isnan(off[1:])).all() == told
+
+
+def test_the_ego_alone_tells():
+    centres, supporting = sees(), everywhere()
+    supporting[[1, 2, 4, 5]] = False
+    centres[WRONG] += [0.0, 0.9]
+    assert misplaced(centres, supporting, ORIGINS, HEARD)[WRONG] == pytest.approx(0.9, abs=0.05)
+
+
+def test_whoever_is_not_heard_says_nothing_about_others_but_is_placed():
+    centres, heard = sees(), HEARD.copy()
+    centres[[1, 2, 4]] += [0.0, 1.0]
+    heard[[1, 2, 4]] = False
+    off = misplaced(centres, everywhere(), ORIGINS, heard)
+    assert off[1:] == pytest.approx([0.96, 0.96, 0.0, 0.96, 0.0], abs=0.05)
+
+
+@pytest.mark.parametrize(("agents", "count"), [(1, 8), (2, 0), (6, 0)])
+def test_of_nobody_and_nothing_nothing_is_told(agents, count):
+    off = misplaced(np.zeros((agents, count, 2)), everywhere((agents, count)), ORIGINS[:agents], HEARD[:agents])
+    assert np.isnan(off).all()
+
+
+def told(*frames):
+    """A placing after frames of how far the liar is off, of a team that is off by .1 m else."""
+    placing = Placing()
+    for far in frames:
+        placing.learn({**dict.fromkeys(TEAM, 0.1), LIAR: far})
+    return placing
+
+
+def test_far_off_is_told_at_once_and_a_little_off_in_time():
+    usual = EXPECTED_M + RATE * (0.1 - EXPECTED_M)
+    assert told(0.99 * ONCE * usual).out == set()
+    assert told(1.01 * ONCE * usual).out == {LIAR}
+    assert told(*[0.8 * ONCE_M] * 3).out == set()
+    assert told(*[0.8 * ONCE_M] * 20).out == {LIAR}
+    assert told(*[0.98 * MEAN_M] * 100).out == set()
+
+
+def test_what_is_usual_in_the_team_is_no_reason():
+    placing = Placing()
+    for _ in range(50):
+        placing.learn(dict.fromkeys(TEAM, 0.7))
+    assert placing.out == set()
+    alone = Placing()
+    for _ in range(50):
+        alone.learn({LIAR: 0.7})
+    assert alone.out == {LIAR}
+
+
+def test_whoever_is_in_place_again_or_can_no_longer_be_placed_is_back():
+    others = dict.fromkeys([name for name in TEAM if name != LIAR], 0.1)
+    for back in ({LIAR: 0.1}, {}):
+        placing = told(*[1.0] * 10)
+        assert placing.out == {LIAR}
+        frames = 0
+        while placing.out and frames < 20:
+            placing.learn({**others, **back})
+            frames += 1
+        assert 3 <= frames <= 10
+
+
+def test_it_is_kept_and_forgotten():
+    placing = told(*[1.0] * 10)
+    memory = Memory.from_state(json.loads(json.dumps(Memory(placing=placing).to_state())))
+    assert memory.placing == placing
+    memory.leave(LIAR, 0.5)
+    assert LIAR not in {*memory.placing.off, *memory.placing.out}
+    assert Memory.from_state({**Memory().to_state(), "placing": {}}).placing == Placing()
+
+
+class Displaced(World):
+    """The liar sees all vehicles elsewhere; what is fused does not show it."""
+
+    def __init__(self):
+        super().__init__({}, nothing)
+        places = {name: [(x, y, 5.5) for x, y in SEEN[:, :2]] for name in (EGO, *TEAM)}
+        self.testimony = saying(places, seen={LIAR: SEEN[:, :2] + [0, 1.0]})
+
+
+def test_who_is_out_of_place_is_left_out_while_it_is_and_not_suspected():
+    met = Displaced().play(10)
+    assert all(set(decision.accepted) == set(TEAM) - {LIAR} for decision, _ in met)
+    assert not any(decision.named for decision, _ in met)
+    last, tested = met[-1]
+    assert last.suspicion[LIAR] < 0.1
+    assert not any(LIAR in subset for subset in tested)
+    assert last.rejected[LIAR].reason is Reason.NOT_SAMPLED
+    assert last.rejected[LIAR].evidence["misplaced_m"] == pytest.approx(0.9, abs=0.15)
+    assert "misplaced_m" not in HONEST.play(1)[0][0].rejected
+    after = HONEST.play(10, before=Displaced(), quiet=10)
+    assert LIAR not in after[0][0].accepted
+    assert LIAR in after[-1][0].accepted
+
+
+def test_whoever_is_alone_is_left_out_too_and_comes_back():
+    world, honest, rng = Displaced(), HONEST, np.random.default_rng(0)
+    state, accepted = DEFENSE.initial_state([LIAR]), []
+    for frame in range(24):
+        judge = (world if frame < 12 else honest).judge
+        decision, _ = run_frame(DEFENSE, state, (LIAR,), [], rng, judge=judge)
+        state = json.loads(json.dumps(decision.state))
+        accepted.append(decision.accepted)
+    assert accepted[2:12] == [()] * 10
+    assert accepted[-1] == (LIAR,)
+
+
+def test_without_time_for_a_test_the_answer_goes_without_who_is_out_of_place():
+    state = json.loads(json.dumps(Displaced().play(10)[-1][0].state))
+    state["trusted"] = sorted(TEAM)
+    decision, tested = run_frame(DEFENSE, state, TEAM, [], np.random.default_rng(0), most=0)
+    assert tested == []
+    assert set(decision.accepted) == set(TEAM) - {LIAR}
+
+
+def played(campaign, frames=14, number=1700):
+    """Who is accepted in each frame of a validation scene with one attacker, and who is named."""
+    detector, scene = load(), IntersectionScene(number)
+    ego, team = scene.egos[0], sorted(set(scene.agents) - {scene.egos[0]})
+    session = Session(detector, team, defense_for(GroupTestingSettings(), detector.info), rng=np.random.default_rng(0))
+    accepted, named = [], set()
+    for index in range(frames):
+        messages = encode_all(detector, scene.frame(index))
+        mine = messages.pop(ego)
+        lies = load_campaign(campaign).messages(detector, mine, messages, team[:1], index, np.random.default_rng(index))
+        answer = session.answer(index, mine, {**messages, **lies})
+        accepted.append(set(answer.accepted))
+        named |= set(answer.named or ())
+    return team, accepted, named
+
+
+@pytest.mark.parametrize("campaign", ["honest@drifting-pose", "honest@turning-pose"])
+def test_a_pose_that_moves_off_slowly_is_found(campaign):
+    team, accepted, named = played(campaign, 24)
+    assert team[0] in accepted[0]
+    assert all(team[0] not in of_frame for of_frame in accepted[20:])
+    assert all(set(team[1:]) <= of_frame for of_frame in accepted[20:])
+    assert not named
