@@ -23,6 +23,7 @@ from robosac.scenes import IntersectionScene
 from robosac.session import Session, defense_for
 from service.keeping.record import SessionRecord, new_seed
 from service.keeping.store import Store
+from service.runtime import keep_what_is_loaded, tune_process
 
 FIRST_SCENE = 1600
 LEARNING = 5
@@ -35,11 +36,14 @@ async def main() -> None:
     parser.add_argument("--frames", type=int, default=20)
     parser.add_argument("--teammates", type=int, default=5)
     options = parser.parse_args()
+    tune_process()  # as a gateway does: else each frame's maps are faulted in anew
     torch.set_num_threads(1)
     parts: dict[str, list[float]] = {}
     with tempfile.TemporaryDirectory() as folder:
         store = Store(f"sqlite:///{Path(folder) / 'sessions.db'}")
         await store.start()
+        load()
+        keep_what_is_loaded()
         for number in range(FIRST_SCENE, FIRST_SCENE + options.scenes):
             await play(number, options.frames, options.teammates, store, parts)
         await store.close()
