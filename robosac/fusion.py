@@ -189,7 +189,7 @@ class FrameRun:
         """Ask the witness what each message says by itself, of as many as there is time for: the ego's first, then
         those of teammates that are trusted.
         """
-        if isinstance(self.detector, Testifying):
+        if hasattr(self.detector, "testify") and isinstance(self.detector, Testifying):  # the first is fast
             with self._spending("testimony"):
                 said = self.detector.testify(self.ego, teammates)
                 self.testimony = None if said is None else said.of({EGO, *teammates})

@@ -49,7 +49,8 @@ class Passes:
 
     def _decoded(self, subset: Hypothesis, likely: Iterable[Hypothesis]) -> dict[Hypothesis, FloatArray]:
         prepared, at_once = self._prepared, [subset]
-        if isinstance(prepared, Batching) and prepared.worth > 1:
+        # most are worth 1, and to see whether something has the form of a protocol takes far longer than this
+        if getattr(prepared, "worth", 1) > 1 and isinstance(prepared, Batching):
             others = (other for other in likely if self.takes(other) and other not in at_once)
             for other in islice(others, self._deadline.room(prepared.worth - 1)):
                 at_once.append(other)  # one by one, so that none comes twice

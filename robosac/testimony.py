@@ -84,18 +84,14 @@ class Testimony:
     def likelihood(self, points: FloatArray) -> FloatArray:
         """L at places (n, 2), ego frame: (agents, n), bilinear, within +- `MOST`, 0 outside a map."""
         turn, move = self._to_cells
-        place = (turn @ points.T).reshape(
-            2, len(self.agents), len(points)
-        ) + move  # rows and columns of the padded maps
+        # rows and columns of the padded maps
+        place = (turn @ points.T).reshape(2, len(self.agents), len(points)) + move
         first = np.minimum(np.maximum(np.floor(place), 0.0), self._last)
         y, x = np.minimum(np.maximum(place - first, 0.0), 1.0)
-        padded, (row, column) = self._padded, first.astype(np.int64)
-        wide = padded.shape[2]
+        (row, column), wide = first.astype(np.int64), self._padded.shape[2]
         corner = (row + self._starts) * wide + column
-        flat = padded.ravel()
-        top = flat[corner] * (1 - x) + flat[corner + 1] * x
-        corner += wide
-        bottom = flat[corner] * (1 - x) + flat[corner + 1] * x
+        left, right = self._padded.take(np.add.outer([[0, 1], [wide, wide + 1]], corner)).swapaxes(0, 1)
+        top, bottom = left * (1 - x) + right * x
         value: FloatArray = top * (1 - y) + bottom * y
         return value
 
@@ -213,10 +209,10 @@ def planar(ego_pose: FloatArray, poses: Sequence[FloatArray]) -> FloatArray:
     """The ego's plane in each sender's frame (n, 3, 3), of their poses world_from_sensor (4, 4). How high they say they
     are does not count, as in `robosac.detectors.warp.sampling_matrix`.
     """
-    senders = np.stack(poses)
-    level = np.tile(ego_pose, (len(poses), 1, 1))
+    senders = np.array(poses)
+    level = np.repeat(ego_pose[None], len(poses), axis=0)
     level[:, 2, 3] = senders[:, 2, 3]
     relative = np.linalg.inv(senders) @ level
-    found = np.tile(np.eye(3), (len(poses), 1, 1))
+    found = np.repeat(np.eye(3)[None], len(poses), axis=0)
     found[:, :2, :2], found[:, :2, 2] = relative[:, :2, :2], relative[:, :2, 3]
     return found

@@ -66,7 +66,7 @@ class Claims:
     def of(cls, boxes: FloatArray, heard: Testimony, shown: FloatArray | None = None) -> Claims:
         """Look up boxes (n, 5+), each by itself; or beside others that are ``shown`` (m, 2+), themselves among them."""
         cos, sin = np.cos(boxes[:, 4]), np.sin(boxes[:, 4])
-        along, across = np.stack([cos, sin], axis=-1), np.stack([-sin, cos], axis=-1)
+        along, across = np.array([cos, sin]).T, np.array([-sin, cos]).T
         around = boxes[:, :2] + AROUND_M * (_STEPS[:, None, :1] * along + _STEPS[:, None, 1:] * across)
         found = heard.likelihood(around.reshape(-1, 2)).reshape(len(heard.agents), len(_STEPS), len(boxes))
         if shown is not None:

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Sequence
+from functools import lru_cache
 from itertools import compress
 
 import numpy as np
@@ -12,7 +13,7 @@ from robosac.boxes import BoolArray, FloatArray, IntArray, pairwise_iou
 from robosac.defenses.group_testing.claims import DENIES, LEANS, NEARLY_SUPPORTS, SUPPORTS, two_witnesses
 from robosac.defenses.group_testing.differences import AWAY_EFFECT, carried, gone, gone_alone
 from robosac.defenses.group_testing.objects import SHOWN_SCORE, Shown
-from robosac.defenses.protocol import JudgedBox
+from robosac.defenses.protocol import Hypothesis, JudgedBox
 
 SAME_M = 2.5
 """A box of another fusion, centred so near, stands for the same vehicle."""
@@ -103,6 +104,8 @@ def _each_once(repairs: Sequence[Repair], answer: Shown, kept: BoolArray) -> tup
 def _judged(shown: Shown, which: IntArray, status: Standing | None = None) -> list[JudgedBox]:
     """Some of the boxes of a fusion, by their places (n,); they stand as the fourth step says, or as is known."""
     claims, found = shown.claims, list[JudgedBox]()
+    if not len(which):
+        return found
     said, supporting = claims.likelihood[:, which], claims.supporting[:, which]
     ego, backed = supporting[0], claims.beside[which] >= SUPPORTS
     leaning = np.where(ego, ~backed, claims.rest[which] <= LEANS)
@@ -115,8 +118,13 @@ def _judged(shown: Shown, which: IntArray, status: Standing | None = None) -> li
         witnesses, deniers = tuple(compress(claims.witnesses, supports)), tuple(compress(claims.witnesses, denies))
         unknown = Standing.DISPUTED if deniers else Standing.SINGLE_WITNESS
         stands = status or (Standing.CONFIRMED if confirmed else unknown)
-        found.append(JudgedBox(shown.teammates, index, Support(status=stands, witnesses=witnesses, deniers=deniers)))
+        found.append(JudgedBox(shown.teammates, index, _support(stands, witnesses, deniers)))
     return found
+
+
+@lru_cache(maxsize=4096)  # most boxes have the same few witnesses
+def _support(status: Standing, witnesses: Hypothesis, deniers: Hypothesis) -> Support:
+    return Support(status=status, witnesses=witnesses, deniers=deniers)
 
 
 def _in_place(box: FloatArray, away: float, parts: Sequence[Shown]) -> Repair | None:
