@@ -10,7 +10,7 @@ import numpy as np
 from robosac.boxes import FloatArray
 from robosac.defenses.group_testing.claims import SUPPORTS
 from robosac.defenses.group_testing.differences import SAME_LIE_M, effects, gone
-from robosac.defenses.group_testing.geometry import WITNESS_SCORE, come_and_gone, followed
+from robosac.defenses.group_testing.geometry import WITNESS_SCORE, followed, gone_since
 from robosac.defenses.group_testing.hearing import REACH_M, Hearing
 from robosac.defenses.group_testing.knowledge import Knowledge
 from robosac.defenses.group_testing.lateness import Place, late, motions, senders
@@ -205,9 +205,11 @@ class Findings:
         """Where (n, 2) a vehicle stands that a fusion showed in the frame before and does not show now, though somebody
         is certain of it.
         """
-        shown, before = self.shown[fused], self.known.memory.shown.get(self.known.key(fused), NOTHING)
-        _, gone = come_and_gone(before, followed(shown.boxes, self.pose))
-        return shown.missing_near((gone[:, :2] - self.pose[:2, 3]) @ self.pose[:2, :2])
+        shown, subset = self.shown[fused], self.known.key(fused)
+        if subset not in self.known.memory.shown:
+            return NOTHING[:, :2]
+        gone = gone_since(self.known.memory.shown[subset], followed(shown.boxes, self.pose))
+        return shown.missing_near((gone[:, :2] - self.pose[:2, 3]) @ self.pose[:2, :2]) if len(gone) else gone[:, :2]
 
     def vouching(self, fused: Hypothesis, lie: Lie) -> Hypothesis:
         """Those fused whose own messages go with a ghost or a hole, if they are several and not all."""

@@ -152,12 +152,16 @@ def come_and_gone(
     perturbed map shakes, come and go. ``real`` says of boxes (n, 4) in which places a vehicle stands by the word of
     others: if a box comes and goes there, the detector is unsure, and nobody has made it up.
     """
-    came = _nowhere(now[now[:, 3] >= NEW_SCORE], before)
-    gone = _nowhere(before[before[:, 3] >= WITNESS_SCORE], now)
+    came, gone = _nowhere(now[now[:, 3] >= NEW_SCORE], before), gone_since(before, now)
     if real is None or not len(came) + len(gone):
         return came, gone
     counts = ~real(np.concatenate([came, gone]))
     return came[counts[: len(came)]], gone[counts[len(came) :]]
+
+
+def gone_since(before: FloatArray, now: FloatArray) -> FloatArray:
+    """Boxes (m, 4) that have gone, see `come_and_gone`, whoever says what of them."""
+    return _nowhere(before[before[:, 3] >= WITNESS_SCORE], now)
 
 
 def same_vehicles(boxes: FloatArray, others: FloatArray) -> tuple[IntArray, IntArray]:

@@ -6,6 +6,7 @@ import hashlib
 import math
 from collections.abc import Collection, Mapping
 from dataclasses import dataclass, field
+from functools import lru_cache
 from typing import Any
 
 import numpy as np
@@ -40,6 +41,7 @@ _SPREAD_BY = 0x9E3779B97F4A7C15
 _SPREAD = np.uint64(_SPREAD_BY)
 
 
+@lru_cache(maxsize=4096)
 def identity(name: str) -> int:
     """A teammate as 64 bits; a subset is the sum of its members, modulo 2 ** 64."""
     return int.from_bytes(hashlib.blake2b(name.encode(), digest_size=8).digest(), "little")
