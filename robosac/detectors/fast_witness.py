@@ -51,7 +51,7 @@ class FastWitness:
                 )
                 for block, dilation in zip(network.blocks, DILATIONS, strict=True)
             ]
-            self._head = network.head.get_parameter("bias").clone(), network.head.weight[:, :, 0, 0].T.contiguous()
+            self._head = network.head.get_parameter("bias")[:, None].clone(), network.head.weight[:, :, 0, 0].clone()
         with torch.inference_mode():  # where it is expanded
             self._read = read.clone(memory_format=torch.contiguous_format)
 
@@ -66,5 +66,6 @@ class FastWitness:
         maps = (cells.flip(2) if layout.mirrored else cells).permute(0, 3, 1, 2).to(self._dtype)
         for weight, bias, dilation in self._blocks:
             maps = functional.conv2d(maps, weight, bias, 1, dilation, dilation).relu_().add_(maps)
-        said = torch.addmm(self._head[0], maps.permute(0, 2, 3, 1).flatten(0, 2).float(), self._head[1])
-        return said.view(-1, layout.height, layout.width, LAYERS, u, u).permute(0, 3, 1, 4, 2, 5)
+        # all places of a layer side by side, as they are wanted
+        said = torch.addmm(self._head[0], self._head[1], maps.permute(0, 2, 3, 1).flatten(0, 2).float().T)
+        return said.view(LAYERS, u, u, -1, layout.height, layout.width).permute(3, 0, 4, 1, 5, 2)
