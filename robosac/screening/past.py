@@ -4,7 +4,7 @@ from __future__ import annotations
 
 from collections.abc import Mapping
 from dataclasses import dataclass
-from typing import Any
+from typing import Any, NamedTuple
 
 MEMORY = "screening"
 """Under which a session's state holds what was sent."""
@@ -14,8 +14,7 @@ Place = tuple[float, float]
 """x and y in the world, metres, rounded to 1 cm."""
 
 
-@dataclass(frozen=True)
-class Sent:
+class Sent(NamedTuple):
     """A message that was sent, perhaps several times."""
 
     digest: str
@@ -26,8 +25,7 @@ class Sent:
     """Where it was sent from first."""
 
 
-@dataclass(frozen=True)
-class Anchor:
+class Anchor(NamedTuple):
     """A map to compare later ones with."""
 
     frame: int
