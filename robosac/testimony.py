@@ -168,7 +168,9 @@ class Testimony:
         cell = 2 * self.half_extent_m / size
         place = (_moved(self.from_ego, who, points.T) + self.half_extent_m) / cell
         nearest = np.minimum(np.maximum(place.astype(np.int64), 0), size - 1)
-        found = self.maps[who, layers, nearest[1], nearest[0]].T
+        (width,), (height,) = size
+        at = (who * LAYERS * height + nearest[1]) * width + nearest[0]  # in the first layers of maps in a row
+        found = self.maps.take(at + np.arange(LAYERS)[layers, None] * height * width)
         seen = (nearest + 0.5) * cell - self.half_extent_m + found[:2]
         return _moved(self._to_ego, who, seen), found[2:]
 

@@ -132,6 +132,12 @@ class Shown:
         along, across = off[..., 0] * cos + off[..., 1] * sin, off[..., 1] * cos - off[..., 0] * sin
         return np.abs([along / (seen.along + SLACK_ALONG_M), across / (seen.across + SLACK_ACROSS_M)])
 
+    @cached_property
+    def _farther_away(self) -> FloatArray:
+        """The greater (witnesses, n) of the two."""
+        farther: FloatArray = self._away.max(axis=0)
+        return farther
+
     def away(self, suspects: Collection[str] = (), *, across: bool = False) -> FloatArray:
         """How far (n,) each box is from where witnesses see it, in either direction or ``across`` itself, the lower
         median of at least two; 0 with fewer. The suspects are no witnesses.
@@ -141,7 +147,7 @@ class Shown:
 
     def accusers(self, index: int, suspects: Collection[str]) -> Hypothesis:
         """Who but the suspects sees a vehicle elsewhere than a box is."""
-        away = self._away[:, :, index].max(axis=0).tolist()  # not a number where nothing is seen
+        away = self._farther_away[:, index].tolist()  # not a number where nothing is seen
         said = zip(self.claims.witnesses, away, strict=True)
         return tuple(name for name, far in said if far > IN_PLACE and name not in suspects)
 
@@ -157,11 +163,11 @@ class Shown:
         """
         asked = frozenset(suspects), across
         if asked not in self._medians:
-            others = np.array([name not in suspects for name in self.claims.witnesses])
-            away = self._away[1:, others] if across else self._away[:, others]
-            away = np.sort(away.max(axis=0), axis=0)  # what is not a number comes last
-            seeing: IntArray = (~np.isnan(away)).sum(axis=0)
-            middle: FloatArray = away[np.maximum(seeing - 1, 0) // 2, np.arange(len(self.boxes))]
+            others = [name not in suspects for name in self.claims.witnesses]
+            away = (self._away[1] if across else self._farther_away)[others].T
+            seeing: IntArray = np.add.reduce(~np.isnan(away), axis=1)
+            away = np.sort(away, axis=1)  # what is not a number comes last
+            middle: FloatArray = away[np.arange(len(self.boxes)), np.maximum(seeing - 1, 0) // 2]
             self._medians[asked] = np.where(seeing > 0, middle, np.inf), seeing
         return self._medians[asked]
 
