@@ -41,10 +41,10 @@ def unfounded(decision: Decision, team: Sequence[str], decoded: Decoded) -> Iter
             yield "leaves boxes out, but judged none of those it answers with"
         return
     judged = (*decision.objects, *decision.contradicted)
-    present, taken = {EGO, *team}, set()
+    present, accepted, taken = {EGO, *team}, set(decision.accepted), set()
     for box in judged:
         subset = tuple(box.subset)
-        if not set(subset) <= set(decision.accepted):
+        if not accepted.issuperset(subset):
             yield f"judges a box of some who are not all among the accepted: {list(subset)}"
         elif subset not in decoded:
             yield f"judges a box of some who were not fused in this frame: {list(subset)}"
@@ -52,7 +52,8 @@ def unfounded(decision: Decision, team: Sequence[str], decoded: Decoded) -> Iter
             yield f"judges box {box.index} of {len(decoded[subset])}: {list(subset)}"
         elif (subset, box.index) in taken:
             yield f"judges box {box.index} twice: {list(subset)}"
-        if absent := {*box.support.witnesses, *box.support.deniers} - present:
+        if not (present.issuperset(box.support.witnesses) and present.issuperset(box.support.deniers)):
+            absent = {*box.support.witnesses, *box.support.deniers} - present
             yield f"takes the word of some who are not in the frame: {sorted(absent)}"
         taken.add((subset, box.index))
 
@@ -61,7 +62,7 @@ def best_first(judged: Judged, decoded: Decoded) -> tuple[Judged, FloatArray]:
     """Judged boxes by descending score, and their rows (n, 6); those of equal score stay in order."""
     if not judged:
         return (), np.zeros((0, 6))
-    rows = np.stack([decoded[tuple(box.subset)][box.index] for box in judged])
+    rows = np.array([decoded[tuple(box.subset)][box.index] for box in judged])
     order = np.argsort(-rows[:, 5], kind="stable")
     return tuple(judged[i] for i in order), rows[order]
 

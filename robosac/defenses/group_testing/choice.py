@@ -2,12 +2,14 @@
 
 from __future__ import annotations
 
+from dataclasses import dataclass
+
 import numpy as np
 
 from robosac.boxes import BoolArray, FloatArray, IntArray
 from robosac.defenses.group_testing.geometry import crowd
 from robosac.defenses.group_testing.knowledge import Knowledge
-from robosac.defenses.group_testing.memory import CHANGE_REPEAT, EGO_REPEAT, PAIR_REPEAT, keys
+from robosac.defenses.group_testing.memory import CHANGE_REPEAT, EGO_REPEAT, PAIR_REPEAT, KeyArray, keys
 from robosac.defenses.group_testing.posterior import EXACT, Posterior
 
 GAIN = 0.26
@@ -58,20 +60,25 @@ def expected_information(known: Knowledge, subsets: BoolArray, decoded: BoolArra
         Whether the ego alone sees enough to compare with.
     """
     posterior, memory = known.posterior, known.memory
-    bits = np.zeros(len(subsets))
+    count, bits = len(subsets), np.zeros(len(subsets))
     masks, subset_keys, sizes = posterior.masks(subsets), known.keys(subsets), subsets.sum(axis=1)
     nobody, nothing = np.zeros_like(sizes), np.zeros_like(subset_keys)
-    alone = posterior.cells(np.zeros_like(masks), masks)
+    pairs = _pairs(known, subsets, decoded)
+    # all at once, beside the ego and in pairs
+    cells = posterior.cells(*(np.hstack(of) for of in ((np.zeros_like(masks), pairs.a), (masks, pairs.d))))
+    a_sizes, d_sizes = np.append(nobody, pairs.a_sizes), np.append(sizes, pairs.d_sizes)
+    told = DEPENDENCE * known.model.information(a_sizes, d_sizes, cells) * dilution(a_sizes + d_sizes)
     if ego_sees:
-        once = memory.weights(keys(nothing, subset_keys), EGO_REPEAT)
-        bits += DEPENDENCE * once * known.model.information(nobody, sizes, alone) * dilution(sizes)
+        bits += memory.weights(keys(nothing, subset_keys), EGO_REPEAT) * told[:count]
     again = np.flatnonzero([key in memory.shown for key in subset_keys.tolist()])
     if len(again):
         once = memory.weights(keys(subset_keys[again], nothing[again]), CHANGE_REPEAT)
         boxes = np.array([crowd(memory.shown[key]) for key in subset_keys[again].tolist()])
-        told = known.model.change_information(sizes[again], boxes, alone[again])
-        bits[again] += once * told * dilution(sizes[again])
-    return (bits + _of_pairs(known, subsets, decoded)) * memory.steadiness.trust
+        changed = known.model.change_information(sizes[again], boxes, cells[again])
+        bits[again] += once * changed * dilution(sizes[again])
+    best = np.zeros(count)
+    np.maximum.at(best, pairs.subset, memory.weights(pairs.keys, PAIR_REPEAT) * told[count:])
+    return (bits + best) * memory.steadiness.trust
 
 
 def most_information(known: Knowledge, subsets: BoolArray) -> FloatArray:
@@ -86,26 +93,34 @@ def most_information(known: Knowledge, subsets: BoolArray) -> FloatArray:
     return most
 
 
-def _of_pairs(known: Knowledge, subsets: BoolArray, decoded: BoolArray) -> FloatArray:
-    """Bits (n,) from the best pair that each subset makes with a part or superset of it."""
+@dataclass(frozen=True, eq=False)
+class _Pairs:
+    """Pairs (p,) that subsets would make with parts or supersets of them."""
+
+    subset: IntArray
+    """(p,): which subset."""
+    a: IntArray
+    d: IntArray
+    """(B, p): masks of the smaller one, and of what the larger one has more."""
+    a_sizes: IntArray
+    d_sizes: IntArray
+    keys: KeyArray
+    """(p,): of the tests, as memory knows them."""
+
+
+def _pairs(known: Knowledge, subsets: BoolArray, decoded: BoolArray) -> _Pairs:
     posterior = known.posterior
-    best = np.zeros(len(subsets))
     sizes, other_sizes = subsets.sum(axis=1), decoded.sum(axis=1)
     shared = subsets.astype(np.float64) @ decoded.T  # exact as floats, whose products are the fast ones
     above = shared == other_sizes
     index, other = np.nonzero(above | (shared == sizes[:, None]))
-    if not len(index):
-        return best
     masks, other_masks = posterior.masks(subsets)[:, index], posterior.masks(decoded)[:, other]
     own_keys, other_keys = known.keys(subsets)[index], known.keys(decoded)[other]
     grows = above[index, other]
     a_keys, ad_keys = np.where(grows, (other_keys, own_keys), (own_keys, other_keys))
     a_sizes, together = np.minimum(sizes[index], other_sizes[other]), np.maximum(sizes[index], other_sizes[other])
-    cells = posterior.cells(np.where(grows, other_masks, masks), masks ^ other_masks)
-    told = known.model.information(a_sizes, together - a_sizes, cells)
-    once = known.memory.weights(keys(a_keys, ad_keys - a_keys), PAIR_REPEAT)
-    np.maximum.at(best, index, DEPENDENCE * once * told * dilution(together))
-    return best
+    a = np.where(grows, other_masks, masks)
+    return _Pairs(index, a, masks ^ other_masks, a_sizes, together - a_sizes, keys(a_keys, ad_keys - a_keys))
 
 
 def dilution(sizes: IntArray) -> FloatArray:

@@ -8,7 +8,7 @@ import numpy as np
 
 from robosac.boxes import BoolArray, FloatArray, IntArray
 from robosac.defenses.group_testing import sets
-from robosac.defenses.group_testing.blocks import Block, members
+from robosac.defenses.group_testing.blocks import Block
 from robosac.defenses.group_testing.model import CELLS, CLEAN
 from robosac.defenses.group_testing.sets import ATTACKS, BENIGN, PLAIN
 
@@ -53,7 +53,7 @@ class Distribution:
     @property
     def members(self) -> list[str]:
         """The team, block by block: the order of every array over teammates."""
-        return members(self._blocks)
+        return [name for names in self._names for name in names]
 
     @property
     def nobody(self) -> float:

@@ -92,7 +92,7 @@ class Evidence:
         self._alone: Shown | None = None
         self._against: dict[str, defaultdict[str, float]] = {test: defaultdict(float) for test in TESTS}
         self.outcomes: list[Outcome] = []
-        self.shown: dict[int, FloatArray] = {}
+        self.shown = known.shown = {}
         self.differences: list[Difference] = []
         self.ego_sees = self.ego_witnesses = True
 

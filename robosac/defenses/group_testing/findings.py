@@ -208,8 +208,12 @@ class Findings:
         shown, subset = self.shown[fused], self.known.key(fused)
         if subset not in self.known.memory.shown:
             return NOTHING[:, :2]
-        gone = gone_since(self.known.memory.shown[subset], followed(shown.boxes, self.pose))
+        gone = gone_since(self.known.memory.shown[subset], self._followed(fused))
         return shown.missing_near((gone[:, :2] - self.pose[:2, 3]) @ self.pose[:2, :2]) if len(gone) else gone[:, :2]
+
+    def _followed(self, fused: Hypothesis) -> FloatArray:
+        known = self.known.shown.get(self.known.key(fused))
+        return followed(self.shown[fused].boxes, self.pose) if known is None else known
 
     def vouching(self, fused: Hypothesis, lie: Lie) -> Hypothesis:
         """Those fused whose own messages go with a ghost or a hole, if they are several and not all."""

@@ -7,7 +7,7 @@ from dataclasses import dataclass, field
 
 import numpy as np
 
-from robosac.boxes import BoolArray
+from robosac.boxes import BoolArray, FloatArray
 from robosac.defenses.group_testing.memory import KeyArray, Memory, identity
 from robosac.defenses.group_testing.model import EvidenceModel
 from robosac.defenses.group_testing.posterior import Posterior
@@ -23,6 +23,8 @@ class Knowledge:
     memory: Memory
     members: list[str] = field(init=False)
     """The team, in the order of every array over teammates; some may be missing in the frame."""
+    shown: dict[int, FloatArray] = field(default_factory=dict, init=False)
+    """By the sum of its identities: what each subset showed in this frame (n, 4), see `geometry.followed`."""
 
     def __post_init__(self) -> None:
         self.members = self.posterior.members

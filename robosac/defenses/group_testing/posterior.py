@@ -123,7 +123,7 @@ class Posterior(Distribution):
             expected = self._expected(by_level, touched, [of_a[b] for b in touched], [of_d[b] for b in touched])
         else:
             expected = by_level.reshape(1, 1 + self._kinds, -1)
-        updated = expected @ np.stack([sets.by_level(self._width, of_a[b], of_d[b]) for b in touched])
+        updated = expected @ np.array([sets.by_level(self._width, of_a[b], of_d[b]) for b in touched])
         updated *= self._tables[touched]
         evidence = updated.sum(axis=2)
         updated /= np.maximum(evidence, _TINY)[:, :, None]
