@@ -242,8 +242,9 @@ def nms(boxes: FloatArray, scores: FloatArray, iou_threshold: float) -> IntArray
     while len(order):
         block, order = order[:_NMS_BLOCK], order[_NMS_BLOCK:]
         overlap = pairwise_iou(boxes[block], boxes[block]) > iou_threshold
+        overlap.flat[:: len(block) + 1] = False  # with themselves
         alive = np.ones(len(block), dtype=bool)
-        for i in range(len(block)):
+        for i in np.flatnonzero(overlap.any(axis=1)).tolist():
             if alive[i]:
                 alive[i + 1 :] &= ~overlap[i, i + 1 :]
         survivors = block[alive]
