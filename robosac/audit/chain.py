@@ -10,9 +10,10 @@ from __future__ import annotations
 import hashlib
 from collections.abc import Mapping
 from dataclasses import InitVar, dataclass, field
+from functools import lru_cache
 from typing import Any
 
-import rfc8785
+from robosac.audit.lines import canonical
 
 GENESIS = "0" * 64
 """``previous`` of a log's first record."""
@@ -37,14 +38,18 @@ class Unsealed:
     parts: Mapping[str, bytes] = field(init=False)
 
     def __post_init__(self, event: Mapping[str, Any]) -> None:
-        object.__setattr__(self, "parts", {name: rfc8785.dumps(value) for name, value in event.items()})
+        object.__setattr__(self, "parts", {name: canonical(value) for name, value in event.items()})
 
     def seal(self, session_id: str, seq: int, previous: str) -> str:
         """The line of the record; see `seal`."""
         place: dict[str, Any] = {"session_id": session_id, "seq": seq, "previous": previous}
-        parts = {**self.parts, **{name: rfc8785.dumps(value) for name, value in place.items()}}
+        parts = {**self.parts, **{name: canonical(value) for name, value in place.items()}}
         ordered = sorted(parts.items(), key=lambda part: part[0].encode("utf-16be"))  # as RFC 8785 has it
-        return (b"{" + b",".join(rfc8785.dumps(name) + b":" + value for name, value in ordered) + b"}").decode()
+        return (b"{" + b",".join(_named(name) + b":" + value for name, value in ordered) + b"}").decode()
+
+
+_named = lru_cache(maxsize=256)(canonical)
+"""The canonical form of a field's name."""
 
 
 def seal(event: Mapping[str, Any], session_id: str, seq: int, previous: str) -> str:

@@ -170,9 +170,8 @@ def _short_timings(spent: Mapping[str, float]) -> Any:
 
 
 def _short_proof(proof: Proof) -> Any:
-    fields = proof.as_json()
     digest = packing.short_digest(proof.digest)
-    return [digest, fields["signature"]] if "signature" in fields else digest
+    return digest if proof.signature is None else [digest, proof.as_json()["signature"]]
 
 
 def _short_rejections(
@@ -209,6 +208,7 @@ def _short_supports(supports: Sequence[Support] | None, names: Sequence[str]) ->
     """Packed if only those who sent a message have a say; else at length, so that it can be seen."""
     if supports is None:
         return None
-    if all(set(names).issuperset([*each.witnesses, *each.deniers]) for each in supports):
+    known = set(names)
+    if all(known.issuperset(each.witnesses) and known.issuperset(each.deniers) for each in supports):
         return packing.pack_supports(supports, names)
     return [{"status": e.status.value, "witnesses": list(e.witnesses), "deniers": list(e.deniers)} for e in supports]

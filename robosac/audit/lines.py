@@ -6,6 +6,7 @@ import codecs
 import json
 import re
 from collections.abc import Iterator, Mapping
+from contextlib import suppress
 from typing import Any, BinaryIO, NoReturn
 
 import rfc8785
@@ -28,7 +29,7 @@ _READER = json.JSONDecoder(parse_constant=_no_number)
 _AS_CANONICAL = json.JSONEncoder(ensure_ascii=False, allow_nan=False, sort_keys=True, separators=(",", ":"))
 """Several times faster than rfc8785. It orders names otherwise where they are not ASCII, and writes some numbers
 otherwise."""
-_NUMBER = re.compile(rb"[:\[,]-?(?:\d{16}|\d+(?:\.0*[,\]}]|(?:\.\d+)?[eE]))")
+_NUMBER = re.compile(r"[:\[,]-?(?:\d{16}|\d+(?:\.0*[,\]}]|(?:\.\d+)?[eE]))")
 """A number that Python may write otherwise than RFC 8785: large, with an exponent, or a whole one with a point."""
 
 
@@ -70,12 +71,25 @@ def _why(line: bytes, error: Exception) -> str:
     return f"{error.msg}: character {error.pos + 1}" if isinstance(error, json.JSONDecodeError) else str(error)
 
 
+def canonical(value: Any) -> bytes:
+    """The canonical form (RFC 8785) of a JSON value.
+
+    Raises
+    ------
+    rfc8785.CanonicalizationError
+        If it has none.
+    """
+    with suppress(TypeError, ValueError):
+        text = _AS_CANONICAL.encode([value])  # in a list, so that a number has something before and after it
+        if text.isascii() and not _NUMBER.search(text):
+            return text[1:-1].encode()
+    whole: bytes = rfc8785.dumps(value)
+    return whole
+
+
 def is_canonical(line: bytes, record: Mapping[str, Any]) -> bool:
-    """Whether a line is the canonical form (RFC 8785) of its record, as `read` read it."""
+    """Whether a line is the canonical form of its record, as `read` read it."""
     try:
-        if line.isascii() and not _NUMBER.search(line) and _AS_CANONICAL.encode(record).encode() == line:
-            return True
-        canonical: bytes = rfc8785.dumps(dict(record))
+        return canonical(dict(record)) == line
     except (ValueError, RecursionError):
         return False
-    return canonical == line

@@ -12,7 +12,7 @@ import hashlib
 import json
 import zlib
 from collections.abc import Mapping, Sequence
-from functools import lru_cache
+from functools import cache, lru_cache
 from typing import Any
 
 import numpy as np
@@ -111,12 +111,12 @@ def pack_supports(supports: Sequence[Support], names: Sequence[str]) -> str:
         Whom the bits stand for, the least first; all witnesses and deniers must be among them.
     """
     width, bits = -(-len(names) // 8), _bits(names)
-    rows = [
-        bytes([_STANDINGS.index(each.status)])
-        + _mask(each.witnesses, bits).to_bytes(width, "little")
-        + _mask(each.deniers, bits).to_bytes(width, "little")
-        for each in supports
-    ]
+
+    @cache  # most boxes have the same few witnesses
+    def mask(chosen: Sequence[str]) -> bytes:
+        return _mask(chosen, bits).to_bytes(width, "little")
+
+    rows = [bytes([_STANDINGS.index(each.status)]) + mask(each.witnesses) + mask(each.deniers) for each in supports]
     columns = np.frombuffer(b"".join(rows), dtype=np.uint8).reshape(-1, 1 + 2 * width).T
     return deflated(columns.tobytes())
 

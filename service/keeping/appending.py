@@ -56,7 +56,7 @@ def append(  # a transaction's work, and what was made ready for it
         revision=record.revision + bool(changes),
     )
     changed = columns(after, *changes, *GROWTH, "revision", state=state)
-    connection.execute(CHANGE.values(changed), {"this": session_id})
+    connection.execute(CHANGE, {"this": session_id, **changed})  # not `values`, so that it is compiled once
     connection.execute(insert(audit_lines), line_row(session_id, after.audit_seq, line))
     return after
 
