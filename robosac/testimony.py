@@ -122,8 +122,7 @@ class Testimony:
         agents, _, height, width = self.maps.shape
         padded = np.zeros((agents, height + 3, width + 3), dtype=self.maps.dtype)
         inside = padded[:, 1:-2, 1:-2]
-        np.maximum(self.maps[:, LIKELIHOOD], -MOST, out=inside)
-        np.minimum(inside, MOST, out=inside)
+        np.clip(self.maps[:, LIKELIHOOD], -MOST, MOST, out=inside)
         return padded
 
     @cached_property

@@ -75,7 +75,8 @@ class Claims:
 
     def without(self, agents: Collection[str]) -> Claims:
         """The same boxes, and what the other witnesses say of them."""
-        kept = [i for i, name in enumerate(self.witnesses) if name not in agents]
+        others = set(agents)
+        kept = [i for i, name in enumerate(self.witnesses) if name not in others]
         if len(kept) == len(self.witnesses):
             return self
         return Claims(self.boxes, tuple(self.witnesses[i] for i in kept), self.likelihood[kept])
@@ -208,6 +209,7 @@ def two_witnesses(speaking: BoolArray) -> BoolArray:
 
 def vouched(supporting: BoolArray, agents: Sequence[str], suspects: Collection[str]) -> BoolArray:
     """Which places (n,) one of the agents supports, ``supporting`` (agents, n), who is no suspect, or two."""
-    others = np.array([name not in suspects for name in agents])
-    enough: BoolArray = supporting[others].any(axis=0) | (supporting.sum(axis=0) >= 2)
+    suspected = set(suspects)
+    others = [name not in suspected for name in agents]
+    enough: BoolArray = supporting[others].any(axis=0) | (np.add.reduce(supporting, axis=0, dtype=np.int16) >= 2)
     return enough

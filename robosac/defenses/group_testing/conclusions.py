@@ -65,7 +65,9 @@ def conclude(found: Findings, answer: Hypothesis) -> None:
     _place(found, answer)
     _leave_alone(found, answer)
     _clear(found, comparisons)
-    for name in found.team:
+    blameful = {name for name, lies in blamed.items() if lies}
+    concerned = blameful | conflicts.keys() | having_a_part | straying.keys() | found.lies.levels.keys()
+    for name in filter(concerned.__contains__, found.team):
         counts, lies = dict(conflicts.get(name, {})), blamed[name]
         if lies or name in having_a_part:
             found.lies.effects[name] = frame
@@ -123,13 +125,12 @@ def _conflicts(found: Findings, answer: Hypothesis) -> dict[str, dict[str, int]]
         return {}
     claims = found.shown[answer].everybody
     claims = claims.of_boxes(claims.boxes[:, 5] >= CONFLICT_SCORE)
-    conflicts = {who: at for who, *at in zip(claims.witnesses, *claims.in_conflict(found.unheard), strict=True)}
+    both = np.array(claims.in_conflict(found.unheard))
+    conflicts = {claims.witnesses[i]: both[:, i] for i in np.flatnonzero(both.any(axis=(0, 2))).tolist()}
     frame, once = found.known.memory.frame, None if found.calm else 1
     counts: dict[str, dict[str, int]] = {}
-    for name in found.team:
+    for name in filter(conflicts.__contains__, found.team):
         supported, denied = conflicts[name]
-        if not (supported | denied).any():
-            continue
         if supported.any() and denied.any():
             found.lies.effects[name] = frame
         unseen = denied & found.hearing.everybody.is_empty(name, claims.boxes[:, :2])

@@ -181,7 +181,8 @@ def _speaking_for(joined: Shown, index: int, without: Shown, at: int, suspects: 
 def gone(joined: Shown, without: Shown, suspects: Collection[str] = ()) -> IntArray:
     """Boxes, by their places in ``without``, that are gone in ``joined`` although others support them."""
     claims = without.claims
-    others = np.array([name not in suspects for name in claims.witnesses])
+    suspected = set(suspects)
+    others = np.array([name not in suspected for name in claims.witnesses])
     supported = two_witnesses(claims.supporting & others[:, None])
     supported &= claims.likelihood[others].sum(axis=0) >= WEIGHTY
     lost, rise = joined.beside(without, _lost)

@@ -120,13 +120,11 @@ class Distribution:
         `_LIMITS` (L,), and none in ``d`` above the second.
         """
         codes = sets.codes(self._width)
-        touched = np.flatnonzero((a | d).any(axis=1)).tolist() or [0]
-        product: FloatArray | None = None
-        for b in touched:
-            part = self._below[b].take(2 * codes[-1] - _OF_A * codes[a[b]] - _OF_D * codes[d[b]], axis=1)
-            product = part if product is None else np.multiply(product, part, out=product)
-        assert product is not None
-        return product
+        touched = np.flatnonzero((a | d).any(axis=1))
+        touched = touched if len(touched) else np.zeros(1, dtype=np.int64)
+        limits = 2 * codes[-1] - _OF_A * codes[a[touched]][:, None] - _OF_D * codes[d[touched]][:, None]  # (b, L, n)
+        each: FloatArray = np.moveaxis(self._below, 1, 2)[touched[:, None, None], limits]  # (b, L, n, 1 + K)
+        return np.moveaxis(np.multiply.reduce(each, axis=0), -1, 0)
 
     @property
     def _below(self) -> FloatArray:

@@ -163,7 +163,7 @@ class Shown:
         """
         asked = frozenset(suspects), across
         if asked not in self._medians:
-            others = [name not in suspects for name in self.claims.witnesses]
+            others = [name not in asked[0] for name in self.claims.witnesses]
             away = (self._away[1] if across else self._farther_away)[others].T
             seeing: IntArray = np.add.reduce(~np.isnan(away), axis=1)
             away = np.sort(away, axis=1)  # what is not a number comes last

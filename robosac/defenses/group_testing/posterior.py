@@ -123,8 +123,9 @@ class Posterior(Distribution):
             expected = self._expected(by_level, touched, [of_a[b] for b in touched], [of_d[b] for b in touched])
         else:
             expected = by_level.reshape(1, 1 + self._kinds, -1)
-        updated = expected @ np.array([sets.by_level(self._width, of_a[b], of_d[b]) for b in touched])
-        updated *= self._tables[touched]
+        updated = self._tables[touched]
+        for i, b in enumerate(touched):
+            updated[i] *= expected[i] @ sets.by_level(self._width, of_a[b], of_d[b])
         evidence = updated.sum(axis=2)
         updated /= np.maximum(evidence, _TINY)[:, :, None]
         tables, below = updated, None

@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Sequence
-from functools import lru_cache
+from functools import cache, lru_cache
 from itertools import compress
 
 import numpy as np
@@ -113,9 +113,14 @@ def _judged(shown: Shown, which: IntArray, status: Standing | None = None) -> li
     second = backed & supporting.any(axis=0) & ((said >= NEARLY_SUPPORTS).sum(axis=0) >= 2)
     several = (supporting.sum(axis=0) >= 2) | second
     known = np.where(ego, backed, several & ~denying.any(axis=0)).tolist()
-    by_box = zip(which.tolist(), supporting.T.tolist(), denying.T.tolist(), known, strict=True)
+
+    @cache  # most boxes have the same few witnesses
+    def named(speaking: bytes) -> Hypothesis:
+        return tuple(compress(claims.witnesses, speaking))
+
+    by_box = zip(which.tolist(), supporting.T, denying.T, known, strict=True)
     for index, supports, denies, confirmed in by_box:
-        witnesses, deniers = tuple(compress(claims.witnesses, supports)), tuple(compress(claims.witnesses, denies))
+        witnesses, deniers = named(supports.tobytes()), named(denies.tobytes())
         unknown = Standing.DISPUTED if deniers else Standing.SINGLE_WITNESS
         stands = status or (Standing.CONFIRMED if confirmed else unknown)
         found.append(JudgedBox(shown.teammates, index, _support(stands, witnesses, deniers)))
