@@ -69,8 +69,8 @@ class MeanFusionNetwork(nn.Module):
 class FastDecoder(nn.Module):
     """What `MeanFusionNetwork.decode` does, in less time; for inference only.
 
-    The two heads are one convolution. Outputs are filled up with zeros to multiples of `AT_A_TIME`: a processor makes
-    48 channels faster than 40.
+    The two heads are one convolution. Steps follow one another without any blocks. Outputs are filled up with zeros to
+    multiples of `AT_A_TIME`: a processor makes 48 channels faster than 40.
 
     Parameters
     ----------
@@ -83,12 +83,16 @@ class FastDecoder(nn.Module):
         *first, block = deepcopy(network.decoder).children()
         last = _filled_up([next(block.children())], 0)
         heads = _filled_up([network.class_head, network.box_head], last.out_channels)
-        self.steps = nn.Sequential(*first, last, nn.ReLU(inplace=True), heads)
+        single = (step for step in nn.Sequential(*first).modules() if not list(step.children()))
+        steps = [step for step in single if not isinstance(step, nn.Identity)]
+        self.steps = nn.Sequential(*steps, last, nn.ReLU(inplace=True), heads)
         self.requires_grad_(False).to(memory_format=torch.channels_last)  # type: ignore[call-overload]
 
     def decode(self, fused: torch.Tensor) -> tuple[torch.Tensor, torch.Tensor]:
         """As `MeanFusionNetwork.decode`."""
-        heads = self.steps(fused)
+        heads = fused
+        for step in self.steps:
+            heads = step.forward(heads)  # there are no hooks to look for
         return heads[:, 0].contiguous(), heads[:, 1 : 1 + BOX_CHANNELS]
 
 
