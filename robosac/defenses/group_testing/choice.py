@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from dataclasses import dataclass
+from functools import lru_cache
 
 import numpy as np
 
@@ -39,10 +40,18 @@ def gain(sizes: FloatArray | IntArray) -> FloatArray:
     return GAIN * (1.0 - np.exp(-m / GAIN_SCALE)) + more
 
 
+@lru_cache(maxsize=16)
+def _gains(most: int) -> FloatArray:
+    """`gain` of none up to the most messages."""
+    gains: FloatArray = gain(np.arange(most + 1))
+    return gains
+
+
 def utility(posterior: Posterior, subsets: BoolArray) -> FloatArray:
     """``U(m) = P(m clean) G(|m|) - (1 - P(m clean)) HARM`` of each subset (n,); the ego's own answer has 0."""
     clean = posterior.unattacked(posterior.masks(subsets))
-    return clean * gain(subsets.sum(axis=1)) - (1.0 - clean) * HARM
+    worth: FloatArray = clean * _gains(subsets.shape[1])[subsets.sum(axis=1)] - (1.0 - clean) * HARM
+    return worth
 
 
 def expected_information(known: Knowledge, subsets: BoolArray, decoded: BoolArray, *, ego_sees: bool) -> FloatArray:
