@@ -107,3 +107,10 @@ def _check_message(info: DetectorInfo, role: Role, message: object, name: str) -
             raise ValueError(f"{name}: the tensor {tensor!r} is missing")
         if (shape := np.shape(message.tensors[tensor])) != spec.shape:
             raise ValueError(f"{name}: the tensor {tensor!r} must be of shape {spec.shape}, got {shape}")
+
+
+def by_text(value: object) -> bool:
+    """Whether all keys of a JSON value are texts: JSON has no others, and some writers make texts of them."""
+    if isinstance(value, Mapping):
+        return all(isinstance(key, str) and by_text(item) for key, item in value.items())
+    return all(map(by_text, value)) if isinstance(value, list | tuple) else True

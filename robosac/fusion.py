@@ -18,7 +18,7 @@ import rfc8785
 
 from robosac.ahead import Ahead
 from robosac.answers import Reason, Source, Verdict
-from robosac.arguments import check_defense, check_frame, check_rng
+from robosac.arguments import by_text, check_defense, check_frame, check_rng
 from robosac.boxes import FloatArray
 from robosac.calibrated import witness_of
 from robosac.consensus import at_least, compare
@@ -245,6 +245,8 @@ class FrameRun:
             raise UnverifiedAnswer(f"{self.defense.kind} {doubt}")
         if self.defense.kind not in shipped():  # those that ship are known to keep JSON, and theirs may be long
             rfc8785.dumps(dict(decision.state))
+            if doubt := next((name for name, why in decision.rejected.items() if not by_text(why.evidence)), None):
+                raise UnverifiedAnswer(f"{self.defense.kind} gives evidence on {doubt} by keys that are no text")
 
     def _assemble(self, passes: Passes, decision: Decision) -> Steps[dict[str, Any]]:
         """The fields of the result that hold boxes, and whose they are; judged ones are checked by now."""

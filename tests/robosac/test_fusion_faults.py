@@ -101,3 +101,23 @@ def test_a_state_that_cannot_be_kept_is_a_fault_of_the_frame(caplog):
         result = run(FakeDetector(), Hoarder())
     assert (result.source, result.state) == (Source.EGO_ONLY, {})
     assert "CanonicalizationError" in result.fault
+
+
+class Numbering(SampleConsensus):
+    """A defence of one's own, whose evidence has numbers for names."""
+
+    kind: Literal["numbering"] = "numbering"
+
+    def converse(self, team, state, rng):
+        decision = yield from super().converse(team, state, rng)
+        told = {"by": [{5: 1, "5": 2}]}
+        return replace(
+            decision, rejected={name: replace(why, evidence=told) for name, why in decision.rejected.items()}
+        )
+
+
+def test_evidence_by_anything_but_texts_is_a_fault_of_the_frame(caplog):
+    with caplog.at_level(logging.CRITICAL):
+        result = run(FakeDetector(), Numbering())
+    assert result.source == Source.EGO_ONLY
+    assert "keys that are no text" in result.fault
