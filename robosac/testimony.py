@@ -7,7 +7,7 @@ A witness network reads one agent's message alone and says for every place how m
 from __future__ import annotations
 
 from collections.abc import Callable, Collection, Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from functools import cached_property, lru_cache
 
 import numpy as np
@@ -21,6 +21,8 @@ may be off along and across the vehicle (metres).
 LAYERS = 5
 KNOWS = 3.0
 """An agent knows of a place whether a vehicle is there if its L is so far from 0."""
+AGREED_M = 0.6
+"""All see a vehicle in one place if none is so far off from their mean, along either axis."""
 MOST = 7.0
 """L is clipped to +- this: beyond it the network has seen too little to know."""
 
@@ -148,6 +150,16 @@ class Testimony:
         off[:, who, where] = np.exp(off_by)
         return Sighting(centre, *off)
 
+    def agreed(self, points: FloatArray, asked: BoolArray) -> tuple[FloatArray, BoolArray]:
+        """The mean (n, 2) of where those asked (agents, n) see the vehicles at places (n, 2), ego frame; and which (n,)
+        all of them see in one place. Somebody is asked of each.
+        """
+        centres = self.centres(points, asked)
+        off = np.abs(self.sighting(points, asked).centre - centres)
+        farthest = np.fmax.reduce(off, axis=(0, 2))  # it is not a number for those who are not asked
+        agreed: BoolArray = farthest <= AGREED_M
+        return centres, agreed
+
     def centres(self, points: FloatArray, asked: BoolArray) -> FloatArray:
         """The mean (n, 2) of where those asked (agents, n) see the vehicles at places (n, 2), ego frame; somebody is
         asked of each.
@@ -172,6 +184,12 @@ class Testimony:
         found = self.maps.take(at + np.arange(LAYERS)[layers, None] * height * width)
         seen = (nearest + 0.5) * cell - self.half_extent_m + found[:2]
         return _moved(self._to_ego, who, seen), found[2:]
+
+    def silenced(self, agent: str) -> Testimony:
+        """The same, of which one says nothing, as if it had observed nothing."""
+        index, maps, over_ego = self.agents.index(agent), self.maps.copy(), self.over_ego.copy()
+        maps[index, LIKELIHOOD] = over_ego[index] = 0.0
+        return replace(self, maps=maps, over_ego=over_ego, unread=(*self.unread, agent))
 
     def of(self, agents: Collection[str]) -> Testimony:
         """That of some of them alone."""

@@ -94,3 +94,29 @@ def test_places_of_the_egos_map_are_a_grid():
     places = made(slope(0, 0)).ego_places()
     assert places.shape == (SIZE, SIZE, 2)
     np.testing.assert_allclose([places[0, 0], places[0, 1], places[1, 0]], [[-7, -7], [-5, -7], [-7, -5]])
+
+
+def test_who_is_silenced_says_nothing_and_the_others_are_as_before(rng):
+    said = made(rng.normal(size=(2, LAYERS, SIZE, SIZE)), [HERE, AWAY])
+    said.over_ego[:] = 2.0
+    points = rng.uniform(-6, 6, (9, 2))
+    before = said.likelihood(points)
+    less = said.silenced("")
+    assert not less.likelihood(points)[0].any()
+    assert not less.over_ego[0].any()
+    assert less.unread == ("",)
+    np.testing.assert_array_equal(less.likelihood(points)[1], before[1])
+    np.testing.assert_array_equal(less.over_ego[1], said.over_ego[1])
+    np.testing.assert_array_equal(said.likelihood(points), before)
+    assert said.over_ego.all()
+
+
+@pytest.mark.parametrize(("off", "agreed"), [(0.0, True), (0.8, True), (1.0, False)])
+def test_they_agree_who_see_a_vehicle_in_one_place(off, agreed):
+    maps = np.zeros((3, LAYERS, SIZE, SIZE))
+    maps[:, Y] = np.array([0.0, 0.0, off])[:, None, None]
+    said = made(maps, [HERE] * 3, ("", "a", "b"))
+    points = np.array([[1.2, 0.7], [-2.9, 5.0]])
+    centres, same = said.agreed(points, np.array([[True, False], [True, True], [True, False]]))
+    np.testing.assert_allclose(centres, [[1.0, 1.0 + off / 3], [-3.0, 5.0]], atol=1e-6)
+    assert same.tolist() == [agreed, True]  # one agrees with itself

@@ -66,12 +66,13 @@ def conclude(found: Findings, answer: Hypothesis) -> None:
     _leave_alone(found, answer)
     _clear(found, comparisons)
     blameful = {name for name, lies in blamed.items() if lies}
+    _doubt_ego(found, bool(blameful or conflicts))
     concerned = blameful | conflicts.keys() | having_a_part | straying.keys() | found.lies.levels.keys()
     for name in filter(concerned.__contains__, found.team):
         counts, lies = dict(conflicts.get(name, {})), blamed[name]
         if lies or name in having_a_part:
             found.lies.effects[name] = frame
-        if lies and found.late(name):
+        if lies and found.seems_late(name):
             lies = [replace(lie, along=True) for lie in lies]
         for kind in {lie.counts_as for lie in lies}:
             of_kind = [lie for lie in lies if lie.counts_as == kind]
@@ -137,7 +138,7 @@ def _conflicts(found: Findings, answer: Hypothesis) -> dict[str, dict[str, int]]
         if unseen.any() and found.hearing.alone(name, found.unheard) >= FEWEST_SEEN:
             unseen[:] = False
         kinds = np.where(unseen, "unseen", "conflict")
-        if found.late(name):
+        if found.seems_late(name):
             kinds[:] = "late"
         for kind in ("conflict", "unseen", "late"):
             places = [found.placed(box[:2]) for box in claims.boxes[(supported | denied) & (kinds == kind)]]
@@ -201,6 +202,13 @@ def _place(found: Findings, answer: Hypothesis) -> None:
     found.known.memory.placing.learn(
         {name: by for name, by in zip(everybody.agents, far, strict=True) if not np.isnan(by)}
     )
+
+
+def _doubt_ego(found: Findings, anything_wrong: bool) -> None:
+    """Learn whether the ego's own message is late; where nothing seems wrong it does no harm."""
+    memory = found.known.memory
+    if (anything_wrong or memory.ego_is_late) and found.ego_late:
+        memory.ego_late = memory.frame
 
 
 def _comparisons(found: Findings) -> dict[tuple[Hypothesis, Hypothesis], str]:

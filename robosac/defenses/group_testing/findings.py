@@ -7,8 +7,8 @@ from functools import cached_property
 
 import numpy as np
 
-from robosac.boxes import FloatArray
-from robosac.defenses.group_testing.claims import SUPPORTS
+from robosac.boxes import FloatArray, IntArray
+from robosac.defenses.group_testing.claims import NOT_TOGETHER, SUPPORTS
 from robosac.defenses.group_testing.differences import SAME_LIE_M, effects, gone
 from robosac.defenses.group_testing.geometry import WITNESS_SCORE, followed, gone_since
 from robosac.defenses.group_testing.hearing import REACH_M, Hearing
@@ -18,6 +18,7 @@ from robosac.defenses.group_testing.lies import Lies
 from robosac.defenses.group_testing.objects import Lie, Shown
 from robosac.defenses.group_testing.shapes import BLAMING, agreeing, reshaped, to_ask
 from robosac.defenses.protocol import EGO, Difference, Hypothesis, Outcome
+from robosac.testimony import Testimony
 
 CALM = 0.5
 """From here on the ego counts as steady."""
@@ -67,6 +68,7 @@ class Findings:
         self.hearing: Hearing | None = None
         self.pose: FloatArray = np.eye(4)
         self.differences: list[Difference] = []
+        self._testimony: Testimony | None = None
         self._alone: FloatArray | None = None
         self._gone: dict[tuple[Hypothesis, Hypothesis], FloatArray] = {}
         self._late: dict[str, bool] = {}
@@ -79,7 +81,9 @@ class Findings:
         if outcome.testimony is None or outcome.boxes is None:
             return None
         if self.hearing is None:
-            self.hearing = Hearing(outcome.testimony, self.unheard)
+            self._testimony = outcome.testimony
+            silent = self.known.memory.ego_is_late
+            self.hearing = Hearing(outcome.testimony.silenced(EGO) if silent else outcome.testimony, self.unheard)
             self._alone = outcome.alone
         if outcome.pose is not None:
             self.pose = outcome.pose
@@ -154,32 +158,57 @@ class Findings:
         return {} if self.hearing is None else senders(self.hearing.everybody, self.pose)
 
     def late(self, sender: str) -> bool:
-        """Whether a sender's message is late: by the vehicles that the largest fusion without it shows, where one is
+        """Whether a teammate's message is late: by the vehicles that the largest fusion without it shows, where one is
         decoded, or by those that the ego sees alone, as all others may be late, too.
         """
         if sender not in self._late:
             self._late[sender] = self._late_beside(sender, self._without(sender)) or self._late_beside(sender, ())
         return self._late[sender]
 
+    @cached_property
+    def ego_late(self) -> bool:
+        """Whether the ego's own message is late: by vehicles of the largest fusion that more teammates see in one place
+        than would lie together. Then every other message seems to be wrong.
+        """
+        if not self.shown:
+            return False
+        shown = self.shown[max(self.shown, key=len)]
+        teammates = shown.everybody.supporting.copy()
+        teammates[0] = False
+        told = np.flatnonzero((teammates.sum(axis=0) >= NOT_TOGETHER) & (shown.boxes[:, 5] >= WITNESS_SCORE))
+        centres, agreed = self.heard().everybody.agreed(shown.boxes[told, :2], teammates[:, told])
+        return self._fits_late(EGO, shown, told[agreed], centres[agreed])
+
+    def seems_late(self, sender: str) -> bool:
+        """Whether a teammate's message is late, or seems to be as the ego's own is, now or not long ago."""
+        return self.late(sender) or self.known.memory.ego_is_late or self.ego_late
+
     def _without(self, sender: str) -> Hypothesis:
         without = [fused for fused in self.shown if sender not in fused]
         return max(without or self.shown, key=len, default=())
 
     def _late_beside(self, sender: str, fused: Hypothesis) -> bool:
-        memory, now = self.known.memory, self.senders
-        before = memory.shown.get(self.known.key(fused), max(memory.shown.values(), key=len, default=NOTHING))
         shown = self.shown.get(fused) or self._of_ego
-        if shown is None or not {sender, EGO} <= memory.senders.keys() & now.keys():
+        if shown is None:
             return False
         others = shown.everybody.without({sender}).supporting.any(axis=0)
-        rows = followed(shown.boxes[others & (shown.boxes[:, 5] >= WITNESS_SCORE)], self.pose)
+        told = np.flatnonzero(others & (shown.boxes[:, 5] >= WITNESS_SCORE))
+        return self._fits_late(sender, shown, told, shown.boxes[told, :2])
+
+    def _fits_late(self, sender: str, shown: Shown, told: IntArray, centres: FloatArray) -> bool:
+        """Whether a sender's message is late by some boxes (n,) of a fusion, of vehicles centred there (n, 2)."""
+        memory, now = self.known.memory, self.senders
+        if self._testimony is None or not {sender, EGO} <= memory.senders.keys() & now.keys():
+            return False
+        largest = max(memory.shown.values(), key=len, default=NOTHING)
+        before = memory.shown.get(self.known.key(shown.teammates), largest)
         since = {name: np.subtract(now[name], memory.senders[name]) for name in (sender, EGO)}
-        moved = motions(rows, before)
-        known = ~np.isnan(moved[:, 0])
-        centres = np.concatenate([rows[known, :2], [now[EGO]]]) - now[EGO]
-        moved = np.concatenate([moved[known], [since[EGO]]])  # the ego is a vehicle, too
-        turn = self.pose[:2, :2]
-        return late(self.heard().everybody, sender, since[sender] @ turn, centres @ turn, moved @ turn)
+        moved = motions(followed(shown.boxes[told], self.pose), before)
+        known, turn = ~np.isnan(moved[:, 0]), self.pose[:2, :2]
+        centres, moved = centres[known], moved[known] @ turn
+        if sender != EGO:  # the ego is a vehicle, too
+            centres, moved = np.vstack([centres, np.zeros(2)]), np.vstack([moved, since[EGO] @ turn])
+        return late(self._testimony, sender, since[sender] @ turn, centres, moved)
 
     def note(self, joined: Hypothesis, without: Hypothesis, lies: Sequence[Lie]) -> None:
         """Note for whoever looks on what is wrong in a fusion by the fault of those whom the other one does without."""

@@ -63,6 +63,10 @@ def _boxes(kept: Any) -> FloatArray:
     return (decimals.from_text(kept) if isinstance(kept, str) else np.asarray(kept, dtype=np.float64)).reshape(-1, 4)
 
 
+LATE_FRAMES = 5
+"""An ego that was late is late for so many frames: a scanner's delay stays, and not every frame shows it."""
+
+
 @dataclass
 class Memory:
     """Mutable while a frame is judged."""
@@ -83,6 +87,8 @@ class Memory:
     """That frame's number, as its outcomes gave it."""
     senders: dict[str, tuple[float, float]] = field(default_factory=dict)
     """Where in the world each sender was in that frame: x, y, metres; see `lateness.senders`."""
+    ego_late: int | None = None
+    """The latest frame in which the ego's own message was late."""
     lies: Lies = field(default_factory=Lies)
     """About objects."""
     straying: Straying = field(default_factory=Straying)
@@ -90,6 +96,11 @@ class Memory:
     vigilance: Vigilance = field(default_factory=Vigilance)
     steadiness: Steadiness = field(default_factory=Steadiness)
     strangeness: Strangeness = field(default_factory=Strangeness)
+
+    @property
+    def ego_is_late(self) -> bool:
+        """Whether the ego's own message was late not long ago."""
+        return self.ego_late is not None and self.frame - self.ego_late <= LATE_FRAMES
 
     def weights(self, tests: KeyArray, rho: float) -> FloatArray:
         """Expected weights of tests (n,): ``1 - rho ** k`` if a test was made k frames ago already, else 1."""
@@ -158,6 +169,7 @@ class Memory:
             "shown": {f"{key:016x}": decimals.as_text(boxes.ravel(), 6) for key, boxes in self.shown.items()},
             "shown_in": self.shown_in,
             "senders": {name: list(place) for name, place in self.senders.items()},
+            "ego_late": self.ego_late,
             "lies": self.lies.to_state(),
             "straying": self.straying.to_state(),
             "placing": self.placing.to_state(),
@@ -178,6 +190,7 @@ class Memory:
             shown={int(key, 16): _boxes(kept) for key, kept in state.get("shown", {}).items()},
             shown_in=int(state.get("shown_in", 0)),
             senders={name: (float(x), float(y)) for name, (x, y) in state.get("senders", {}).items()},
+            ego_late=state.get("ego_late"),
             lies=Lies.from_state(state["lies"]) if "lies" in state else Lies(),
             straying=Straying.from_state(state.get("straying", {})),
             placing=Placing.from_state(state.get("placing", {})),

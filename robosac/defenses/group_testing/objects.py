@@ -17,7 +17,7 @@ from weakref import WeakKeyDictionary
 import numpy as np
 
 from robosac.boxes import BoolArray, FloatArray, IntArray, pairwise_iou
-from robosac.defenses.group_testing.claims import DENIES, SUPPORTS, Claims, two_witnesses, vouched
+from robosac.defenses.group_testing.claims import DENIES, NOT_TOGETHER, SUPPORTS, Claims, two_witnesses, vouched
 from robosac.defenses.group_testing.hearing import REACH_M, Hearing
 from robosac.defenses.protocol import Hypothesis
 from robosac.testimony import Sighting
@@ -36,6 +36,8 @@ AWAY = 2.5
 """A box is out of place if it is so many times farther from where witnesses see the vehicle than they may err."""
 IN_PLACE = 1.5
 """A box is in its place if it is at most so many times farther from where witnesses see it than they may err."""
+ELSEWHERE = 2.0
+"""A witness sees the vehicle of a box elsewhere if that is so many times farther away than the witness may err."""
 SLACK_ALONG_M = 0.25
 SLACK_ACROSS_M = 0.2
 """Added to what a witness says it may err: senders are not quite where they say, nor are boxes where all is honest."""
@@ -150,6 +152,18 @@ class Shown:
         away = self._farther_away[:, index].tolist()  # not a number where nothing is seen
         said = zip(self.claims.witnesses, away, strict=True)
         return tuple(name for name, far in said if far > IN_PLACE and name not in suspects)
+
+    @cached_property
+    def seen_elsewhere(self) -> BoolArray:
+        """Who (witnesses, n), of at least two that see the vehicle of a box, sees it elsewhere; nobody where the ego
+        sees it in the box's place, or more teammates do than would lie together.
+        """
+        away = self._farther_away
+        placed = away <= IN_PLACE  # what is not a number is neither
+        settled = placed[0] | (np.add.reduce(placed[1:], axis=0, dtype=np.int16) >= NOT_TOGETHER)
+        several = np.add.reduce(self.claims.supporting, axis=0, dtype=np.int16) >= 2
+        elsewhere: BoolArray = (away >= ELSEWHERE) & several & ~settled
+        return elsewhere
 
     def in_place(self, joining: Collection[str]) -> BoolArray:
         """Which boxes (n,) stand where those who are not among the joining see a vehicle, by their lower median."""

@@ -40,7 +40,8 @@ def judge(answer: Shown, decoded: Sequence[Shown], reshaped: Sequence[tuple[int,
     4. Any other box is ``confirmed`` by the ego, if all but the teammate who supports it most support it together
        (`Claims.beside`), and ``disputed`` if they do not. Where the ego does not support it, it is ``disputed`` if
        somebody denies it, or all others together lean against it (`Claims.rest`); ``confirmed`` by two teammates, of
-       whom the second may nearly support it if they all do together; or ``single_witness``.
+       whom the second may nearly support it if they all do together; or ``single_witness``. Whoever sees its vehicle
+       elsewhere (`Shown.seen_elsewhere`) denies it, too.
 
     Parameters
     ----------
@@ -106,13 +107,18 @@ def _judged(shown: Shown, which: IntArray, status: Standing | None = None) -> li
     claims, found = shown.claims, list[JudgedBox]()
     if not len(which):
         return found
-    said, supporting = claims.likelihood[:, which], claims.supporting[:, which]
+    said, supporting, elsewhere = (
+        claims.likelihood[:, which],
+        claims.supporting[:, which],
+        shown.seen_elsewhere[:, which],
+    )
     ego, backed = supporting[0], claims.beside[which] >= SUPPORTS
     leaning = np.where(ego, ~backed, claims.rest[which] <= LEANS)
     denying = said <= np.where(leaning, np.maximum(LEANS, said.min(axis=0, initial=np.inf)), DENIES)
     second = backed & supporting.any(axis=0) & ((said >= NEARLY_SUPPORTS).sum(axis=0) >= 2)
     several = (supporting.sum(axis=0) >= 2) | second
-    known = np.where(ego, backed, several & ~denying.any(axis=0)).tolist()
+    known = (np.where(ego, backed, several & ~denying.any(axis=0)) & ~elsewhere.any(axis=0)).tolist()
+    supporting, denying = supporting & ~elsewhere, denying | elsewhere
 
     @cache  # most boxes have the same few witnesses
     def named(speaking: bytes) -> Hypothesis:

@@ -199,3 +199,71 @@ def test_boxes_that_nobody_else_supports_or_that_are_faint_tell_nothing(said_by,
         told = {"testimony": saying({**dict.fromkeys(TEAM, ()), **words}), "alone": boxes[:0]}
         found.learn(Outcome(REST, 0.9, Verdict.CONSENSUS, boxes, boxes[:0], POSE, 1, **told))
     assert found.late(LIAR) == is_late
+
+
+def ego_found(ego_delay=1, seeing=("car-2", "car-3", "rsu"), aside=0.0, unheard=()):
+    """Findings of a frame of whom all, or some, see all vehicles, the last of them aside, and the ego where they were."""
+    memory = Memory(senders=dict.fromkeys((EGO, *TEAM), (0.0, 0.0)))
+    known = Knowledge(MODEL, Posterior(len(MODEL.kinds), 0.5, 0.25, TEAM), memory)
+    memory.shown = {known.key(tuple(TEAM)): followed(cars(PLACES - SPEED), np.eye(4))}
+    says = {EGO: shown_at(PLACES - ego_delay * SPEED)}
+    says |= {name: [(*place, YES) for place in PLACES] for name in seeing}
+    found = Findings(known, Lies(), TEAM, unheard)
+    heard = saying({**dict.fromkeys((EGO, *TEAM), ()), **says}, seen={seeing[-1]: PLACES + [0.0, aside]})
+    told = {"testimony": heard, "alone": cars(PLACES - ego_delay * SPEED)}
+    found.learn(Outcome(tuple(TEAM), 0.9, Verdict.CONSENSUS, cars(PLACES), told["alone"], np.eye(4), 1, **told))
+    return found
+
+
+@pytest.mark.parametrize(("delay", "late_by_it"), [(0, False), (1, True), (2, True), (5, False), (-1, False)])
+def test_the_ego_is_late_if_three_teammates_see_all_vehicles_farther_on(delay, late_by_it):
+    assert ego_found(delay).ego_late == late_by_it
+
+
+def test_two_teammates_and_those_who_differ_do_not_make_the_ego_late():
+    assert not ego_found(seeing=("car-2", "car-3")).ego_late
+    assert ego_found(aside=0.8).ego_late
+    assert not ego_found(aside=1.0).ego_late
+    assert ego_found(unheard=("car-2",)).ego_late
+    assert not Findings(ego_found().known, Lies(), TEAM, ()).ego_late
+
+
+def deny(frames, ego_delay):
+    """Decisions in traffic that one teammate denies, where the ego's message is so many frames old."""
+    state, rng, found = DEFENSE.initial_state(TEAM), np.random.default_rng(0), []
+    for frame in range(frames):
+        true = PLACES + frame * SPEED
+        own = shown_at(true - min(ego_delay, frame) * SPEED, true)
+        says = dict.fromkeys(TEAM, [(*place, YES) for place in true]) | {LIAR: [(*place, NO) for place in true]}
+        heard = saying({EGO: own, **says})
+
+        def judge(subset, _, number, true=true, heard=heard):
+            told = {"testimony": heard, "alone": cars(true)}
+            return Outcome(subset, 0.93, Verdict.CONSENSUS, cars(true), cars(true), np.eye(4), number, **told)
+
+        decision, _ = run_frame(DEFENSE, state, TEAM, [], rng, judge=judge)
+        state = json.loads(json.dumps(decision.state))
+        found.append(decision)
+    return found
+
+
+@pytest.mark.parametrize(("delay", "names", "since"), [(0, {LIAR}, None), (1, set(), 7), (2, set(), 7)])
+def test_beside_a_late_ego_nobody_is_named(delay, names, since):
+    found = deny(8, delay)
+    assert {name for decision in found for name in decision.named} == names
+    assert found[-1].state["memory"]["ego_late"] == since
+    assert all(EGO in judged.support.witnesses for judged in found[0].objects)
+    heard = [EGO in (*judged.support.witnesses, *judged.support.deniers) for judged in found[-1].objects]
+    assert any(heard) == (delay == 0)
+
+
+def test_an_ego_that_was_late_is_heard_again_in_time():
+    state = deny(4, 1)[-1].state
+    silent = []
+    for _ in range(9):
+        memory = Memory.from_state(state["memory"])
+        silent.append(memory.ego_is_late)
+        state["memory"]["frame"] += 1
+    assert silent == [True] * 5 + [False] * 4
+    del state["memory"]["ego_late"]  # as in the states of older versions
+    assert not Memory.from_state(state["memory"]).ego_is_late

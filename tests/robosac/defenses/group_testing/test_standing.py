@@ -123,6 +123,31 @@ def test_a_box_stands_on_what_is_said_of_it(said, status):
     assert all(set(each.witnesses) == {EGO, *TEAM} for each in everywhere)
 
 
+@pytest.mark.parametrize(
+    ("seen", "status", "against"),
+    [
+        ({"car-2": 0.0, "car-3": 0.0, "rsu": 1.2}, Standing.DISPUTED, {"rsu"}),
+        ({"car-2": 0.0, "car-3": 0.0, "rsu": 0.7}, Standing.CONFIRMED, set()),  # it may err so much
+        ({EGO: 1.2, "car-2": 0.0, "car-3": 0.0}, Standing.DISPUTED, {EGO}),
+        ({EGO: 1.2, "rsu": 1.2, "car-2": 0.0, "car-3": 0.0}, Standing.DISPUTED, {EGO, "rsu"}),
+        ({EGO: 0.0, "rsu": 1.2}, Standing.CONFIRMED, set()),  # the ego sees for itself
+        ({EGO: 1.2, "rsu": 1.2, "car-2": 0.0, "car-3": 0.0, "car-4": 0.0}, Standing.CONFIRMED, set()),  # not three
+        ({"rsu": 1.2}, Standing.SINGLE_WITNESS, set()),  # there is no second word
+    ],
+)
+def test_a_box_whose_vehicle_a_witness_sees_elsewhere_is_disputed(seen, status, against):
+    """By so many metres aside of the box; two that vouch for it may have moved it together."""
+    speaking = {name: [(*PLACE, YES)] for name in seen}
+    centres = {name: [PLACE + (0.0, aside)] for name, aside in seen.items()}
+    testimony = saying({name: speaking.get(name, []) for name in (EGO, *TEAM)}, seen=centres)
+    answer = Shown(tuple(TEAM), CAR, Hearing(testimony, ()))
+    ((judged,), contradicted) = judge(answer, [answer])
+    assert contradicted == ()
+    assert judged.support.status is status
+    assert set(judged.support.deniers) == against
+    assert set(judged.support.witnesses) == set(seen) - against
+
+
 def test_a_sure_box_that_nobody_speaks_of_is_left_out_and_accuses_nobody_yet():
     defense = GroupTesting(MODEL, GroupTestingSettings(inspections=0))
     decision, tested = World({LIAR: -0.5}, lambda _: SURE).play(1, defense)[0]
