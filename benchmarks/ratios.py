@@ -19,7 +19,9 @@ from speed.turns import Part
 
 from clients.machine import machine
 from robosac.cli import outputs
+from robosac.detectors import load
 from robosac.files import write_text
+from service.runtime import keep_what_is_loaded, tune_process
 
 PARTS: dict[str, Callable[[int], list[Part]]] = {
     "once": lambda turns: [once.part(turns)],
@@ -52,7 +54,10 @@ def main(
         raise typer.BadParameter(f"{', '.join(unknown)}: not one of {', '.join(PARTS)}", param_hint="--only")
     if out is not None:
         outputs.check_file(out, "--out", force)
+    tune_process()  # as a gateway does: else each frame's maps are faulted in anew
     torch.set_num_threads(1)
+    load()
+    keep_what_is_loaded()
     console = Console(stderr=True)
     sections = []
     for name in only or PARTS:
