@@ -9,7 +9,12 @@ from robosac.audit.events import FrameAnswered
 
 
 def contradictions(
-    answer: FrameAnswered, *, ego_id: str | None, threshold: float | None, trusted: Collection[str] | None
+    answer: FrameAnswered,
+    *,
+    ego_id: str | None,
+    threshold: float | None,
+    trusted: Collection[str] | None,
+    team: Collection[str] | None,
 ) -> Iterator[str]:
     """Everything that cannot be true together in a record. What needs an argument that is None is not checked.
 
@@ -21,10 +26,14 @@ def contradictions(
         Jaccard index from which on a hypothesis is in consensus.
     trusted : collection of str or None
         The trust list before the frame.
+    team : collection of str or None
+        The teammates enrolled in the frame.
     """
     yield from _of_answer(answer, trusted)
     yield from _of_hypotheses(answer, threshold)
-    yield from _of_team(answer, ego_id)
+    yield from _of_messages(answer, ego_id)
+    if team is not None:
+        yield from _of_team(answer, set(team))
 
 
 def _of_answer(answer: FrameAnswered, trusted: Collection[str] | None) -> Iterator[str]:
@@ -65,7 +74,7 @@ def _of_hypotheses(answer: FrameAnswered, threshold: float | None) -> Iterator[s
             yield f"hypothesis {i} is in {outcome.verdict} at {outcome.jaccard_index:g}; the threshold is {threshold:g}"
 
 
-def _of_team(answer: FrameAnswered, ego_id: str | None) -> Iterator[str]:
+def _of_messages(answer: FrameAnswered, ego_id: str | None) -> Iterator[str]:
     accepted, rejected = set(answer.accepted), set(answer.rejected)
     if accepted & rejected:
         yield f"{_listed(accepted & rejected)} both accepted and rejected"
@@ -85,6 +94,15 @@ def _of_team(answer: FrameAnswered, ego_id: str | None) -> Iterator[str]:
     ignored = set(answer.messages) - accepted - rejected - {ego_id}
     if ignored:
         yield f"{_listed(ignored)} neither accepted nor rejected"
+
+
+def _of_team(answer: FrameAnswered, team: set[str]) -> Iterator[str]:
+    strangers = set(answer.accepted).union(*(o.teammates for o in answer.hypotheses)) - team
+    if strangers:
+        yield f"{_listed(strangers)} fused without being enrolled"
+    unmentioned = team - set(answer.accepted) - set(answer.rejected) - set(answer.messages)
+    if unmentioned:
+        yield f"{_listed(unmentioned)} enrolled, but neither accepted nor rejected"
 
 
 def _listed(names: Collection[str]) -> str:

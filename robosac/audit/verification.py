@@ -73,6 +73,7 @@ class _History:
     commitment: str | None = None
     frame: int | None = None
     trusted: tuple[str, ...] | None = None
+    team: tuple[str, ...] | None = None
     keys: dict[str, str] = field(default_factory=dict)
     doubtful: set[str] = field(default_factory=set)
     format: int = FORMAT
@@ -80,7 +81,7 @@ class _History:
 
     def doubt(self) -> None:
         """Forget all that a missing or changed record may have changed."""
-        self.commitment = self.frame = self.trusted = self.latest = None
+        self.commitment = self.frame = self.trusted = self.team = self.latest = None
         self.doubtful = set(self.keys)
 
 
@@ -204,7 +205,7 @@ class _Verification:
                 self._open(opened)
             case TeamChanged() as change:
                 self._enrol(change.public_keys)
-                self._history.trusted = trusted_in(change.state)
+                self._history.trusted, self._history.team = trusted_in(change.state), change.teammates
             case FrameAnswered() as answer:
                 self._check_answer(answer)
             case Equivocation() as lie:
@@ -219,6 +220,7 @@ class _Verification:
             threshold=threshold if isinstance(threshold, int | float) else None,
             commitment=opened.next_seed_commitment,
             trusted=trusted_in(opened.state),
+            team=opened.teammates,
             format=opened.format,
         )
         self._enrol(opened.public_keys)
@@ -239,7 +241,10 @@ class _Verification:
             self._find(Fault.WRONG_SEED, f"frame {answer.frame} was not drawn from the seed committed to before")
         if known.frame is not None and answer.frame <= known.frame:
             self._find(Fault.FRAME_ORDER, f"frame {answer.frame} after frame {known.frame}")
-        for detail in contradictions(answer, ego_id=known.ego_id, threshold=known.threshold, trusted=known.trusted):
+        told = contradictions(
+            answer, ego_id=known.ego_id, threshold=known.threshold, trusted=known.trusted, team=known.team
+        )
+        for detail in told:
             self._find(Fault.CONTRADICTION, f"frame {answer.frame}: {detail}")
         for name, proof in answer.messages.items():
             self._check_signature(name, answer.frame, proof)

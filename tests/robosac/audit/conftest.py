@@ -47,10 +47,13 @@ def proof(name: str, frame: int, what: str = "") -> Proof:
     return Proof(digest=content, signature=sign(KEY, SESSION, name, frame, content) if name == "rsu" else None)
 
 
-def answered(frame: int, seed: str, *outcomes: Outcome, trusted: tuple[str, ...] = (), source=Source.CONSENSUS):
+def answered(
+    frame: int, seed: str, *outcomes: Outcome, trusted: tuple[str, ...] = (), source=Source.CONSENSUS, missing=()
+):
     accepted = outcomes[-1].teammates if source is Source.CONSENSUS else trusted
     why = Rejection(Reason.DISSENSUS, {"hypotheses": [0], "lowest_jaccard_index": 0.125})
     rejected = {"car-2": why if outcomes else Rejection(Reason.DISTRUSTED, distrust=Distrust.UNTRUSTED)}
+    rejected |= {name: Rejection(Reason.MISSING) for name in missing}
     state = {"trusted": list(trusted), "frames_since_check": 0}
     boxes = np.array([[1.5, 2.0, 4.0, 2.0, 0.25, 0.75]])
     result = FusionResult(
@@ -116,7 +119,7 @@ def events(detector) -> list[dict[str, Any]]:
         refusal.as_json(),
         Equivocation(vehicle_id="rsu", frame=1, first=first, second=proof("rsu", 1, ", otherwise")).as_json(),
         change.as_json(),
-        answered(5, f"{2:064x}", against, found, trusted=("rsu", "car-3")),
+        answered(5, f"{2:064x}", against, found, trusted=("rsu", "car-3"), missing=("car-4",)),
         SessionEnded(why="closed").as_json(),
     ]
 

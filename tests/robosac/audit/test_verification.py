@@ -168,6 +168,7 @@ HYPOTHESIS = {"teammates": ["rsu", "car-3"], "jaccard_index": 0.75, "verdict": "
             "car-2 rejected for a dissensus, but in no",
         ),
         (6, {"rejected": []}, "car-2 neither accepted nor rejected"),
+        (6, {"rejected": []}, "car-4 enrolled, but neither accepted nor rejected"),
     ],
 )
 def test_decisions_that_contradict_themselves_are_told(events, index, fields, complaint):
@@ -183,9 +184,25 @@ def test_fusing_without_a_message_is_told(events):
     assert "no message of the ego, car-1" in details
 
 
+def test_fusing_somebody_who_is_not_enrolled_is_told(events):
+    found = [(finding.line, finding.detail) for finding in verify(change(events, 0, teammates=["car-2", "rsu"]))]
+    assert found == [
+        (2, "frame 0: car-3 fused without being enrolled"),
+        (3, "frame 1: car-3 fused without being enrolled"),
+    ]
+
+
+def test_whom_a_lost_record_may_have_enrolled_is_not_asked_about(events):
+    without = events[5] | {"teammates": ["car-2", "rsu", "car-3", "car-4", "car-9"]}
+    lines = seal_all([*events[:5], without, *events[6:]])
+    assert [f.fault for f in verify([*lines[:5], *lines[6:]])] == [Fault.WRONG_SEQ, Fault.BROKEN_LINK]
+
+
 def test_what_a_team_change_says_of_the_trusted_counts(events):
     signed = {name: proof(name, 6).as_json() for name in events[2]["messages"]}
-    forgotten = [*events[:6], {**events[2], "seed": events[6]["seed"], "frame": 6, "messages": signed}]
+    rejected = [*events[2]["rejected"], {"vehicle_id": "car-4", "reason": "missing"}]
+    again = {"seed": events[6]["seed"], "frame": 6, "messages": signed, "rejected": rejected}
+    forgotten = [*events[:6], {**events[2], **again}]
     assert [finding.detail.split(": ")[1] for finding in verify(seal_all(forgotten))] == [
         "car-3 accepted as trusted, but not on the trust list before",
         "car-3 on the trust list without a consensus",
