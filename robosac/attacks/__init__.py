@@ -17,6 +17,7 @@ from robosac.attacks.hearing import Hearing, NoWitness
 from robosac.attacks.noise import GaussianNoise
 from robosac.attacks.objects import OnObjects
 from robosac.attacks.replays import Copy, Elsewhere, Frozen, Replay, Stale
+from robosac.attacks.returned import AttackError
 from robosac.attacks.situation import Foreign, Lie, Past, Situation
 from robosac.attacks.still import EraseStill, InventStill, ShiftStill
 from robosac.attacks.vehicles import Dim, Displace, GhostBeside, Jump, OnVehicles, Remove, RemoveMany, Stretch, Turn
@@ -81,6 +82,7 @@ __all__ = [
     "HONEST",
     "PGD",
     "Attack",
+    "AttackError",
     "Campaign",
     "CarliniWagner",
     "Copy",

@@ -17,6 +17,7 @@ import numpy as np
 import torch
 from torch.nn import functional
 
+from robosac.attacks.returned import check_aim
 from robosac.attacks.situation import Situation
 from robosac.detectors.base import AttackSurface
 
@@ -47,7 +48,8 @@ class Attack(ABC):
     Raises
     ------
     ValueError
-        If a parameter that is a number is none, not positive or infinite, or one that counts is not whole.
+        If a parameter that is a number is none, not positive or infinite, or one that counts is not whole; or if
+        ``needs`` is a text in the place of a tuple.
     """
 
     name: ClassVar[str]
@@ -64,6 +66,8 @@ class Attack(ABC):
     """L-infinity bound on the perturbation, in units of the message."""
 
     def __post_init__(self) -> None:
+        if isinstance(self.needs, str):
+            raise ValueError(f"needs must be a tuple of names, such as ({self.needs!r},), not a text")
         for parameter in fields(self):
             name, value = parameter.name, getattr(self, parameter.name)
             kind = getattr(parameter.type, "__name__", parameter.type)  # a text where annotations are not evaluated
@@ -184,7 +188,9 @@ class IterativeAttack(Attack):
         for _ in range(self.steps):
             delta = {name: self.perturbation(v) for name, v in variables.items()}
             attacked = {name: clean[name] + d for name, d in delta.items()}
-            gradients = torch.autograd.grad(aim(attacked, delta), list(variables.values()))
+            value = aim(attacked, delta)
+            check_aim(getattr(self, "name", type(self).__name__), value)
+            gradients = torch.autograd.grad(value, list(variables.values()))
             with torch.no_grad():
                 for variable, gradient in zip(variables.values(), gradients, strict=True):
                     variable.grad = self.normalise(gradient)

@@ -19,6 +19,7 @@ from robosac.attacks.alibi import Alibi, covering, framing, keeping
 from robosac.attacks.base import Attack, IterativeAttack, Tensors, Term
 from robosac.attacks.geometric import SHOWN
 from robosac.attacks.hearing import Hearing
+from robosac.attacks.returned import check_returned
 from robosac.attacks.situation import Past, Situation
 from robosac.boxes import FloatArray, pose_matrix
 from robosac.detectors.base import AttackSurface, Detector, Encoder, GeometricSurface, Message, Preparer, blank
@@ -177,6 +178,8 @@ class Campaign:
         ------
         KeyError
             If an attacker has no message in the frame.
+        AttackError
+            If the attack returns what is no message of an attacker.
         NoGeometry
             If the attack or its alibi needs boxes that the detector does not show.
         NoWitness
@@ -201,6 +204,7 @@ class Campaign:
         if self.hears:
             known = replace(known, hearing=Hearing.of(detector.info, ego, surface.messages, known.poses))
         tensors = self._attacked(surface, acting, rng, known)
+        check_returned(self.name, tensors, surface, acting)
         attacking = {name: detector.perturbed(sent[name], tensor) for name, tensor in tensors.items()}
         return {**sent, **attacking} if self.pose is not None else attacking
 

@@ -13,8 +13,8 @@ import typer
 from rich.console import Console
 
 from robosac import defenses
-from robosac.attacks import lacking, load_campaign
-from robosac.cli.blame import blaming, check_known, listed
+from robosac.attacks import AttackError, lacking, load_campaign
+from robosac.cli.blame import blaming, check_known, failing, listed
 from robosac.cli.options import (
     WORLD_HELP,
     DataName,
@@ -109,7 +109,7 @@ def run(  # the options of a command line
     what = (chosen, columns, extent, seed, recordings, pose_error, live)
     plans = {name: Plan(*what, source) for name, source in sources.items()}
     started = time.monotonic()
-    with blaming("--world" if world else "--data", SceneError), progress(console) as bar:
+    with failing(AttackError), blaming("--world" if world else "--data", SceneError), progress(console) as bar:
         task = bar.add_task("frames", total=len(plans) * len(extent.settings) * extent.scenes * extent.frames)
         found = compare_plans(list(plans.values()), jobs, lambda: bar.advance(task))
     path = _write(dict(zip(plans, found, strict=True)), plans, out, command(context))

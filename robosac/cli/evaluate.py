@@ -14,8 +14,8 @@ from rich.console import Console
 from rich.table import Table
 
 from robosac import attacks
-from robosac.attacks import CAMPAIGN_HELP
-from robosac.cli.blame import blaming
+from robosac.attacks import CAMPAIGN_HELP, AttackError
+from robosac.cli.blame import blaming, failing
 from robosac.cli.options import DataName, DetectorName, Seed, check_attack, load_data, load_detector, progress
 from robosac.cli.outputs import Force, make_folder
 from robosac.detectors import DEFAULT_DETECTOR
@@ -50,7 +50,7 @@ def run(  # the options of a command line
     chosen, source = load_detector(detector), load_data(data)
     check_attack(chosen_attack, chosen)
     rng = np.random.default_rng([seed, 0])
-    with blaming("--data", SceneError, NoFrames), progress(console) as bar:
+    with failing(AttackError), blaming("--data", SceneError, NoFrames), progress(console) as bar:
         some = source.scenes("test")[: scenes or DEFAULT_SCENES]
         if len(some) < (scenes or 1):
             raise SceneError(f"{source.name} has {len(some)} test scenes")

@@ -10,7 +10,7 @@ import typer
 from rich.console import Console
 
 from robosac import attacks, defenses
-from robosac.attacks import CAMPAIGN_HELP, HONEST, Campaign
+from robosac.attacks import CAMPAIGN_HELP, HONEST, AttackError, Campaign
 from robosac.budget import DomainError
 from robosac.calibrated import calibration_of
 from robosac.cli.blame import blaming, failing
@@ -175,7 +175,7 @@ def _chosen(  # the options of a command line
 
 def _played(sequence: Scenario, settings: DefenseSettings) -> list[Moment]:
     """The frames, answered."""
-    with blaming("--data", SceneError), progress(Console(stderr=True)) as bar:
+    with failing(AttackError), blaming("--data", SceneError), progress(Console(stderr=True)) as bar:
         task = bar.add_task("frames", total=sequence.frames)
         met = sequence.met(lambda: bar.advance(task))
     with failing(FaultyDefense, DomainError):

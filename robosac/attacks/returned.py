@@ -1,0 +1,66 @@
+"""What an attack returns, looked at before it is sent: attacks of one's own return anything."""
+
+from __future__ import annotations
+
+from collections.abc import Collection, Mapping
+
+import torch
+
+from robosac.detectors.base import AttackSurface
+
+
+class AttackError(ValueError):
+    """What an attack made is not what it has to be."""
+
+
+def check_returned(name: str, sent: object, surface: AttackSurface, acting: Collection[str]) -> None:
+    """Refuse what is no mapping of attackers to finite tensors of the shapes of their benign messages.
+
+    Parameters
+    ----------
+    name : str
+        The attack's.
+    sent : object
+        What its ``run`` returned.
+    surface : AttackSurface
+        What it was given.
+    acting : collection of str
+        The attackers that it was given.
+
+    Raises
+    ------
+    AttackError
+        That says which part is wrong.
+    """
+    if not isinstance(sent, Mapping):
+        raise AttackError(f"{name}: run must return a mapping of attackers to tensors, got a {type(sent).__name__}")
+    for vehicle, tensor in sent.items():
+        if vehicle not in acting:
+            attackers = ", ".join(acting)
+            raise AttackError(f"{name}: run returned a message of {vehicle!r}; the attackers are {attackers}")
+        part, benign = f"{name}: the message of {vehicle!r} that run returned", surface.messages[vehicle]
+        if not isinstance(tensor, torch.Tensor):
+            raise AttackError(f"{part} must be a tensor, got a {type(tensor).__name__}")
+        if tensor.shape != benign.shape:
+            raise AttackError(f"{part} must be of shape {tuple(benign.shape)}, got {tuple(tensor.shape)}")
+        if not torch.isfinite(tensor).all():
+            raise AttackError(f"{part} holds NaN or infinity")
+
+
+def check_aim(name: str, value: object) -> None:
+    """Refuse an aim that cannot be descended.
+
+    Raises
+    ------
+    AttackError
+        If it is not one number that follows from the attackers' messages.
+    """
+    if not isinstance(value, torch.Tensor):
+        got = f"a {type(value).__name__}"
+    elif value.numel() != 1:
+        got = f"a tensor of shape {tuple(value.shape)}"
+    elif not value.requires_grad:
+        got = "a number that does not depend on them"
+    else:
+        return
+    raise AttackError(f"{name}: what is minimised must be one number that follows from the messages, got {got}")

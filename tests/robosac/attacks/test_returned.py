@@ -1,0 +1,81 @@
+from dataclasses import dataclass
+
+import numpy as np
+import pytest
+import torch
+
+from robosac.attacks import Attack, AttackError, Campaign, IterativeAttack
+from robosac.attacks.returned import check_returned
+from robosac.scenes import IntersectionScene
+from tests.robosac.attacks.linear import Linear
+
+SHAPE = (3, 4)
+
+
+@pytest.mark.parametrize(
+    ("sent", "words"),
+    [
+        (None, "mine: run must return a mapping of attackers to tensors, got a NoneType"),
+        ([torch.zeros(SHAPE)], "mine: run must return a mapping of attackers to tensors, got a list"),
+        ({"d": torch.zeros(SHAPE)}, "mine: run returned a message of 'd'; the attackers are a, b"),
+        ({"c": torch.zeros(SHAPE)}, "mine: run returned a message of 'c'; the attackers are a, b"),
+        ({"b": np.zeros(SHAPE)}, "mine: the message of 'b' that run returned must be a tensor, got a ndarray"),
+        ({"b": torch.zeros(1, 4)}, r"the message of 'b' .* must be of shape \(3, 4\), got \(1, 4\)"),
+        ({"b": torch.full(SHAPE, torch.nan)}, "the message of 'b' that run returned holds NaN or infinity"),
+    ],
+)
+def test_what_is_no_message_of_an_attacker_is_refused(sent, words):
+    with pytest.raises(AttackError, match=words):
+        check_returned("mine", sent, Linear(), ["a", "b"])
+
+
+def test_messages_of_some_attackers_will_do():
+    for sent in ({}, {"a": torch.zeros(SHAPE)}, {"b": torch.zeros(SHAPE, dtype=torch.float64)}):
+        check_returned("mine", sent, Linear(), ["a", "b"])
+
+
+@pytest.mark.parametrize(
+    ("value", "words"),
+    [
+        (lambda logits: None, "got a NoneType"),
+        (lambda logits: 1.0, "got a float"),
+        (lambda logits: logits, r"got a tensor of shape \(3, 4\)"),
+        (lambda logits: torch.tensor(1.0), "got a number that does not depend on them"),
+    ],
+)
+def test_an_aim_that_cannot_be_descended_is_told(value, words):
+    @dataclass(frozen=True)
+    class Mine(IterativeAttack):
+        name = "mine"
+
+        def objective(self, known, logits, delta):
+            return value(logits)
+
+    with pytest.raises(AttackError, match=f"^mine: what is minimised must be one number .* {words}$"):
+        Mine().run(Linear(), ["a"], np.random.default_rng(0))
+
+
+class Nothing(Attack):
+    """Forgets to return anything."""
+
+    name = "nothing"
+
+    def run(self, surface, attackers, rng, situation=None):
+        """Nothing is returned."""
+
+
+def test_a_campaign_looks_at_what_its_attack_returns(detector):
+    messages = {
+        name: detector.encode(view.points, view.pose) for name, view in IntersectionScene(seed=8).frame(0).views.items()
+    }
+    ego = messages.pop("car-1")
+    with pytest.raises(AttackError, match="nothing: run must return a mapping"):
+        Campaign(Nothing()).messages(detector, ego, messages, ["rsu"], 0, np.random.default_rng(0))
+
+
+def test_needs_are_a_tuple_of_names():
+    class Needs(Nothing):
+        needs = "class_logits"
+
+    with pytest.raises(ValueError, match=r"needs must be a tuple of names, such as \('class_logits',\)"):
+        Needs()
