@@ -7,7 +7,7 @@ detector decodes them, the consensus test judges, and the defence learns, until 
 from __future__ import annotations
 
 import logging
-from collections.abc import Collection, Iterable, Iterator, Mapping, Sequence
+from collections.abc import Collection, Generator, Iterable, Iterator, Mapping, Sequence
 from contextlib import contextmanager
 from dataclasses import dataclass, field, fields
 from functools import partial
@@ -215,14 +215,32 @@ class FrameRun:
 
     def _converse(self, passes: Passes, team: list[str], state: State, rng: np.random.Generator) -> Steps[Decision]:
         conversation = self.defense.converse(team, state, rng)
+        if not isinstance(conversation, Generator):
+            raise TypeError(f"{self.defense.kind}: converse must be a generator, which yields hypotheses")
         try:
             batch = next(conversation)
             while True:
+                self._check_asked(batch, team)
                 batch = conversation.send((yield from self._test(passes, batch)))
         except StopIteration as stop:
             decision: Decision = stop.value
+        if not isinstance(decision, Decision):
+            raise TypeError(f"{self.defense.kind}: converse must return a Decision, got a {type(decision).__name__}")
         self._check(decision, team, state)
         return decision
+
+    def _check_asked(self, batch: Sequence[Hypothesis], team: list[str]) -> None:
+        """Of defences that do not ship, look at what they ask for."""
+        if self.defense.kind in shipped():
+            return
+        if not isinstance(batch, Iterable):
+            raise TypeError(
+                f"{self.defense.kind}: converse must yield lists of hypotheses, got a {type(batch).__name__}"
+            )
+        for subset in batch:
+            if not isinstance(subset, tuple) or not set(team).issuperset(subset):
+                what = f"converse asked for {subset!r}; a hypothesis is a tuple of teammates, who are {', '.join(team)}"
+                raise ValueError(f"{self.defense.kind}: {what}")
 
     def _check(self, decision: Decision, team: list[str], state: State) -> None:
         """Nothing reaches the answer that was not verified in this frame or trusted before; nor does trust come from

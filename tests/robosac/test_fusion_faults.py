@@ -1,4 +1,5 @@
 import logging
+import re
 from dataclasses import replace
 from typing import Literal
 
@@ -121,3 +122,42 @@ def test_evidence_by_anything_but_texts_is_a_fault_of_the_frame(caplog):
         result = run(FakeDetector(), Numbering())
     assert result.source == Source.EGO_ONLY
     assert "keys that are no text" in result.fault
+
+
+class Beginner(SampleConsensus):
+    """Asks for this, and then returns that."""
+
+    kind: Literal["beginner"] = "beginner"  # type: ignore[assignment]
+
+    def __init__(self, asked, decided=None):
+        super().__init__()
+        object.__setattr__(self, "script", (asked, decided))
+
+    def converse(self, team, state, rng):
+        asked, decided = self.script
+        yield asked
+        return decided
+
+
+class Plain(Beginner):
+    """Forgets to yield."""
+
+    def converse(self, team, state, rng):
+        return Decision((), Source.EGO_ONLY, dict.fromkeys(team), None, state)
+
+
+@pytest.mark.parametrize(
+    ("defense", "words"),
+    [
+        (Plain([]), "TypeError: beginner: converse must be a generator"),
+        (Beginner(None), "TypeError: beginner: converse must yield lists of hypotheses, got a NoneType"),
+        (Beginner(["a"]), "ValueError: beginner: converse asked for 'a'; a hypothesis is a tuple of teammates"),
+        (Beginner([("a", "z")]), r"ValueError: beginner: converse asked for \('a', 'z'\); .* who are a, b, c, d, e"),
+        (Beginner([("a",)]), "TypeError: beginner: converse must return a Decision, got a NoneType"),
+    ],
+)
+def test_a_conversation_in_another_form_is_told(defense, words, caplog):
+    with caplog.at_level(logging.CRITICAL):
+        result = run(FakeDetector(), defense)
+    assert (result.source, result.accepted) == (Source.EGO_ONLY, ())
+    assert re.match(words, result.fault)
