@@ -7,9 +7,11 @@ says where it stands.
 
 from __future__ import annotations
 
+import math
 from collections.abc import Callable, Iterator, Mapping, Sequence
 from contextlib import contextmanager
 from dataclasses import dataclass
+from numbers import Integral, Real
 from typing import Any
 
 import numpy as np
@@ -72,6 +74,68 @@ class CheckedScene(SceneAround):
     source: str
     """Its source's name, for messages."""
 
+    @property
+    def agents(self) -> Sequence[str]:
+        """Those of the original.
+
+        Raises
+        ------
+        SceneError
+            If they are no ids.
+        """
+        return self._ids("agents", self.scene.agents)
+
+    @property
+    def egos(self) -> Sequence[str]:
+        """Those of the original.
+
+        Raises
+        ------
+        SceneError
+            If they are no ids of agents.
+        """
+        egos = self._ids("egos", self.scene.egos)
+        if not set(self.scene.agents).issuperset(egos):
+            raise SceneError(f"{self._where}: egos must be some of the agents, got {egos!r}")
+        return egos
+
+    @property
+    def length(self) -> int | None:
+        """That of the original.
+
+        Raises
+        ------
+        SceneError
+            If it is no number of frames.
+        """
+        length = self.scene.length
+        if length is not None and (not isinstance(length, Integral) or length < 0):
+            raise SceneError(f"{self._where}: length must be a number of frames or None, got {length!r}")
+        return length
+
+    @property
+    def frame_period_s(self) -> float:
+        """That of the original.
+
+        Raises
+        ------
+        SceneError
+            If it is no time.
+        """
+        period_s = self.scene.frame_period_s
+        if not isinstance(period_s, Real) or not 0 < period_s < math.inf:
+            raise SceneError(f"{self._where}: frame_period_s must be a positive number of seconds, got {period_s!r}")
+        return period_s
+
+    @property
+    def _where(self) -> str:
+        return f"{self.source}, scene {self.number}"
+
+    def _ids(self, part: str, ids: Sequence[str]) -> Sequence[str]:
+        if isinstance(ids, str) or not ids or not all(isinstance(each, str) for each in ids):
+            raise SceneError(f"{self._where}: {part} must be one or more ids, got {ids!r}")
+        return ids
+
     def frame(self, index: int) -> Frame:
         """A frame of the scene, its views checked.
 
@@ -80,7 +144,7 @@ class CheckedScene(SceneAround):
         SceneError
             If it cannot be had, or a view has not the form that it must have.
         """
-        where = f"{self.source}, scene {self.number}, frame {index}"
+        where = f"{self._where}, frame {index}"
         with _said(where):
             frame = self.scene.frame(index)
             for name, view in frame.views.items():
@@ -123,7 +187,8 @@ def view_fault(view: View) -> str | None:
     """
     pose, points = view.pose, view.points
     if _shape(pose) != (4, 4) or not _finite(pose).all():
-        return f"pose must be 4 x 4 finite numbers, got {_shown(pose)}"
+        got = "some that are not" if _shape(pose) == (4, 4) else _shown(pose)
+        return f"pose must be 4 x 4 finite numbers, got {got}"
     fault = pose_fault(pose)
     if fault is not None:
         return f"pose {fault}"

@@ -96,7 +96,7 @@ TILTED = pose_matrix(0.0, 0.0, 0.0, 0.0)[:, [2, 1, 0, 3]] * [-1, 1, 1, 1]
     [
         (seen(pose=np.eye(3)), "van-0: pose must be 4 x 4 finite numbers, got (3, 3)"),
         (seen(pose=[1, 2, 3]), "van-0: pose must be 4 x 4 finite numbers, got a list"),
-        (seen(pose=SOUND.pose * np.nan), "van-0: pose must be 4 x 4 finite numbers, got (4, 4)"),
+        (seen(pose=SOUND.pose * np.nan), "van-0: pose must be 4 x 4 finite numbers, got some that are not"),
         (seen(pose=SOUND.pose.T), "van-0: pose must be a rigid transform: a rotation, a translation, last row 0 0 0 1"),
         (seen(pose=np.zeros((4, 4))), "van-0: pose must be a rigid transform"),
         (seen(pose=TILTED), "van-0: pose must be upright"),
@@ -165,3 +165,28 @@ def test_what_ships_is_not_checked_and_what_does_not_is(tmp_path, monkeypatch):
     for copy in (made, pickle.loads(pickle.dumps(made))):
         assert isinstance(copy.scenes("test")[0], CheckedScene)
         assert isinstance(copy.training_scenes()[0], CheckedScene)
+
+
+@pytest.mark.parametrize(
+    ("part", "value", "words"),
+    [
+        ("agents", (), r"agents must be one or more ids, got \(\)"),
+        ("agents", "van-0", "agents must be one or more ids, got 'van-0'"),
+        ("agents", (0, 1), r"agents must be one or more ids, got \(0, 1\)"),
+        ("egos", (), r"egos must be one or more ids, got \(\)"),
+        ("egos", ("van-9",), r"egos must be some of the agents, got \('van-9',\)"),
+        ("length", "50", "length must be a number of frames or None, got '50'"),
+        ("length", -1, "length must be a number of frames or None, got -1"),
+        ("frame_period_s", 0, "frame_period_s must be a positive number of seconds, got 0"),
+        ("frame_period_s", None, "frame_period_s must be a positive number of seconds, got None"),
+        ("frame_period_s", np.nan, "frame_period_s must be a positive number of seconds, got nan"),
+    ],
+)
+def test_what_a_scene_says_of_itself_is_checked(part, value, words):
+    scene = CheckedScene(type("Odd", (Scene,), {part: value})(), "t7")
+    with pytest.raises(SceneError, match=f"^t7, scene 7: {words}$"):
+        getattr(scene, part)
+
+
+def test_a_scene_may_have_no_end():
+    assert CheckedScene(type("Endless", (Scene,), {"length": None})(), "t7").length is None
