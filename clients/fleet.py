@@ -218,7 +218,7 @@ def main(  # the options of a command line
     attacker_ratio: Annotated[float | None, typer.Option(help="Ratio the defence assumes.")] = None,
     sampling_budget: Annotated[int | None, typer.Option(help="Most hypotheses a frame.")] = None,
     collaborators: Annotated[int | None, typer.Option(help="Teammates in a hypothesis.")] = None,
-    seed: Annotated[int, typer.Option(help="Of the attackers' choice and starts.")] = 0,
+    seed: Annotated[int, typer.Option(min=0, help="Of the attackers' choice and starts.")] = 0,
     budget_ms: Annotated[
         float | None, typer.Option(min=1, max=trial.MOST_BUDGET_MS, help="Latency budget; by default the gateway's.")
     ] = None,

@@ -210,7 +210,7 @@ def main(
     force: trial.Force = False,
     url: trial.Url = None,
     egos: Annotated[int, typer.Option(min=1, help="Honest egos, each at five frames a second.")] = 2,
-    rate: Annotated[float, typer.Option(min=0.1, help="Requests of strangers a second.")] = 20.0,
+    rate: Annotated[float, typer.Option(min=0.1, max=10_000, help="Requests of strangers a second.")] = 20.0,
     seconds: trial.Seconds = 10.0,
     api_key: trial.ApiKey = None,
 ) -> None:

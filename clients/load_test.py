@@ -221,7 +221,7 @@ def main(  # the options of a command line
         list[int] | None,
         typer.Option(min=1, max=len(TEAM), help="Teammates of an ego, by default all; give it several times."),
     ] = None,
-    rate: Annotated[float, typer.Option(min=0.1, help="Open loop: frames a second of each ego.")] = 5.0,
+    rate: Annotated[float, typer.Option(min=0.1, max=10_000, help="Open loop: frames a second of each ego.")] = 5.0,
     budget_ms: trial.Budget = 200.0,
     defense: Annotated[str, typer.Option(help="Kind of the sessions' defence.")] = str(DEFENSE["kind"]),
     scene: Annotated[int, typer.Option(min=0, help="Seed of the scene whose frames are sent.")] = 3,

@@ -153,7 +153,7 @@ def main(
     force: trial.Force = False,
     url: trial.Url = None,
     egos: Annotated[int, typer.Option(min=1, help="Sessions that the frames are spread over.")] = 100,
-    factor: Annotated[float, typer.Option(min=1, help="Multiple of the capacity.")] = 10.0,
+    factor: Annotated[float, typer.Option(min=1, max=1000, help="Multiple of the capacity.")] = 10.0,
     seconds: trial.Seconds = 10.0,
     budget_ms: trial.Budget = 200.0,
 ) -> None:

@@ -32,6 +32,8 @@ T = TypeVar("T")
 
 MOST_BUDGET_MS = 60_000
 """Longer budgets no gateway grants."""
+MOST_SECONDS = 86_400
+"""Of a part: a day."""
 _KEY = re.compile(r"[A-Za-z0-9._~+/-]+=*")
 
 
@@ -64,7 +66,7 @@ ApiKey = Annotated[
     str | None,
     typer.Option(envvar=API_KEY_VARIABLE, callback=checked_key, help="Opens sessions, where the gateway asks for one."),
 ]
-Seconds = Annotated[float, typer.Option(min=0.5, help="Length of each part.")]
+Seconds = Annotated[float, typer.Option(min=0.5, max=MOST_SECONDS, help="Length of each part.")]
 Budget = Annotated[float, typer.Option(min=1, max=MOST_BUDGET_MS, help="Latency budget.")]
 Force = outputs.Force
 Out = Annotated[Path | None, typer.Option(help="Folder for the report, a JSON file.")]

@@ -19,6 +19,8 @@ from robosac.calibration.messages import add, held, measure
 from robosac.calibration.reliability import Reliability, add_worlds, check_in
 from robosac.cli.blame import blaming, failing
 from robosac.cli.options import (
+    MOST_POSE_ERROR_M,
+    POSE_ERROR_HELP,
     WORLD_HELP,
     DataName,
     DetectorName,
@@ -54,7 +56,7 @@ def run(  # the options of a command line
     ] = None,
     attackers: Annotated[list[int] | None, typer.Option(min=1, help="Attackers at a time.")] = None,
     pose_error: Annotated[
-        list[float] | None, typer.Option(min=0.0, help="Standard deviation of the teammates' positions, metres.")
+        list[float] | None, typer.Option(min=0.0, max=MOST_POSE_ERROR_M, help=POSE_ERROR_HELP)
     ] = None,
     scenes: Annotated[int, typer.Option(min=1, help="Validation scenes to fit to.")] = _DEFAULTS.scenes,
     check_scenes: Annotated[int, typer.Option(min=0, help="Further ones to check on.")] = _DEFAULTS.check_scenes,

@@ -19,6 +19,7 @@ from robosac.cli.options import (
     WORLD_HELP,
     DataName,
     DetectorName,
+    PoseError,
     Seed,
     command,
     load_data,
@@ -74,9 +75,7 @@ def run(  # the options of a command line
     recordings: Annotated[
         Path | None, typer.Option(metavar="DIR", help="Folder in which recorded frames are kept, to be used again.")
     ] = None,
-    pose_error: Annotated[
-        float, typer.Option(min=0.0, help="Standard deviation of the teammates' positions, metres.")
-    ] = 0.0,
+    pose_error: PoseError = 0.0,
     live: Annotated[bool, typer.Option(help="Record nothing: each defence decodes for itself, and is timed.")] = False,
     jobs: Annotated[int, typer.Option(min=1, help="Processes that share the sequences.")] = 1,
     seed: Seed = 0,

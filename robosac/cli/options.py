@@ -33,6 +33,9 @@ WORLD_HELP = (
     f"one of {', '.join(WORLDS)}, all of them (all), or a scene source of one's own, module:callable; may be repeated."
 )
 """What ``--world`` takes."""
+MOST_POSE_ERROR_M = 100.0
+POSE_ERROR_HELP = "Standard deviation of the teammates' positions, metres."
+PoseError = Annotated[float, typer.Option(min=0.0, max=MOST_POSE_ERROR_M, help=POSE_ERROR_HELP)]
 Seed = Annotated[int, typer.Option(min=0, help="Of everything random.")]
 
 

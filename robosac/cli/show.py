@@ -14,11 +14,20 @@ from robosac.attacks import CAMPAIGN_HELP, HONEST, AttackError, Campaign
 from robosac.budget import DomainError
 from robosac.calibrated import calibration_of
 from robosac.cli.blame import blaming, failing
-from robosac.cli.options import DataName, DetectorName, Seed, check_attack, load_data, load_detector, progress
+from robosac.cli.options import (
+    DataName,
+    DetectorName,
+    PoseError,
+    Seed,
+    check_attack,
+    load_data,
+    load_detector,
+    progress,
+)
 from robosac.cli.outputs import Force, check_file
 from robosac.defenses import DefenseSettings
 from robosac.detectors import DEFAULT_DETECTOR
-from robosac.evaluation.comparison.pictures import TableError, draw_heat_map, read_table
+from robosac.evaluation.comparison.pictures import TableError, UnknownColumn, draw_heat_map, read_table
 from robosac.evaluation.playing import FaultyDefense
 from robosac.figures import check_film, check_picture
 from robosac.pictures.film import draw_film
@@ -38,7 +47,6 @@ DefenseName = Annotated[
     typer.Option(help=f"{', '.join(defenses.shipped())}, or module:callable; by default that of a new session."),
 ]
 SceneNumber = Annotated[int, typer.Option("--scene", min=0, help="Which test scene, counted from 0.")]
-PoseError = Annotated[float, typer.Option(min=0.0, help="Standard deviation of the teammates' positions, metres.")]
 FramesOfSequence = Annotated[int, typer.Option(min=1, help="Of the sequence, from its first on.")]
 
 
@@ -134,7 +142,7 @@ def comparison(
     with blaming("--out", ValueError):
         check_picture(out)
     check_file(out, "--out", force)
-    with blaming("TABLE", OSError, TableError):
+    with blaming("TABLE", OSError, TableError), blaming("--column", UnknownColumn):
         heat = read_table(table, column)
     with blaming("--out", OSError, ValueError):
         draw_heat_map(heat, out)

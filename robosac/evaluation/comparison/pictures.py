@@ -25,6 +25,10 @@ class TableError(ValueError):
     """A file is no table of a comparison, or does not have what is asked of it."""
 
 
+class UnknownColumn(TableError):
+    """A table has no such column of numbers."""
+
+
 @dataclass(frozen=True)
 class HeatMap:
     """Figures of a comparison, to be drawn: a line for each setting, a column for each defence."""
@@ -58,7 +62,7 @@ def read_table(path: Path, column: str) -> HeatMap:
     Raises
     ------
     TableError
-        If it is no such table, or has no such column of numbers.
+        If it is no such table; `UnknownColumn` if it has no such column of numbers.
     OSError
         If it cannot be read.
     """
@@ -71,7 +75,7 @@ def read_table(path: Path, column: str) -> HeatMap:
         raise TableError(f"{path} is no table of robosac compare: it lacks one of the columns {', '.join(WHERE)}")
     if column not in lines[0] or column in WHERE:
         known = [name for name in lines[0] if name not in (*WHERE, "world")]
-        raise TableError(f"{path} has no figure {column!r}; it has {', '.join(known)}")
+        raise UnknownColumn(f"{path} has no figure {column!r}; it has {', '.join(known)}")
     name, at, first = column.partition("_from_")
     difference = f"{name}_difference{at}{first}"
     against = difference if difference in lines[0] else None

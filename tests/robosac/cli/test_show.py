@@ -54,6 +54,7 @@ def test_the_figures_of_a_comparison_are_drawn(tmp_path):
         (["suspicion", "--out", "x.png", "--data", "nonesuch"], "no scene source 'nonesuch'"),
         (["comparison", "nonesuch.csv", "--out", "x.png"], "No such file"),
         (["comparison", str(TABLE), "--column", "nonesuch", "--out", "x.png"], "no figure 'nonesuch'; it has ap50"),
+        (["comparison", str(TABLE), "--column", "nonesuch", "--out", "x.png"], "Invalid value for --column"),
     ],
 )
 def test_what_cannot_be_drawn_is_explained_before_any_work(arguments, why, tmp_path, monkeypatch):
