@@ -33,6 +33,13 @@ def now() -> str:
     return datetime.now(UTC).isoformat(timespec="milliseconds").replace("+00:00", "Z")
 
 
+def _is_time(text: str) -> bool:
+    try:
+        return datetime.fromisoformat(text).tzinfo is not None
+    except ValueError:
+        return False
+
+
 def _decoded(value: Any) -> Any:
     return base64.b64decode(value, validate=True) if isinstance(value, str) else value
 
@@ -52,6 +59,13 @@ class _Event(Typed):
     """What all events have."""
 
     time: str = Field(default_factory=now)
+
+    @field_validator("time")
+    @classmethod
+    def _check_time(cls, time: str) -> str:
+        if not time.endswith("Z") or not _is_time(time):
+            raise ValueError("must be a time in UTC, as RFC 3339 writes it")
+        return time
 
 
 def _check_state(state: dict[str, Any]) -> dict[str, Any]:

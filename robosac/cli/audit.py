@@ -46,6 +46,8 @@ def verify(
     ] = None,
 ) -> None:
     """Check that nothing in a log was changed, and that it does not contradict itself; 1 if something is wrong."""
+    if gateway_key and receipts is None:
+        raise typer.BadParameter("is for receipts, and none are given", param_hint="--receipts")
     promised = None if receipts is None else _read_receipts(receipts, gateway_key or [])
     if head is not None and re.fullmatch("[0-9a-f]{64}", head) is None:
         raise typer.BadParameter("must be 64 hexadecimal digits, lower case", param_hint="--head")
@@ -115,6 +117,9 @@ def replay_decision(
     with blaming("FILE", OSError, replay.ReplayError), file.open("rb") as lines:
         decision = replay.find(lines_in(lines), number)
     loaded = load_named(detector, decision.session.detector, "log")
+    kind = decision.session.defense.get("kind")
+    if defense is not None and kind in defenses.shipped():
+        raise typer.BadParameter(f"the log's defence is {kind}, which ships", param_hint="--defense")
     with blaming("--defense", ValueError):
         kinds = None if defense is None else defenses.known([defense])
     with blaming("--messages", replay.ReplayError):

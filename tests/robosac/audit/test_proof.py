@@ -153,4 +153,6 @@ def test_the_command_checks_receipts(events, tmp_path):
     done = CliRunner().invoke(app, [*command, "--gateway-key", PUBLIC])
     assert (done.exit_code, "broken-promise" in done.output) == (1, True)
     assert CliRunner().invoke(app, command).exit_code == 2
+    done = CliRunner().invoke(app, [*command[:3], "--gateway-key", PUBLIC])
+    assert (done.exit_code, "--receipts" in done.output) == (2, True)
     assert CliRunner().invoke(app, [*command, "--gateway-key", "A" * 43 + "="]).exit_code == 2

@@ -243,6 +243,7 @@ def test_a_log_names_no_code_to_run_and_says_nothing_to_the_terminal(got, tmp_pa
         (["replay", "log", "--messages", "body", "--frame", "7"], "no answer to frame 7"),
         (["replay", "log", "--messages", "body", "--frame", "1"], "of frame 2, not 1"),
         (["replay", "log", "--messages", "body", "--detector", "nonesuch"], "no detector 'nonesuch'"),
+        (["replay", "log", "--messages", "body", "--defense", "halving"], "the log's defence is "),
         (["report", "nonesuch", "--vehicle", "rsu"], "No such file"),
     ],
 )

@@ -253,6 +253,8 @@ def test_the_sessions_beginning_and_end_must_be_where_they_belong(events):
     ("index", "name", "value"),
     [
         (0, "ego_id", 3),
+        (0, "time", "yesterday"),
+        (1, "time", "2026-11-21T09:30:00.212"),
         (0, "public_keys", {"rsu": "AAAA"}),
         (0, "state", {"trusted": [1]}),
         (1, "seed", "xyz"),
