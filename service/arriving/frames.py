@@ -65,7 +65,7 @@ class Frames:
         frame, parts = await self._read(caller, body, read_frame)
         for name in parts.malformed:
             self.metrics.refused(parts.unusable[name].reason.value)
-        asked = Asked(caller, frame, parts.ego, arrived, parts.messages, parts.unusable)
+        asked = Asked(caller, frame, parts.ego, arrived, parts.messages, parts.unusable, whole=True)
         asked.spent("receive", arrived)
         with room.holding(_expanded_by(asked, body)):
             return await self._answer(asked, gather=False)
@@ -129,13 +129,14 @@ class Frames:
         """As `_check_ego`; a refusal goes on record."""
         await self.deciding.settled(asked)
         try:
-            await self._check_ego(asked.caller, asked.frame, asked.ego)
+            await self._check_ego(asked)
         except Unusable as error:
             await self.refuse(asked.caller, error, asked.frame)
             raise
 
-    async def _check_ego(self, caller: Caller, frame: int, ego: Received) -> None:
+    async def _check_ego(self, asked: Asked) -> None:
         """Refuse an ego's message that is not for a new frame, or from where the ego cannot be."""
+        caller, frame, ego = asked.caller, asked.frame, asked.ego
         record = await self.sessions.current(caller)
         self.sessions.store.check_room(record)  # before anything is computed that could not be kept
         if record.last_frame is not None and frame <= record.last_frame:
@@ -148,7 +149,7 @@ class Frames:
         self._check_jump(frame, record.last_frame)
         doubt = caller.live.motion.implausible(caller.vehicle_id, frame, ego.message.pose)
         if doubt is not None:
-            raise Unusable(Kind.IMPLAUSIBLE_POSE, Reason.MALFORMED, doubt, "ego.pose")
+            raise Unusable(Kind.IMPLAUSIBLE_POSE, Reason.MALFORMED, doubt, "ego.pose" if asked.whole else "pose")
 
     def _check_jump(self, frame: int, latest: int | None) -> None:
         """Refuse a frame so far after the latest that no later one would be left, or that a vehicle may be anywhere."""

@@ -127,7 +127,8 @@ class Deciding:
                 detail = "it joined again with another key after its message was checked"
                 left_out[name] = Rejection(Reason.UNAUTHENTICATED, {"detail": detail})
             elif doubt := live.motion.implausible(name, asked.frame, received.message.pose, ego_pose):
-                left_out[name] = Rejection(Reason.MALFORMED, {"field": "pose", "detail": doubt})
+                field = f"teammates.{name}.pose" if asked.whole else "pose"
+                left_out[name] = Rejection(Reason.MALFORMED, {"field": field, "detail": doubt})
                 self.metrics.refused(Reason.MALFORMED.value)
             else:
                 present[name] = received

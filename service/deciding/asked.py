@@ -36,6 +36,8 @@ class Asked:
     """Why a part of the body is not among the messages."""
     absences: dict[str, Rejection] = field(default_factory=dict)
     """Why a teammate sent nothing; noted for another attempt."""
+    whole: bool = False
+    """Whether all messages came in one body, which is the ego's."""
     begun: Begun | None = None
     """What is worked out while teammates are waited for."""
     timings: dict[str, float] = field(default_factory=dict)

@@ -86,6 +86,17 @@ async def test_the_ego_cannot_leap(served, messages, benign):
     assert (record["reason"], record["field"]) == ("malformed", "ego.pose")
 
 
+async def test_a_pose_that_cannot_be_is_told_by_its_place_in_the_body_that_was_sent(served, messages):
+    session = await served.open(gather_ms=20, defense=NONE)
+    ego, teammate = served.ego(session), served.teammate(session, "rsu")
+    await teammate.send(0, messages["rsu"])
+    assert (await ego.ask(0, messages[EGO])).accepted == ("rsu",)
+    await teammate.send(1, moved(messages["rsu"], 25.0))
+    assert (await ego.ask(1, messages[EGO])).rejected["rsu"].field == "pose"
+    leap = wire.pack_message(2, EGO, moved(messages[EGO], 40.0))
+    assert problem(await served.post(session, "messages", leap), 422, "implausible-pose")["field"] == "pose"
+
+
 @pytest.mark.parametrize(("settings", "dx"), [({}, 25.0), ({"max_range_m": 60.0}, 100.0)])
 async def test_a_teammate_that_cannot_be_where_it_says_is_left_out(settings, dx, messages, benign):
     async with serve(**settings) as served:
@@ -94,7 +105,7 @@ async def test_a_teammate_that_cannot_be_where_it_says_is_left_out(settings, dx,
         assert (await ego.post_frame(0, messages[EGO], benign)).accepted == TEAM
         answer = await ego.post_frame(1, messages[EGO], {**benign, "rsu": moved(benign["rsu"], dx)})
         assert answer.rejected["rsu"].reason == "malformed"
-        assert answer.rejected["rsu"].field == "pose"
+        assert answer.rejected["rsu"].field == "teammates.rsu.pose"
         assert answer.accepted == TEAM[:-1]
         assert (await ego.post_frame(2, messages[EGO], benign)).accepted == TEAM
 
