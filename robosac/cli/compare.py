@@ -29,7 +29,7 @@ from robosac.cli.options import (
 )
 from robosac.cli.outputs import Force, make_folder
 from robosac.defenses import Defense
-from robosac.detectors import DEFAULT_DETECTOR, Detector
+from robosac.detectors import DEFAULT_DETECTOR, Detector, DetectorError
 from robosac.evaluation.comparison import (
     DEFENSES,
     FULL,
@@ -108,7 +108,8 @@ def run(  # the options of a command line
     what = (chosen, columns, extent, seed, recordings, pose_error, live)
     plans = {name: Plan(*what, source) for name, source in sources.items()}
     started = time.monotonic()
-    with failing(AttackError), blaming("--world" if world else "--data", SceneError), progress(console) as bar:
+    blamed = blaming("--world" if world else "--data", SceneError)
+    with failing(AttackError, DetectorError), blamed, progress(console) as bar:
         task = bar.add_task("frames", total=len(plans) * len(extent.settings) * extent.scenes * extent.frames)
         found = compare_plans(list(plans.values()), jobs, lambda: bar.advance(task))
     path = _write(dict(zip(plans, found, strict=True)), plans, out, command(context))

@@ -18,7 +18,7 @@ from robosac.attacks import CAMPAIGN_HELP, AttackError
 from robosac.cli.blame import blaming, failing
 from robosac.cli.options import DataName, DetectorName, Seed, check_attack, load_data, load_detector, progress
 from robosac.cli.outputs import Force, make_folder
-from robosac.detectors import DEFAULT_DETECTOR
+from robosac.detectors import DEFAULT_DETECTOR, DetectorError
 from robosac.evaluation import BoundsReport, NoFrames, Sampling, evaluate_bounds
 from robosac.evaluation.frames import evaluation_frames
 from robosac.files import write_text
@@ -50,7 +50,7 @@ def run(  # the options of a command line
     chosen, source = load_detector(detector), load_data(data)
     check_attack(chosen_attack, chosen)
     rng = np.random.default_rng([seed, 0])
-    with failing(AttackError), blaming("--data", SceneError, NoFrames), progress(console) as bar:
+    with failing(AttackError, DetectorError), blaming("--data", SceneError, NoFrames), progress(console) as bar:
         some = source.scenes("test")[: scenes or DEFAULT_SCENES]
         if len(some) < (scenes or 1):
             raise SceneError(f"{source.name} has {len(some)} test scenes")

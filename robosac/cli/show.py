@@ -26,7 +26,7 @@ from robosac.cli.options import (
 )
 from robosac.cli.outputs import Force, check_file
 from robosac.defenses import DefenseSettings
-from robosac.detectors import DEFAULT_DETECTOR
+from robosac.detectors import DEFAULT_DETECTOR, DetectorError
 from robosac.evaluation.comparison.pictures import TableError, UnknownColumn, draw_heat_map, read_table
 from robosac.evaluation.playing import FaultyDefense
 from robosac.figures import check_film, check_picture
@@ -183,7 +183,7 @@ def _chosen(  # the options of a command line
 
 def _played(sequence: Scenario, settings: DefenseSettings) -> list[Moment]:
     """The frames, answered."""
-    with failing(AttackError), blaming("--data", SceneError), progress(Console(stderr=True)) as bar:
+    with failing(AttackError, DetectorError), blaming("--data", SceneError), progress(Console(stderr=True)) as bar:
         task = bar.add_task("frames", total=sequence.frames)
         met = sequence.met(lambda: bar.advance(task))
     with failing(FaultyDefense, DomainError):

@@ -7,6 +7,7 @@ from typing import TYPE_CHECKING
 from robosac.detectors.base import (
     AttackSurface,
     Detector,
+    DetectorError,
     DetectorInfo,
     Encoder,
     GeometricSurface,
@@ -43,6 +44,7 @@ __all__ = [
     "DEFAULT_DETECTOR",
     "AttackSurface",
     "Detector",
+    "DetectorError",
     "DetectorInfo",
     "EmbeddedDetector",
     "Encoder",

@@ -41,6 +41,10 @@ class TensorSpec:
         return int(np.prod(self.shape)) * np.dtype(self.dtype).itemsize
 
 
+class DetectorError(ValueError):
+    """A detector gave something in another form than it has to."""
+
+
 @dataclass(frozen=True)
 class DetectorInfo:
     """A detector's public face."""

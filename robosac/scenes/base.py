@@ -12,7 +12,7 @@ from dataclasses import dataclass, field
 from typing import Literal, Protocol, runtime_checkable
 
 from robosac.boxes import FloatArray
-from robosac.detectors import Encoder, Message, TensorSpec
+from robosac.detectors import DetectorError, Encoder, Message, TensorSpec
 
 Split = Literal["test", "validation"]
 """What scenes serve: defences are calibrated on validation scenes and measured on test scenes."""
@@ -123,15 +123,21 @@ def encoded(view: View, detector: Encoder) -> Message:
     ------
     SceneError
         If it was recorded for a detector of another layout.
+    DetectorError
+        If the detector encodes in another layout than it declares.
     """
-    message: Message | None = getattr(view, "message", None)
-    if message is None:
-        return detector.encode(view.points, view.pose)
+    recorded: Message | None = getattr(view, "message", None)
+    message = detector.encode(view.points, view.pose) if recorded is None else recorded
+    if not isinstance(message, Message):
+        raise DetectorError(f"{detector.info.name}: encode must return a Message, got a {type(message).__name__}")
     held = {name: TensorSpec(array.dtype.name, array.shape) for name, array in message.tensors.items()}
-    if not any(wanted.items() <= held.items() for wanted in detector.info.tensors.values()):
-        wanted, found = map(_listed, (detector.info.tensors["ego"], held))
-        raise SceneError(f"the detector {detector.info.name} takes {wanted}; the recorded messages hold {found}")
-    return Message(view.pose, message.tensors)
+    fits = any(wanted.items() <= held.items() for wanted in detector.info.tensors.values())
+    takes, found = _listed(detector.info.tensors["ego"]), _listed(held)
+    if not fits and recorded is None:
+        raise DetectorError(f"{detector.info.name}: encode must return a message with {takes}, got {found or 'none'}")
+    if not fits:
+        raise SceneError(f"the detector {detector.info.name} takes {takes}; the recorded messages hold {found}")
+    return message if recorded is None else Message(view.pose, recorded.tensors)
 
 
 def _listed(specs: Mapping[str, TensorSpec]) -> str:

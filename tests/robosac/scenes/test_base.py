@@ -1,8 +1,12 @@
 from dataclasses import dataclass
+from types import SimpleNamespace
 
+import numpy as np
 import pytest
 
-from robosac.scenes import IntersectionScene, SceneError, one_scene, whose_turn
+from robosac.detectors import DetectorError, Message, TensorSpec
+from robosac.scenes import IntersectionScene, SceneError, View, one_scene, whose_turn
+from robosac.scenes.base import encoded
 
 
 @dataclass
@@ -56,3 +60,34 @@ def test_a_scene_is_had_by_its_place_whatever_the_others_are_like():
     ):
         with pytest.raises(SceneError, match=why):
             one_scene(Few(), "test", place, frames, team)
+
+
+class Odd:
+    """A detector that encodes what it was given instead of a scan."""
+
+    def __init__(self, made):
+        layout = {"map": TensorSpec("float32", (2, 2))}
+        self.info = SimpleNamespace(name="odd", tensors={"ego": layout, "teammate": layout})
+        self.made = made
+
+    def encode(self, points, pose):
+        return self.made
+
+
+@pytest.mark.parametrize(
+    ("made", "words"),
+    [
+        (None, "a Message, got a NoneType"),
+        (Message(np.eye(4), {}), r"a message with map of float32 \[2, 2\], got none"),
+        (Message(np.eye(4), {"map": np.zeros((2, 2))}), r"map of float32 \[2, 2\], got map of float64 \[2, 2\]"),
+        (Message(np.eye(4), {"mop": np.zeros((2, 2), np.float32)}), r", got mop of float32 \[2, 2\]"),
+    ],
+)
+def test_what_a_detector_encodes_has_to_be_what_it_declares(made, words):
+    with pytest.raises(DetectorError, match=f"^odd: encode must return .*{words}$"):
+        encoded(View(np.eye(4), np.zeros((1, 3))), Odd(made))
+
+
+def test_a_message_as_declared_is_taken_as_it_is():
+    made = Message(np.eye(4), {"map": np.zeros((2, 2), np.float32)})
+    assert encoded(View(np.eye(4), np.zeros((1, 3))), Odd(made)) is made
