@@ -202,7 +202,7 @@ def test_boxes_that_nobody_else_supports_or_that_are_faint_tell_nothing(said_by,
 
 
 def ego_found(ego_delay=1, seeing=("car-2", "car-3", "rsu"), aside=0.0, unheard=()):
-    """Findings of a frame of whom all, or some, see all vehicles, the last of them aside, and the ego where they were."""
+    """Findings of a frame in which some see all vehicles, the last of them aside, and the ego where they were."""
     memory = Memory(senders=dict.fromkeys((EGO, *TEAM), (0.0, 0.0)))
     known = Knowledge(MODEL, Posterior(len(MODEL.kinds), 0.5, 0.25, TEAM), memory)
     memory.shown = {known.key(tuple(TEAM)): followed(cars(PLACES - SPEED), np.eye(4))}
@@ -234,7 +234,7 @@ def deny(frames, ego_delay):
     for frame in range(frames):
         true = PLACES + frame * SPEED
         own = shown_at(true - min(ego_delay, frame) * SPEED, true)
-        says = dict.fromkeys(TEAM, [(*place, YES) for place in true]) | {LIAR: [(*place, NO) for place in true]}
+        says = {name: [(*place, NO if name == LIAR else YES) for place in true] for name in TEAM}
         heard = saying({EGO: own, **says})
 
         def judge(subset, _, number, true=true, heard=heard):
