@@ -9,7 +9,7 @@ from robosac.boxes import FloatArray
 from robosac.deadline import Deadline
 from robosac.defenses import Hypothesis
 from robosac.detectors import PreparedFrame
-from robosac.detectors.base import Batching
+from robosac.detectors.base import Batching, check_boxes
 
 
 class Passes:
@@ -55,5 +55,5 @@ class Passes:
             for other in islice(others, self._deadline.room(prepared.worth - 1)):
                 at_once.append(other)  # one by one, so that none comes twice
             if len(at_once) > 1:
-                return dict(zip(at_once, prepared.detect_all(at_once), strict=True))
-        return {subset: prepared.detect(subset)}
+                return dict(zip(at_once, map(check_boxes, prepared.detect_all(at_once)), strict=True))
+        return {subset: check_boxes(prepared.detect(subset))}

@@ -186,7 +186,7 @@ def _played(sequence: Scenario, settings: DefenseSettings) -> list[Moment]:
     with failing(AttackError, DetectorError), blaming("--data", SceneError), progress(Console(stderr=True)) as bar:
         task = bar.add_task("frames", total=sequence.frames)
         met = sequence.met(lambda: bar.advance(task))
-    with failing(FaultyDefense, DomainError):
+    with failing(FaultyDefense, DetectorError, DomainError):
         return moments(sequence, met, settings)
 
 

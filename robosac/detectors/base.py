@@ -45,6 +45,23 @@ class DetectorError(ValueError):
     """A detector gave something in another form than it has to."""
 
 
+def check_boxes(boxes: object) -> FloatArray:
+    """The boxes that ``detect`` returned.
+
+    Raises
+    ------
+    DetectorError
+        If they are no (n, 6) ndarray of finite numbers.
+    """
+    if not isinstance(boxes, np.ndarray):
+        raise DetectorError(f"detect must return an array of boxes (n, 6), got a {type(boxes).__name__}")
+    if boxes.ndim != 2 or boxes.shape[1] != 6:
+        raise DetectorError(f"detect must return boxes (n, 6), got {boxes.shape}")
+    if boxes.dtype.kind not in "fiu" or not np.isfinite(boxes).all():
+        raise DetectorError("detect must return finite numbers")
+    return boxes
+
+
 @dataclass(frozen=True)
 class DetectorInfo:
     """A detector's public face."""

@@ -9,7 +9,7 @@ from __future__ import annotations
 import os
 from pathlib import Path
 
-from robosac.detectors.base import Batching, Detector, Placeable, Precise, Preparer, blank, split_precision
+from robosac.detectors.base import Batching, Detector, Placeable, Precise, Preparer, blank, check_boxes, split_precision
 from robosac.detectors.device import CPU, as_device
 from robosac.detectors.embedded import EmbeddedDetector
 from robosac.detectors.weights_file import WeightsError, read_weights
@@ -57,12 +57,18 @@ def load(detector: str | os.PathLike[str] = DEFAULT_DETECTOR, device: str = "cpu
 
 
 def warm_up(detector: Preparer) -> None:
-    """Run frames of zeros through a detector, so that the first one is as fast as the next."""
+    """Run frames of zeros through a detector, so that the first one is as fast as the next.
+
+    Raises
+    ------
+    DetectorError
+        If what it detects are no boxes.
+    """
     ego, teammate = blank(detector.info, "ego"), blank(detector.info, "teammate")
     for _ in range(2):
         prepared = detector.prepare(ego, {"a": teammate, "b": teammate})
-        prepared.detect()
-        prepared.detect(["a", "b"])
+        check_boxes(prepared.detect())
+        check_boxes(prepared.detect(["a", "b"]))
         if isinstance(prepared, Batching) and prepared.worth > 1:
             prepared.detect_all([["a", "b"]] * prepared.worth)
 

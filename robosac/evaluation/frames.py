@@ -17,7 +17,7 @@ from robosac.calibrated import witness_of
 from robosac.consensus import DEFAULT_THRESHOLD, at_least, compare
 from robosac.defenses import EGO, Defense
 from robosac.detectors import Detector, DetectorInfo, Message, PreparedFrame
-from robosac.detectors.base import for_role
+from robosac.detectors.base import check_boxes, for_role
 from robosac.fusion import FusionResult, fuse
 from robosac.scenes import Frame, Scene, SceneError, SceneSource, Split, encoded, seconds_apart
 from robosac.testimony import Testimony
@@ -102,7 +102,7 @@ class DecodedOnce(EvaluationFrame):
         """Boxes (n, 6) of a subset."""
         key = frozenset(teammates)
         if key not in self.boxes:
-            self.boxes[key] = self._prepared.detect(teammates)
+            self.boxes[key] = check_boxes(self._prepared.detect(teammates))
         return self.boxes[key]
 
     def confident(self, teammates: Collection[str] = ()) -> FloatArray:

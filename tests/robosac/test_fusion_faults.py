@@ -22,6 +22,27 @@ def test_a_fault_inside_is_answered_by_the_ego_alone(part, caplog):
     np.testing.assert_array_equal(result.boxes, SEEN)
 
 
+@pytest.mark.parametrize(
+    ("boxes", "words"),
+    [
+        (None, r"an array of boxes \(n, 6\), got a NoneType"),
+        ([SEEN], r"an array of boxes \(n, 6\), got a list"),
+        (SEEN[:, :5], r"boxes \(n, 6\), got \(\d+, 5\)"),
+        (SEEN[0], r"boxes \(n, 6\), got \(6,\)"),
+        (SEEN * np.nan, "finite numbers"),
+        (SEEN.astype(str), "finite numbers"),
+    ],
+)
+def test_what_are_no_boxes_is_a_fault_that_is_told(boxes, words, caplog):
+    detector = FakeDetector()
+    decode = detector.detect
+    detector.detect = lambda teammates=(): boxes if teammates else decode()
+    with caplog.at_level(logging.CRITICAL):
+        result = run(detector)
+    assert re.match(f"DetectorError: detect must return {words}", result.fault)
+    np.testing.assert_array_equal(result.boxes, SEEN)
+
+
 class Liar(SampleConsensus):
     """Answers with a subset that was never in consensus."""
 

@@ -72,6 +72,6 @@ def test_how_many_are_worth_it_can_be_chosen(worth, expected, detector, ego_mess
 @pytest.mark.parametrize("worth", [1, 5])
 def test_a_warm_detector_has_decoded_as_many_at_once_as_it_will(worth, detector):
     decoded = []
-    frame = SimpleNamespace(worth=worth, detect=lambda subset=(): None, detect_all=decoded.append)
+    frame = SimpleNamespace(worth=worth, detect=lambda subset=(): np.zeros((0, 6)), detect_all=decoded.append)
     warm_up(SimpleNamespace(info=detector.info, prepare=lambda ego, others: frame))
     assert {len(subsets) for subsets in decoded} == ({5} if worth == 5 else set())
