@@ -80,8 +80,10 @@ def unpacked(record: Mapping[str, Any]) -> tuple[FloatArray, tuple[Support, ...]
 def _blaming(name: str, unpack: Callable[..., T], *packed: Any) -> T:
     try:
         return unpack(*packed)
-    except (ValueError, TypeError, LookupError, AttributeError, OverflowError, RecursionError) as error:
+    except ValueError as error:
         raise ValueError(f"{name}: {error}") from error
+    except (TypeError, LookupError, AttributeError, OverflowError, RecursionError) as error:
+        raise ValueError(f"{name}: is not in the form that records have ({error})") from error
 
 
 def _fill_in(read: dict[str, Any]) -> None:

@@ -84,6 +84,13 @@ def test_junk_in_any_part_is_told_as_such(events, value):
     assert told > len(changes) / 2
 
 
+@pytest.mark.parametrize(("name", "value"), [("timings_us", ["a"] * 10), ("messages", 5), ("hypotheses", 5)])
+def test_junk_is_told_as_no_form_of_a_record(events, name, value):
+    record = compact(an_answer(events))
+    with pytest.raises(ValueError, match=f"{name}: is not in the form that records have"):
+        expanded({**record, name: value})
+
+
 def test_a_state_that_is_not_of_its_digest_is_told(events):
     record = compact(an_answer(events))
     other = packing.deflated(b'{"trusted":[]}')
