@@ -131,13 +131,12 @@ def encoded(view: View, detector: Encoder) -> Message:
     if not isinstance(message, Message):
         raise DetectorError(f"{detector.info.name}: encode must return a Message, got a {type(message).__name__}")
     held = {name: TensorSpec(array.dtype.name, array.shape) for name, array in message.tensors.items()}
-    fits = any(wanted.items() <= held.items() for wanted in detector.info.tensors.values())
+    if any(wanted.items() <= held.items() for wanted in detector.info.tensors.values()):
+        return message if recorded is None else Message(view.pose, recorded.tensors)
     takes, found = _listed(detector.info.tensors["ego"]), _listed(held)
-    if not fits and recorded is None:
+    if recorded is None:
         raise DetectorError(f"{detector.info.name}: encode must return a message with {takes}, got {found or 'none'}")
-    if not fits:
-        raise SceneError(f"the detector {detector.info.name} takes {takes}; the recorded messages hold {found}")
-    return message if recorded is None else Message(view.pose, recorded.tensors)
+    raise SceneError(f"the detector {detector.info.name} takes {takes}; the recorded messages hold {found}")
 
 
 def _listed(specs: Mapping[str, TensorSpec]) -> str:
