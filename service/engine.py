@@ -177,7 +177,7 @@ class Engine:
         Raises
         ------
         ValueError
-            If a detector cannot be loaded, or two extra ones have the same name.
+            If a detector cannot be loaded or answers no frame of zeros, or two extra ones have the same name.
         """
         extra = [await self._submit(partial(load, detector, self._device)) for detector in self._extra]
         own = {detector.info.name: detector for detector in extra}

@@ -8,11 +8,24 @@ from __future__ import annotations
 
 import os
 from pathlib import Path
+from traceback import extract_tb
 
-from robosac.detectors.base import Batching, Detector, Placeable, Precise, Preparer, blank, check_boxes, split_precision
+from robosac.detectors.base import (
+    Batching,
+    Detector,
+    DetectorError,
+    Placeable,
+    Precise,
+    Preparer,
+    blank,
+    check_boxes,
+    split_precision,
+)
+from robosac.detectors.declared import check_info
 from robosac.detectors.device import CPU, as_device
 from robosac.detectors.embedded import EmbeddedDetector
 from robosac.detectors.weights_file import WeightsError, read_weights
+from robosac.faults import describe
 from robosac.plugins import Kind, classes
 
 DEFAULT_DETECTOR = EmbeddedDetector.name
@@ -44,8 +57,8 @@ def load(detector: str | os.PathLike[str] = DEFAULT_DETECTOR, device: str = "cpu
     WeightsError
         If the weights cannot be used.
     ValueError
-        If there is no such detector, it lacks what a gateway needs, or it cannot decode in that precision or compute
-        on that device.
+        If there is no such detector, it lacks what a gateway needs, its ``info`` cannot be, or it cannot decode in that
+        precision or compute on that device.
     """
     elsewhere = as_device(device) != CPU
     loaded = _load(os.fspath(detector))
@@ -62,15 +75,24 @@ def warm_up(detector: Preparer) -> None:
     Raises
     ------
     DetectorError
-        If what it detects are no boxes.
+        If what it detects are no boxes, or it is the user's own and fails.
     """
     ego, teammate = blank(detector.info, "ego"), blank(detector.info, "teammate")
-    for _ in range(2):
-        prepared = detector.prepare(ego, {"a": teammate, "b": teammate})
-        check_boxes(prepared.detect())
-        check_boxes(prepared.detect(["a", "b"]))
-        if isinstance(prepared, Batching) and prepared.worth > 1:
-            prepared.detect_all([["a", "b"]] * prepared.worth)
+    try:
+        for _ in range(2):
+            prepared = detector.prepare(ego, {"a": teammate, "b": teammate})
+            check_boxes(prepared.detect())
+            check_boxes(prepared.detect(["a", "b"]))
+            if isinstance(prepared, Batching) and prepared.worth > 1:
+                prepared.detect_all([["a", "b"]] * prepared.worth)
+    except DetectorError as error:
+        raise DetectorError(f"{detector.info.name}: {error}") from error
+    except Exception as error:  # the user's code may raise anything
+        if type(detector).__module__.startswith(f"{__package__}."):
+            raise
+        at = extract_tb(error.__traceback__)[-1]
+        said = f"{describe(error)} ({Path(at.filename).name}, line {at.lineno})"
+        raise DetectorError(f"{detector.info.name} cannot answer a frame of zeros: {said}") from error
 
 
 def _load(detector: str) -> Detector:
@@ -85,7 +107,9 @@ def _load(detector: str) -> Detector:
         return _open_weights(Path(detector))
     if detector.endswith(".safetensors") or "/" in detector:
         raise WeightsError(f"there is no file {detector}")
-    return DETECTORS.make(detector)
+    made = DETECTORS.make(detector)
+    check_info(made.info, detector)
+    return made
 
 
 def _open_weights(path: Path) -> Detector:
