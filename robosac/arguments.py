@@ -11,6 +11,7 @@ from collections.abc import Collection, Iterable, Mapping
 import numpy as np
 
 from robosac.budget import DomainError
+from robosac.deadline import Deadline
 from robosac.defenses import EGO, Defense
 from robosac.detectors import DetectorInfo, Message
 from robosac.detectors.base import Role
@@ -82,6 +83,12 @@ def check_rng(rng: object) -> None:
         raise TypeError(f"rng must be a numpy.random.Generator, got {rng!r}")
 
 
+def check_deadline(deadline: object) -> None:
+    """`TypeError` for what is no deadline, such as a number of seconds."""
+    if not isinstance(deadline, Deadline | None):
+        raise TypeError(f"deadline must be a robosac.deadline.Deadline or None, got {deadline!r}")
+
+
 def check_frame(info: DetectorInfo, ego: Message, teammates: Mapping[str, Message]) -> None:
     """Refuse messages that are not of a detector's layout; what their numbers are is not looked at.
 
@@ -100,13 +107,21 @@ def check_frame(info: DetectorInfo, ego: Message, teammates: Mapping[str, Messag
 def _check_message(info: DetectorInfo, role: Role, message: object, name: str) -> None:
     if not isinstance(message, Message):
         raise TypeError(f"{name} must be a Message, got {type(message).__name__}")
-    if np.shape(message.pose) != (4, 4):
-        raise ValueError(f"{name}: the pose must be of shape (4, 4), got {np.shape(message.pose)}")
+    _check_array(f"{name}: the pose", message.pose, (4, 4), "numbers", "fiu")
     for tensor, spec in info.tensors[role].items():
         if tensor not in message.tensors:
             raise ValueError(f"{name}: the tensor {tensor!r} is missing")
-        if (shape := np.shape(message.tensors[tensor])) != spec.shape:
-            raise ValueError(f"{name}: the tensor {tensor!r} must be of shape {spec.shape}, got {shape}")
+        kind = np.dtype(spec.dtype).kind  # wider numbers will do
+        _check_array(f"{name}: the tensor {tensor!r}", message.tensors[tensor], spec.shape, spec.dtype, kind)
+
+
+def _check_array(what: str, array: object, shape: tuple[int, ...], wanted: str, kinds: str) -> None:
+    if not isinstance(array, np.ndarray):
+        raise TypeError(f"{what} must be a numpy array, got {type(array).__name__}")
+    if array.shape != shape:
+        raise ValueError(f"{what} must be of shape {shape}, got {array.shape}")
+    if array.dtype.kind not in kinds:
+        raise ValueError(f"{what} must be of {wanted}, got {array.dtype}")
 
 
 def by_text(value: object) -> bool:

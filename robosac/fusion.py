@@ -18,7 +18,7 @@ import rfc8785
 
 from robosac.ahead import Ahead
 from robosac.answers import Reason, Source, Verdict
-from robosac.arguments import by_text, check_defense, check_frame, check_rng
+from robosac.arguments import by_text, check_deadline, check_defense, check_frame, check_rng
 from robosac.boxes import FloatArray
 from robosac.calibrated import witness_of
 from robosac.consensus import at_least, compare
@@ -104,6 +104,7 @@ def fuse(  # all that a decision follows from, so that it can be made again
     """
     check_defense(defense)
     check_rng(rng)
+    check_deadline(deadline)
     check_frame(detector.info, ego, teammates)
     run = FrameRun(detector, defense, ego, frame, previous, deadline or Deadline(), screening)
     return finished(run.answer(teammates, rng, state))

@@ -8,7 +8,7 @@ from typing import Any, Literal
 import numpy as np
 
 from robosac.ahead import Ahead
-from robosac.arguments import check_frame, check_rng, check_session, check_team, checked_number
+from robosac.arguments import check_deadline, check_frame, check_rng, check_session, check_team, checked_number
 from robosac.calibrated import calibration_of, screening_for
 from robosac.deadline import Deadline
 from robosac.defenses import Defense, DefenseSettings, SampleConsensus, State, build
@@ -176,6 +176,7 @@ class Session:
         """Decide as `decide` does, but pause before each pass, so that the work of others can take turns with it."""
         frame = checked_number(frame)
         check_rng(rng)
+        check_deadline(deadline)
         check_frame((detector or self.detector).info, ego, teammates)
         deadline = deadline or Deadline()
         if isinstance(detector, Ahead):

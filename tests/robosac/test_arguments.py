@@ -5,6 +5,7 @@ from dataclasses import replace
 
 import numpy as np
 import pytest
+import torch
 
 import robosac
 from robosac.audit import verify
@@ -50,6 +51,30 @@ def test_fuse_names_the_message_and_the_tensor_that_is_not_of_the_layout(detecto
     for pose in (np.eye(3), np.eye(4).ravel()):
         with pytest.raises(ValueError, match=r"^ego: the pose must be of shape \(4, 4\)"):
             fused(rng, detector, None, Message(pose, ego_message.tensors), benign)
+
+
+def test_fuse_names_the_array_that_is_none_or_of_other_things_than_numbers(detector, ego_message, benign, rng):
+    features, pose = ego_message.tensors["features"], ego_message.pose
+    for wrong, kind, told in (
+        (Message(pose.tolist(), ego_message.tensors), TypeError, "the pose must be a numpy array, got list"),
+        (Message(pose.astype(str), ego_message.tensors), ValueError, "the pose must be of numbers, got <U"),
+        (Message(pose, {"features": torch.tensor(features)}), TypeError, "the tensor 'features' must be a numpy array"),
+        (Message(pose, {"features": features.astype(int)}), ValueError, "'features' must be of float16, got int64"),
+        (Message(pose, {"features": features.astype(str)}), ValueError, "'features' must be of float16, got <U"),
+    ):
+        for who, ego, teammates in (
+            ("ego", wrong, benign),
+            (r"teammates\['rsu'\]", ego_message, {**benign, "rsu": wrong}),
+        ):
+            with pytest.raises(kind, match=f"^{who}: .*{told}"):
+                fused(rng, detector, None, ego, teammates)
+
+
+def test_a_deadline_is_no_number(rng):
+    with pytest.raises(TypeError, match=r"^deadline must be a robosac\.deadline\.Deadline or None, got 0\.2"):
+        robosac.fuse(FakeDetector(), SampleConsensus(), EGO, TEAM, rng=rng, deadline=0.2)
+    with pytest.raises(TypeError, match=r"^deadline must be"):
+        robosac.Session(FakeDetector(), list(TEAM), SampleConsensus()).answer(0, EGO, TEAM, 0.2)
 
 
 def test_a_message_may_be_frozen_spaced_or_of_wider_numbers(detector, ego_message, benign):
