@@ -116,7 +116,7 @@ def replay(
     console, same = Console(), True
     if url is not None and (detector, own) != (None, None):
         raise typer.BadParameter("the gateway has its own detectors and defences", param_hint="--url")
-    for session in _read(file):
+    for session in _with_frames(_read(file)):
         if url is None:
             same &= _decide_again(session, detector, defense, own, console)
         else:
@@ -146,7 +146,7 @@ def export(
 
     if to is not Form.PICTURES:
         check_file(out, "--out", force)
-    chosen = _one(_read(file), session)
+    (chosen,) = _with_frames([_one(_read(file), session)])
     if to is Form.PICTURES:
         make_folder(out, "--out", force, *(f"{frame.number:06d}.png" for frame in chosen.frames[:1]))
     if to is Form.RERUN:
@@ -174,6 +174,18 @@ def export(
 def _read(file: Path) -> list[RecordedSession]:
     with blaming("FILE", RecordingError, OSError):
         return sessions(file)
+
+
+def _with_frames(found: list[RecordedSession]) -> list[RecordedSession]:
+    """The same, if each has a frame; files that are not whole are told."""
+    for part in (file for session in found for file in session.files):
+        if part.damage is not None:
+            typer.secho(f"{part.path}: {part.damage}; what is before that is good", fg="yellow", err=True)
+    with failing(RecordingError):
+        for session in found:
+            if not session.frames:
+                raise RecordingError(f"{session.files[0].path} has no frames")
+    return found
 
 
 def _one(found: Sequence[RecordedSession], wanted: str | None) -> RecordedSession:

@@ -66,6 +66,21 @@ def test_info_tells_what_is_in_it(path, tmp_path):
     assert "what is before that is good" in said
 
 
+def test_a_file_that_is_not_whole_is_told_by_replay_and_export(path, tmp_path):
+    broken, empty = tmp_path / "broken.mcap", tmp_path / "empty.mcap"
+    broken.write_bytes(path.read_bytes()[:-2000])
+    empty.write_bytes(path.read_bytes()[:50_000])
+    for words in (("replay",), ("export", "--to", "cpm", "--out", tmp_path / "out.jsonl")):
+        status, said = run(*words, broken)
+        assert status == 0, said
+        assert "it ends in the middle (EndOfFile); what is before that is good" in said
+        status, said = run(*words, empty, *(["--force"] if len(words) > 1 else []))
+        assert status == 1
+        assert "Error:" in said
+        assert "empty.mcap has no frames" in said
+    assert len((tmp_path / "out.jsonl").read_text().splitlines()) == 3
+
+
 def test_replay_ends_with_1_only_if_the_recorded_defence_differs(path, detector, recorded_moments, tmp_path):
     assert run("replay", path)[0] == 0
     status, said = run("replay", path, "--defense", "none")
