@@ -213,7 +213,10 @@ def main(  # the options of a command line
     url: trial.Url = None,
     process: Annotated[
         list[str] | None,
-        typer.Option(help="Behind a proxy: address of each gateway, for its metrics; give it several times."),
+        typer.Option(
+            callback=trial.checked_urls,
+            help="Behind a proxy: address of each gateway, for its metrics; give it several times.",
+        ),
     ] = None,
     seconds: trial.Seconds = 10.0,
     egos: Annotated[list[int] | None, typer.Option(min=1, help="Egos at a time; give it several times.")] = None,

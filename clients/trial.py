@@ -52,6 +52,13 @@ def checked_url(url: str | None) -> str | None:
     return url
 
 
+def checked_urls(urls: list[str] | None) -> list[str] | None:
+    """The URLs of several gateways, as an option that is given several times has them."""
+    for url in urls or ():
+        checked_url(url)
+    return urls
+
+
 def checked_key(key: str | None) -> str | None:
     """An API key that a header can carry."""
     if key is not None and not _KEY.fullmatch(key):

@@ -59,6 +59,15 @@ def test_a_short_run_measures_every_load(tmp_path):
             assert load["frames"] == load["egos"] * 3
 
 
+def test_addresses_of_processes_are_looked_at_before_any_work():
+    app = typer.Typer()
+    app.command()(main)
+    result = CliRunner().invoke(app, ["--url", "http://127.0.0.1:9", "--process", "127.0.0.1:9"])
+    assert result.exit_code == 2
+    said = " ".join(result.output.replace("│", "").split())
+    assert "for '--process': must begin with http:// or https://, got 127.0.0.1:9" in said
+
+
 def test_no_figure_is_cut_off_in_a_narrow_terminal():
     figures = Figures(Load("open", 8, attacked=True, rate_hz=5.0), budget_ms=200.0, seconds=2.0)
     figures.latencies_ms += [123.0] * 3
