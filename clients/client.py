@@ -98,7 +98,7 @@ class GatewayClient:
         For one request.
     gateway_keys : sequence of str, optional
         The gateway's public keys, base64, from a source that can be relied on; see `clients.receipts.ReceiptBook`.
-    receipts : Path, optional
+    receipts : str or Path, optional
         File that the receipts of answers are added to.
     tls : ssl.SSLContext, optional
         Whose certificates are good; by default those of the well-known authorities (`certifi`).
@@ -123,7 +123,7 @@ class GatewayClient:
         transport: httpx.AsyncBaseTransport | None = None,
         *,
         gateway_keys: Sequence[str] | None = None,
-        receipts: Path | None = None,
+        receipts: str | Path | None = None,
         tls: ssl.SSLContext | None = None,
     ) -> None:
         self._opener = {} if api_key is None else bearer(api_key)
@@ -135,7 +135,7 @@ class GatewayClient:
             trust_env=False,
             verify=True if tls is None else tls,
         )
-        self.receipts = ReceiptBook(self.public_keys, gateway_keys, receipts)
+        self.receipts = ReceiptBook(self.public_keys, gateway_keys, None if receipts is None else Path(receipts))
 
     async def __aenter__(self) -> GatewayClient:
         return self
@@ -170,6 +170,8 @@ class GatewayClient:
         self, ego_id: str, teammates: Sequence[str], **options: Unpack[SessionOptions]
     ) -> OpenedSession:
         """Open a session."""
+        if isinstance(teammates, str):
+            raise TypeError(f"teammates must be a sequence of ids, got {teammates!r}")
         asked = {name: value for name, value in options.items() if value is not None}
         body = {"ego_id": ego_id, "teammates": list(teammates), **asked}
         opened = told(await self._request("POST", "/v1/sessions", json=body, headers=self._opener), OpenedSession)

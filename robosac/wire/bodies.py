@@ -61,7 +61,9 @@ def pack_message(
 
     An ego may add what is true (`robosac.recording.truth.Truth.as_fields`). By default tensors go as they are.
     """
-    return pack({"frame": frame, "vehicle_id": vehicle_id, **_message_fields(message, packing, signature, truth)})
+    return pack(
+        {"frame": _number(frame), "vehicle_id": vehicle_id, **_message_fields(message, packing, signature, truth)}
+    )
 
 
 def pack_frame(
@@ -83,7 +85,12 @@ def pack_frame(
     fields = {name: _message_fields(message, packing, signed.get(name)) for name, message in teammates.items()}
     known = {"states": dict(states)} if states else {}
     return pack(
-        {"frame": frame, "ego": _message_fields(ego, packing, ego_signature, truth), "teammates": fields, **known}
+        {
+            "frame": _number(frame),
+            "ego": _message_fields(ego, packing, ego_signature, truth),
+            "teammates": fields,
+            **known,
+        }
     )
 
 
@@ -268,9 +275,17 @@ def check_message(payload: Any, info: DetectorInfo, role: Role, path: str = "") 
     )
 
 
+def _number(frame: Any) -> Any:
+    """A frame's number, as msgpack has it: integers of numpy are such, too."""
+    return int(frame) if isinstance(frame, np.integer) else frame
+
+
 def _message_fields(
     message: Message, packing: Packing | None, signature: bytes | None, truth: Mapping[str, Any] | None = None
 ) -> dict[str, Any]:
+    for name, array in {"pose": message.pose, **message.tensors}.items():
+        if not isinstance(array, np.ndarray):
+            raise TypeError(f"{name} must be a numpy array, got {type(array).__name__}")
     tensors = {name: tensor_fields(array, packing or Packing()) for name, array in message.tensors.items()}
     fields = {"pose": [float(value) for value in message.pose.reshape(-1)], "tensors": tensors}
     more = {"signature": signature, "truth": truth}

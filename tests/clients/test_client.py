@@ -48,6 +48,12 @@ async def test_problems_become_exceptions(status, kind):
     assert "wrong-shape: tensors.x.shape: must be [1]" in str(error)
 
 
+async def test_one_text_is_no_team():
+    async with gateway(lambda _: httpx.Response(500)) as client:
+        with pytest.raises(TypeError, match="teammates must be a sequence of ids, got 'car-2'"):
+            await client.open_session("car-1", "car-2")
+
+
 async def test_what_is_not_signed_already_is_rounded_for_its_way(ego_message, benign):
     bodies = []
 

@@ -43,6 +43,23 @@ def test_a_frame_survives_the_journey():
     assert list(envelope.teammates) == ["car-2"]
 
 
+def test_a_number_may_be_an_integer_of_numpy():
+    assert wire.pack_message(np.int64(7), "car-2", TEAMMATE) == wire.pack_message(7, "car-2", TEAMMATE)
+    assert wire.pack_frame(np.int64(7), EGO, {}) == wire.pack_frame(7, EGO, {})
+
+
+@pytest.mark.parametrize(
+    ("message", "words"),
+    [
+        (Message(POSE.tolist(), TEAMMATE.tensors), "pose must be a numpy array, got list"),
+        (Message(POSE, {"features": FEATURES.tolist()}), "features must be a numpy array, got list"),
+    ],
+)
+def test_what_is_no_array_is_packed_in_no_body(message, words):
+    with pytest.raises(TypeError, match=f"^{words}$"):
+        wire.pack_message(7, "car-2", message)
+
+
 def test_tensors_travel_little_endian_in_c_order():
     odd = Message(POSE, {"features": np.asfortranarray(FEATURES.astype(">f2"))})
     packed = msgpack.unpackb(wire.pack_message(0, "x", odd))

@@ -24,7 +24,8 @@ async def test_every_answer_promises_the_log_that_it_is_in(messages, tmp_path):
         (key,) = (await served.http.get("/v1/keys")).json()["keys"]
         assert (key["signs"], len(base64.b64decode(key["public_key"]))) == (True, 32)
         transport, file = served.client._http._transport, tmp_path / "receipts.jsonl"
-        pinned = GatewayClient("http://gateway", transport=transport, gateway_keys=[key["public_key"]], receipts=file)
+        trusted, to = [key["public_key"]], str(file)
+        pinned = GatewayClient("http://gateway", transport=transport, gateway_keys=trusted, receipts=to)
         session = await pinned.open_session(EGO, TEAM, gather_ms=50, latency_budget_ms=20_000)
         ego = pinned.vehicle(session.session_id, EGO, session.ego_token)
         unit = pinned.vehicle(session.session_id, "rsu", session.teammate_tokens["rsu"])
