@@ -107,6 +107,8 @@ def test_what_cannot_be_is_said_before_the_work(own):
     assert "for --attack: invent cannot attack the detector occupancy-max: its attack surface lacks" in said(shifting)
     assert "It can be calibrated with the others: pgd, erase" in said(shifting)
     assert "frames" not in shifting.stdout
+    one = ["--data", "my_data:Road", "--attack", "shift", "--out", "x.json"]
+    assert "with the others" not in said(robosac("calibrate", "--detector", "my_detector:build", *one))
     few = ["--attack", "pgd", "--pose-error", 0, "--scenes", 2, "--check-scenes", 0, "--out", "x.json"]
     small = robosac("calibrate", "--detector", "my_detector:build", "--data", "my_data:Road", *few)
     assert small.exit_code == 2

@@ -122,8 +122,9 @@ def load_attacks(detector: Detector, names: Sequence[str]) -> dict[str, Attack]:
     chosen = {name: attacks.load(name) for name in names}
     faults = {name: fault for name, attack in chosen.items() if (fault := attacks.lacking(attack, detector))}
     if faults:
-        others = ", ".join(name for name in chosen if name not in faults) or "none"
-        raise ValueError(f"{'; '.join(faults.values())}. It can be calibrated with the others: {others}")
+        others = ", ".join(name for name in chosen if name not in faults)
+        said = f". It can be calibrated with the others: {others}" if others else ""
+        raise ValueError("; ".join(faults.values()) + said)
     return chosen
 
 
