@@ -45,6 +45,17 @@ def calibration_of(info: DetectorInfo) -> Calibration:
         raise CalibrationError(str(error)) from error
 
 
+def calibration_fault(info: DetectorInfo) -> str | None:
+    """Why the calibration beside a detector's weights cannot be used; None if it can be, or there is none."""
+    if info.calibration is None:
+        return None
+    try:
+        calibration_of(info)
+    except CalibrationError as error:
+        return str(error)
+    return None
+
+
 def calibration_digest(info: DetectorInfo) -> str | None:
     """SHA-256 (hexadecimal) of the calibration beside a detector's weights, and of the witness, if there is one, after
     it. None if there is no calibration to be read.

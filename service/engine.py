@@ -19,6 +19,7 @@ import numpy as np
 import torch
 
 from robosac.ahead import Ahead
+from robosac.calibrated import calibration_fault
 from robosac.deadline import Deadline
 from robosac.defenses import EGO
 from robosac.detectors import Detector, Message, Preparer, available, load
@@ -187,8 +188,10 @@ class Engine:
             name: await self._submit(partial(load, name, self._device)) for name in available() if name not in own
         }
         self._detectors = shipped | own
-        for detector in self._detectors.values():
+        for name, detector in self._detectors.items():
             await self._submit(partial(warm_up, detector))
+            if fault := await self._submit(partial(calibration_fault, detector.info)):
+                logger.warning("sessions of %s with group_testing are refused: %s", name, fault)
         self.ready = True
 
     def check_ready(self) -> None:

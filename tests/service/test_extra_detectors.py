@@ -1,4 +1,5 @@
 import json
+import shutil
 import sys
 import types
 
@@ -9,7 +10,7 @@ from robosac import attacks, detectors
 from robosac.attacks import GaussianNoise
 from robosac.audit import replay, verify
 from robosac.detectors import EmbeddedDetector
-from robosac.detectors.embedded import ADVERSARIAL_WEIGHTS
+from robosac.detectors.embedded import ADVERSARIAL_WEIGHTS, SHIPPED_WEIGHTS
 from robosac.detectors.v2xsim import write_weights
 from robosac.scenes import IntersectionScene
 from service.settings import Settings
@@ -56,6 +57,24 @@ async def test_a_detector_that_cannot_be_loaded_keeps_the_gateway_from_starting(
     with pytest.raises(ValueError, match=complaint):
         async with serve(extra_detectors=extra):
             pytest.fail("it started")
+
+
+async def test_a_calibration_that_cannot_be_used_is_told_at_the_start(tmp_path, caplog):
+    own = tmp_path / "own.safetensors"
+    shutil.copy(ADVERSARIAL_WEIGHTS, own)
+    calibration = own.with_suffix(".calibration.json")
+    shutil.copy(SHIPPED_WEIGHTS.with_suffix(".calibration.json"), calibration)
+    for text, why in (
+        (None, "own.calibration.json belongs to weights"),
+        ("{", "own.calibration.json is no calibration"),
+    ):
+        caplog.clear()
+        if text is not None:
+            calibration.write_text(text)
+        async with serve(extra_detectors=str(own)):
+            (said,) = [r.getMessage() for r in caplog.records if r.name == "service.engine"]
+        assert said.startswith("sessions of intersection-mean with group_testing are refused: ")
+        assert why in said
 
 
 def test_several_extra_detectors_are_separated_by_commas(monkeypatch):
