@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import hashlib
 import json
+import os
 from dataclasses import replace
 from functools import lru_cache
 from pathlib import Path
@@ -30,19 +31,16 @@ def calibration_of(info: DetectorInfo) -> Calibration:
             "with robosac calibrate"
         )
     try:
-        changed = info.calibration.stat().st_mtime_ns
-    except OSError as error:
-        raise CalibrationError(f"{info.calibration} cannot be read: {error}") from error
-    calibration = _read(info.calibration, changed)
-    if calibration.weights_digest != info.weights_digest:
-        raise CalibrationError(
-            f"{info.calibration.name} belongs to weights with the digest {calibration.weights_digest:.12}..., not to "
-            f"{info.name} with {info.weights_digest:.12}...: calibrate again"
-        )
-    try:
+        calibration = _read(info.calibration, info.calibration.stat().st_mtime_ns)
+        if calibration.weights_digest != info.weights_digest:
+            raise CalibrationError(
+                f"{info.calibration} belongs to weights with the digest {calibration.weights_digest:.12}..., not to "
+                f"{info.name} with {info.weights_digest:.12}...: calibrate again"
+            )
         return replace(calibration, witnessed=witness_of(info) is not None)
-    except (OSError, WeightsError) as error:
-        raise CalibrationError(str(error)) from error
+    except (OSError, CalibrationError, WeightsError) as error:
+        # a gateway tells its clients what is wrong, but not where its files lie
+        raise CalibrationError(str(error).replace(f"{info.calibration.parent}{os.sep}", "")) from error
 
 
 def calibration_fault(info: DetectorInfo) -> str | None:

@@ -71,8 +71,12 @@ async def test_a_calibration_that_cannot_be_used_is_told_at_the_start(tmp_path, 
         caplog.clear()
         if text is not None:
             calibration.write_text(text)
-        async with serve(extra_detectors=str(own)):
+        async with serve(extra_detectors=str(own)) as served:
             (said,) = [r.getMessage() for r in caplog.records if r.name == "service.engine"]
+            body = {"ego_id": "a", "teammates": ["b"], "defense": {"kind": "group_testing"}}
+            refused = await served.http.post("/v1/sessions", json=body)
+        assert why in refused.json()["detail"]
+        assert str(tmp_path) not in refused.text
         assert said.startswith("sessions of intersection-mean with group_testing are refused: ")
         assert why in said
 
