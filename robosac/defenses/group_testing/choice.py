@@ -102,6 +102,14 @@ def most_information(known: Knowledge, subsets: BoolArray) -> FloatArray:
     return most
 
 
+def most_promised(known: Knowledge) -> float:
+    """Bits that `expected_information` does not exceed for any subset: an outcome tells at most the relative entropy of
+    what is attacked to what is not, times how likely an attack is.
+    """
+    of_pairs, of_changes = known.model.most_telling
+    return float(known.posterior.by_kind @ (DEPENDENCE * of_pairs + of_changes)) * known.memory.steadiness.trust
+
+
 @dataclass(frozen=True, eq=False)
 class _Pairs:
     """Pairs (p,) that subsets would make with parts or supersets of them."""

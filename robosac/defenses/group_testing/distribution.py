@@ -60,6 +60,12 @@ class Distribution:
         """Probability that nobody attacks."""
         return float(self._weights[0])
 
+    @property
+    def by_kind(self) -> FloatArray:
+        """Probability (K,) of an attack of each kind."""
+        attacked: FloatArray = self._weights[1:]
+        return attacked
+
     def blocks(self) -> list[list[str]]:
         """The team as it is cut into blocks."""
         return [list(names) for names in self._names]

@@ -78,6 +78,9 @@ class JudgedFrame:
             return None
         ego_sees = self._evidence.ego_witnesses
         gained = np.maximum(0.0, choice.utility(known.posterior, options) - max(0.0, self._best_answer()[1]))
+        most_promised = choice.INFORMATION_VALUE * choice.most_promised(known)
+        if outcomes and gained.max() + most_promised <= choice.TEST_COST:  # as in most frames of an honest team
+            return None
         may_wait = len(self._team) > EXACT and not outcomes and passes > 1
         if not outcomes and not may_wait:  # what cannot be the best is not worth reckoning
             most = choice.INFORMATION_VALUE * choice.most_information(known, options)

@@ -132,6 +132,17 @@ class EvidenceModel:
         apart = self._parts[None, :, :, None] * grid.reshape(*grid.shape[:2], 1, -1)
         return apart.reshape(*grid.shape[:2], -1)
 
+    @cached_property
+    def most_telling(self) -> tuple[FloatArray, FloatArray]:
+        """Relative entropies (K,) of outcomes under each kind of attack to honest ones, at most, bits: of a fusion
+        beside the ego and beside a part of it together, and of a fusion beside itself in the frame before.
+        """
+        honest, attacked = self._by_size[:, None, :CLEAN], self._by_size[:, CLEAN:, None]
+        pairs = _differ(attacked, honest).reshape(len(SIZES), len(self.kinds), -1).max(axis=2)
+        beside_ego = np.array([a == 0 for a, _ in SIZES])
+        changed = _differ(self.changes[1:], self.changes[0]).reshape(len(self.kinds), -1)
+        return pairs[beside_ego].max(axis=0) + pairs[~beside_ego].max(axis=0), changed.max(axis=1)
+
     def tables(self, a: IntArray, d: IntArray) -> FloatArray:
         """Tables (n, CLEAN + 3 K, BINS) for pairs of these sizes (n,) and (n,); d at least 1."""
         return self._by_size[size_row(a, d)]
@@ -213,4 +224,10 @@ class EvidenceModel:
 def _entropy(p: FloatArray) -> FloatArray:
     """Sum of -p log2 p over the last axis."""
     bits: FloatArray = -np.vecdot(p, np.log2(np.maximum(p, _TINY)))
+    return bits
+
+
+def _differ(p: FloatArray, q: FloatArray) -> FloatArray:
+    """Relative entropy of p to q over the last axis, bits."""
+    bits: FloatArray = np.vecdot(p, np.log2(p / q))
     return bits

@@ -3,8 +3,16 @@ import pytest
 
 from robosac.answers import Verdict
 from robosac.boxes import pose_matrix
+from robosac.calibrated import calibration_of
 from robosac.defenses import Outcome
-from robosac.defenses.group_testing.choice import DEPENDENCE, GAIN, GAIN_SCALE, expected_information, gain
+from robosac.defenses.group_testing.choice import (
+    DEPENDENCE,
+    GAIN,
+    GAIN_SCALE,
+    expected_information,
+    gain,
+    most_promised,
+)
 from robosac.defenses.group_testing.evidence import Evidence
 from robosac.defenses.group_testing.geometry import followed
 from robosac.defenses.group_testing.knowledge import Knowledge
@@ -61,6 +69,22 @@ def test_beside_an_ego_that_is_no_witness_only_subsets_of_each_other_tell():
     first = SINGLES[:1]
     assert bits(Memory(), SINGLES[1:], first).min() > 0.05
     assert bits(Memory(), SINGLES[1:], first, ego_sees=False) == pytest.approx(np.zeros(len(SINGLES) - 1))
+
+
+@pytest.mark.parametrize("seed", range(20))
+def test_no_subset_promises_more_than_the_most(detector, seed):
+    model, rng = calibration_of(detector.info).levels[1].with_lies, np.random.default_rng(seed)
+    posterior = Posterior(len(model.kinds), 10 ** -rng.uniform(0.1, 4), 0.25, TEAM)
+    for _ in range(seed % 4):
+        a, d = SINGLES[rng.permutation(len(TEAM))[:2]]
+        posterior.update(a & (rng.random() < 0.5), d, rng.normal(size=4 + 3 * len(model.kinds)))
+    options = rng.random((30, len(TEAM))) < 0.5
+    options = options[options.any(axis=1)]
+    shown = {int(IDENTITIES[i]): followed(SEEN, np.eye(4)) for i in range(len(TEAM))}
+    known = Knowledge(model, posterior, Memory(frame=5, shown=shown))
+    for decoded in (NONE, SINGLES[:2], np.ones((1, len(TEAM)), dtype=bool)):
+        promised = expected_information(known, options, decoded, ego_sees=True)
+        assert 0 < promised.max() <= most_promised(known)
 
 
 @pytest.mark.parametrize(("score", "witnesses"), [(0.9, True), (0.3, False)])
