@@ -14,11 +14,10 @@ from functools import partial
 from typing import Any, TypeVar
 
 import numpy as np
-import rfc8785
 
 from robosac.ahead import Ahead
 from robosac.answers import Reason, Source, Verdict
-from robosac.arguments import by_text, check_deadline, check_defense, check_frame, check_rng
+from robosac.arguments import check_deadline, check_defense, check_frame, check_rng
 from robosac.boxes import FloatArray
 from robosac.calibrated import witness_of
 from robosac.consensus import at_least, compare
@@ -32,7 +31,6 @@ from robosac.defenses import (
     Reference,
     Rejection,
     State,
-    shipped,
     trusted_in,
 )
 from robosac.defenses.batch import likely_after
@@ -41,11 +39,12 @@ from robosac.detectors.base import Testifying
 from robosac.faults import describe
 from robosac.passes import Passes
 from robosac.previous import PreviousAnswer
-from robosac.provenance import UnverifiedAnswer, best_first, unfounded
+from robosac.provenance import UnverifiedAnswer, best_first
 from robosac.result import FusionResult
 from robosac.screening import Screened, Screening, joined, separated
 from robosac.steps import Steps, finished
 from robosac.testimony import Testimony
+from robosac.verified import check_asked, check_decided
 
 __all__ = ["FrameRun", "FusionResult", "UnverifiedAnswer", "fuse"]
 
@@ -221,51 +220,13 @@ class FrameRun:
         try:
             batch = next(conversation)
             while True:
-                self._check_asked(batch, team)
+                check_asked(self.defense, batch, team)
                 batch = conversation.send((yield from self._test(passes, batch)))
         except StopIteration as stop:
             decision: Decision = stop.value
-        if not isinstance(decision, Decision):
-            raise TypeError(f"{self.defense.kind}: converse must return a Decision, got a {type(decision).__name__}")
-        self._check(decision, team, state)
-        return decision
-
-    def _check_asked(self, batch: Sequence[Hypothesis], team: list[str]) -> None:
-        """Of defences that do not ship, look at what they ask for."""
-        if self.defense.kind in shipped():
-            return
-        if not isinstance(batch, Iterable):
-            raise TypeError(
-                f"{self.defense.kind}: converse must yield lists of hypotheses, got a {type(batch).__name__}"
-            )
-        for subset in batch:
-            if not isinstance(subset, tuple) or not set(team).issuperset(subset):
-                what = f"converse asked for {subset!r}; a hypothesis is a tuple of teammates, who are {', '.join(team)}"
-                raise ValueError(f"{self.defense.kind}: {what}")
-
-    def _check(self, decision: Decision, team: list[str], state: State) -> None:
-        """Nothing reaches the answer that was not verified in this frame or trusted before; nor does trust come from
-        less. And what is to be remembered can be.
-        """
         verified = {o.teammates for o in self.outcomes if o.verdict is Verdict.CONSENSUS}
-        trusted = set(trusted_in(state))
-        allowed = {
-            Source.CONSENSUS: bool(decision.accepted) and decision.accepted in verified,
-            Source.TRUSTED: bool(decision.accepted) and trusted.issuperset(decision.accepted),
-            Source.EGO_ONLY: not decision.accepted,
-        }
-        if not allowed[decision.source]:
-            raise UnverifiedAnswer(f"{self.defense.kind} answered {decision.source} with {decision.accepted}")
-        if sorted([*decision.accepted, *decision.rejected]) != team:
-            raise UnverifiedAnswer(f"{self.defense.kind} neither accepted nor rejected some of {team}")
-        if not trusted.union(*verified).issuperset(decision.trusted):
-            raise UnverifiedAnswer(f"{self.defense.kind} trusts {list(decision.trusted)} without a consensus")
-        if doubt := next(unfounded(decision, team, self.boxes), None):
-            raise UnverifiedAnswer(f"{self.defense.kind} {doubt}")
-        if self.defense.kind not in shipped():  # those that ship are known to keep JSON, and theirs may be long
-            rfc8785.dumps(dict(decision.state))
-            if doubt := next((name for name, why in decision.rejected.items() if not by_text(why.evidence)), None):
-                raise UnverifiedAnswer(f"{self.defense.kind} gives evidence on {doubt} by keys that are no text")
+        check_decided(self.defense, decision, team, verified, set(trusted_in(state)), self.boxes)
+        return decision
 
     def _assemble(self, passes: Passes, decision: Decision) -> Steps[dict[str, Any]]:
         """The fields of the result that hold boxes, and whose they are; judged ones are checked by now."""
