@@ -43,6 +43,9 @@ from service.sessions.room import Share
 
 logger = structlog.stdlib.get_logger(__name__)
 
+ACCEPT_CHARACTERS = 512
+"""Of the header `Accept` that are looked at: a head may be so long that all of it would hold up everybody."""
+
 v1 = APIRouter(prefix="/v1", responses=documented(422, 503))
 
 
@@ -284,7 +287,7 @@ def _handed_over(answered: Answered, accept: str | None, gateway: Gateway) -> Re
 
 def _negotiated(answer: BaseModel, accept: str | None, status: int = 200) -> Response:
     """msgpack where the client names it before JSON, else JSON."""
-    for media_range in (accept or "").lower().split(","):
+    for media_range in (accept or "")[:ACCEPT_CHARACTERS].lower().split(","):
         media_type, *parameters = (part.strip() for part in media_range.split(";"))
         if any(re.fullmatch(r"q=0(\.0*)?", parameter) for parameter in parameters):
             continue

@@ -94,6 +94,14 @@ async def test_results_come_as_the_client_asks(served, good_frame, accept, media
     assert result["frame"] == 0
 
 
+async def test_of_a_long_accept_only_the_beginning_is_read(served, good_frame):
+    session = await served.open()
+    for before, media_type in (("," * 400, "application/vnd.msgpack"), ("," * 30_000, "application/json")):
+        accept = f"{before}application/vnd.msgpack"
+        response = await served.post(session, "frames", good_frame(len(before)), Accept=accept)
+        assert (response.status_code, response.headers["content-type"]) == (200, media_type)
+
+
 async def test_both_msgpack_types_are_taken_and_others_are_not(served, good_frame):
     session = await served.open()
     response = await served.post(session, "frames", good_frame(0), **{"Content-Type": "application/msgpack"})
