@@ -161,7 +161,7 @@ def unpack(body: bytes, *, trusted: bool = False, most_entries: int = MAX_ENTRIE
             max_map_len=limit if trusted else min(limit, MAX_MAP),
             max_ext_len=limit,
             list_hook=count,
-            object_hook=count,
+            object_pairs_hook=lambda pairs: dict(count(pairs)),  # where a name that comes again is still there
         )
     except msgpack.ExtraData as error:
         raise WireError("malformed-msgpack", "", "is no msgpack, or has bytes left over after its one value") from error

@@ -177,6 +177,13 @@ def test_a_body_that_is_no_msgpack_within_limits_is_refused(body):
     assert (caught.value.code, caught.value.field) == ("malformed-msgpack", "")
 
 
+def test_a_name_that_comes_again_in_a_map_counts_again():
+    again = b"\xde\x04\x00" + b"\x00\xc0" * 1024
+    assert wire.unpack(again) == {0: None}
+    with pytest.raises(wire.WireError, match=f"more than {wire.MAX_ENTRIES} entries"):
+        wire.unpack(b"\xdc\x00\x40" + again * 64)
+
+
 @pytest.mark.parametrize("body", [GOOD + b"\x00", b"hello", b'{"frame": 0}'])
 def test_bytes_after_the_value_are_told_as_such(body):
     with pytest.raises(wire.WireError, match="is no msgpack, or has bytes left over after its one value"):
