@@ -7,13 +7,14 @@ import contextlib
 import time
 from collections.abc import AsyncIterator, Callable
 from contextlib import AbstractContextManager
-from dataclasses import dataclass
+from dataclasses import dataclass, field
 from typing import TypeVar
 
 from robosac import wire
 from robosac.answers import Reason
 from service.arriving.bodies import SMALL_BYTES
 from service.arriving.checking import InFrame, read_frame, read_message, reason_of
+from service.arriving.giving_way import Line
 from service.deciding.admission import Admission
 from service.deciding.answering import Deciding
 from service.deciding.asked import Answered, Asked
@@ -31,6 +32,8 @@ T = TypeVar("T")
 
 SLACK_BYTES = 64 * 1024
 """What a message may have besides its tensors."""
+_COMPRESSED = wire.ZSTD.encode()
+"""In a body of which much may come, however small it is."""
 
 
 @dataclass(frozen=True)
@@ -43,6 +46,8 @@ class Frames:
     admission: Admission
     max_jump: int
     """By how much a frame's number may exceed the latest answered one."""
+    reading: Line = field(default_factory=lambda: Line(busy=lambda: False))
+    """Bodies that take long to read, by turns of keys: else whoever sends many at once is read before all others."""
 
     async def post_message(self, caller: Caller, body: bytes, arrived: float, room: Share) -> Answered | Receipt:
         """A vehicle's own message, whose request came then: kept for a teammate, answered for the ego.
@@ -93,7 +98,13 @@ class Frames:
     async def _read(self, caller: Caller, body: bytes, read: Callable[[Caller, bytes], T]) -> T:
         """What a body holds, read off the event loop where that takes long; a refusal goes on record."""
         try:
-            return read(caller, body) if len(body) <= SMALL_BYTES else await asyncio.to_thread(read, caller, body)
+            if len(body) <= SMALL_BYTES and _COMPRESSED not in body:
+                return read(caller, body)
+            turn = await self.reading.turn((caller.live.key, caller.record.session_id))
+            try:
+                return await asyncio.to_thread(read, caller, body)
+            finally:
+                turn.end()
         except InFrame as error:
             await self.refuse(caller, error.what, error.frame)
             raise error.what from error.what.__cause__
