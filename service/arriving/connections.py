@@ -25,7 +25,7 @@ class _TooMuch(Exception):
 
 class BoundedHTTP(HttpToolsProtocol):
     """HTTP of uvicorn, for its option ``http``; hangs up on whoever takes too long, or sends too much, before there is
-    a request to answer.
+    a request to answer, and on whoever does not read what is answered.
 
     The time runs from when a connection is made, or from the first byte after a request is answered, until a whole head
     is in. (How long nothing at all may come after an answer is for ``--timeout-keep-alive`` to say, and how long a body
@@ -33,6 +33,8 @@ class BoundedHTTP(HttpToolsProtocol):
     """
 
     head_timeout_s = 10.0
+    unread_timeout_s = 30.0
+    """How long a client may take nothing of what waits for it. To close a connection would wait for it for ever."""
 
     _deadline: TimerHandle | None = None
     _in_head = False
@@ -41,6 +43,7 @@ class BoundedHTTP(HttpToolsProtocol):
     _pieces = 0
     _body_bytes = 0
     _refused: _TooMuch | None = None
+    _unread: TimerHandle | None = None
 
     def connection_made(self, transport: Transport) -> None:  # type: ignore[override]
         super().connection_made(transport)
@@ -90,7 +93,16 @@ class BoundedHTTP(HttpToolsProtocol):
 
     def connection_lost(self, exc: Exception | None) -> None:
         self._disarm()
+        self._forget_unread()
         super().connection_lost(exc)
+
+    def pause_writing(self) -> None:
+        super().pause_writing()
+        self._watch_unread()
+
+    def resume_writing(self) -> None:
+        self._forget_unread()
+        super().resume_writing()
 
     def _answering(self) -> bool:
         return self.cycle is not None and not self.cycle.response_complete
@@ -104,6 +116,22 @@ class BoundedHTTP(HttpToolsProtocol):
         if self._deadline is not None:
             self._deadline.cancel()
             self._deadline = None
+
+    def _watch_unread(self) -> None:
+        waits = self.transport.get_write_buffer_size()
+        self._unread = self.loop.call_later(self.unread_timeout_s, self._look_at_unread, waits)
+
+    def _look_at_unread(self, before: int) -> None:
+        """Cut the connection off if nothing was taken since then; what waits for it is lost."""
+        if self.transport.get_write_buffer_size() < before:
+            self._watch_unread()
+        else:
+            self.transport.abort()
+
+    def _forget_unread(self) -> None:
+        if self._unread is not None:
+            self._unread.cancel()
+            self._unread = None
 
     def _refuse(self, status: str, why: str) -> None:
         """Let the parser stop; it then has a 400 sent."""

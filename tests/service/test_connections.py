@@ -16,8 +16,11 @@ SLOW = b"GET /slow HTTP/1.1\r\nHost: x\r\n\r\n"
 TIMEOUT_S = 0.4
 
 
+LARGE = 2**24
+
+
 class Hasty(BoundedHTTP):
-    head_timeout_s = TIMEOUT_S
+    head_timeout_s = unread_timeout_s = TIMEOUT_S
 
 
 async def application(scope, receive, send):
@@ -28,8 +31,9 @@ async def application(scope, receive, send):
     if scope["method"] == "POST":
         while (await receive()).get("more_body"):
             pass
-    await send({"type": "http.response.start", "status": 200, "headers": [(b"content-length", b"2")]})
-    await send({"type": "http.response.body", "body": b"ok"})
+    body = b"ok" if scope["path"] != "/large" else bytes(LARGE)
+    await send({"type": "http.response.start", "status": 200, "headers": [(b"content-length", b"%d" % len(body))]})
+    await send({"type": "http.response.body", "body": body})
 
 
 @pytest.fixture
@@ -106,6 +110,23 @@ async def test_a_body_may_take_longer_than_a_head(port):
             await asyncio.sleep(TIMEOUT_S / 5)
             writer.write(b"x")
         assert b"200" in await reader.readuntil(b"\r\n\r\n")
+
+
+async def test_whoever_does_not_read_an_answer_is_cut_off(port):
+    request = GET.replace(b"/", b"/large", 1).replace(b"\r\n\r\n", b"\r\nConnection: close\r\n\r\n")
+    for slowly in (False, True):
+        reader, writer = await asyncio.open_connection("127.0.0.1", port, limit=2**16)
+        writer.write(request)
+        taken = 0
+        try:
+            await asyncio.sleep(0 if slowly else 3 * TIMEOUT_S)
+            while piece := await reader.read(2**20):
+                taken += len(piece)
+                await asyncio.sleep(TIMEOUT_S / 40 if slowly else 0)
+        except ConnectionError:
+            pass
+        assert (taken > LARGE) is slowly
+        writer.close()
 
 
 @pytest.mark.parametrize("before", [b"", GET])
