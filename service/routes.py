@@ -39,6 +39,7 @@ from service.schemas import (
 )
 from service.sessions.live import Caller, Standing
 from service.sessions.moving import news
+from service.sessions.pages import pieces
 from service.sessions.room import Share
 
 logger = structlog.stdlib.get_logger(__name__)
@@ -67,6 +68,17 @@ async def _session_request(request: Request, gateway: GatewayDep, key_id: KeyId)
 async def _enrolment_request(request: Request, gateway: GatewayDep, caller: ProvenEgo) -> EnrolmentRequest:
     with _room(gateway, caller).holding(expected_bytes(request, JSON_BYTES)):
         return await read_json(request, EnrolmentRequest)
+
+
+async def _kept_messages(
+    caller: Ego, gateway: GatewayDep, frame: Annotated[int, Path(ge=0, le=wire.MAX_FRAME)]
+) -> AsyncIterator[bytes]:
+    """They count as a body in hand until they are sent: whoever does not read them makes the gateway hold no more."""
+    kept = await gateway.store.messages(caller.record.session_id, frame)
+    if kept is None:
+        raise Refused(Kind.MESSAGES_NOT_KEPT, "no messages of that frame are kept", "frame")
+    with _room(gateway, caller).holding(len(kept)):
+        yield kept
 
 
 async def _standing(caller: Vehicle, gateway: GatewayDep) -> AsyncIterator[Standing]:
@@ -248,14 +260,9 @@ async def stand_by(
     tags=["audit"],
     responses=description.KEPT,
 )
-async def get_messages(
-    caller: Ego, gateway: GatewayDep, frame: Annotated[int, Path(ge=0, le=wire.MAX_FRAME)]
-) -> Response:
+async def get_messages(kept: Annotated[bytes, Depends(_kept_messages)]) -> Response:
     """The messages of a decided frame as a whole frame, where the gateway keeps them, to replay the decision."""
-    kept = await gateway.store.messages(caller.record.session_id, frame)
-    if kept is None:
-        raise Refused(Kind.MESSAGES_NOT_KEPT, "no messages of that frame are kept", "frame")
-    return Response(kept, media_type=MSGPACK)
+    return StreamingResponse(pieces(kept), media_type=MSGPACK, headers={"Content-Length": str(len(kept))})
 
 
 def _room(gateway: Gateway, caller: Caller) -> Share:

@@ -15,13 +15,13 @@ logger = structlog.stdlib.get_logger(__name__)
 
 PATIENCE_S = 30.0
 """How long a socket may take nothing. Meanwhile `service.viewing.viewers` bounds what waits for a viewer's, and
-`service.sessions.pages` what of a log.
+`service.sessions.pages` what of a log or of kept messages.
 """
-_STREAMED = re.compile(r"/v1/(live/|sessions/[^/]*/(audit|standby)$)")
+_STREAMED = re.compile(r"/v1/(live/|sessions/[^/]*/(audit|standby|frames/[^/]*/messages)$)")
 
 
 class HangingUp:
-    """Middleware that ends a stream whose socket takes nothing for too long: of a viewer, or of a log."""
+    """Middleware that ends a stream whose socket takes nothing for too long: of a viewer, a log, or kept messages."""
 
     def __init__(self, app: ASGIApp, patience_s: float = PATIENCE_S) -> None:
         self._app = app

@@ -1,4 +1,4 @@
-"""A log as it is sent, some lines at a time."""
+"""A log, and what else is long, as it is sent: a little at a time."""
 
 from __future__ import annotations
 
@@ -12,7 +12,7 @@ from service.keeping.store import PAGE, Store
 FIRST_PAGE = 4
 """Lines of a log that are read first; then at most twice as many as were sent before."""
 PAGE_BYTES = 2**18
-"""What is sent of a log at a time, or one line: whoever stops to read it makes the gateway hold no more."""
+"""What is sent at a time, or one line of a log: whoever stops to read it makes the gateway hold no more."""
 
 
 async def pages(store: Store, session_id: str, after: int, last: int) -> AsyncIterator[str]:
@@ -32,6 +32,12 @@ async def pages(store: Store, session_id: str, after: int, last: int) -> AsyncIt
         fitting = max(1, bisect_right(list(accumulate(map(len, lines))), PAGE_BYTES))
         after, page = after + fitting, min(PAGE, 2 * fitting)
         yield "\n".join(lines[:fitting]) + "\n"
+
+
+async def pieces(body: bytes) -> AsyncIterator[bytes]:
+    """A body that is at hand as a whole."""
+    for start in range(0, len(body), PAGE_BYTES):
+        yield body[start : start + PAGE_BYTES]
 
 
 async def begun(pages: AsyncIterator[str]) -> AsyncIterator[str]:

@@ -1,3 +1,4 @@
+import asyncio
 import dataclasses
 
 import numpy as np
@@ -8,6 +9,7 @@ from robosac import wire
 from robosac.detectors import Message
 from robosac.detectors.narrow import rounded
 from robosac.signatures import show_public_key, sign
+from service.sessions.pages import PAGE_BYTES
 from tests.service.conftest import EGO, TEAM, problem, serve
 
 NONE = {"kind": "none"}
@@ -238,3 +240,34 @@ async def test_messages_are_kept_for_replays_if_wanted(messages, benign):
         headers = {"Authorization": f"Bearer {session.ego_token}"}
         url = f"/v1/sessions/{session.session_id}/frames/0/messages"
         problem(await served.http.get(url, headers=headers), 404, "messages-not-kept")
+
+
+async def test_kept_messages_are_in_hand_until_they_are_read(messages, benign):
+    async with serve(keep_frames=1, max_inflight_bytes=2**20) as served:
+        session = await served.open(defense=NONE)
+        await served.ego(session).post_frame(0, messages[EGO], benign)
+        kept, room = await served.ego(session).kept_messages(0), served.gateway.bodies
+        taken = []
+
+        async def receive():
+            await asyncio.Event().wait()
+
+        async def send(message):
+            taken.append(message)
+            if message["type"] == "http.response.body":
+                await asyncio.Event().wait()
+
+        headers = [(b"authorization", f"Bearer {session.ego_token}".encode()), (b"host", b"gateway")]
+        url = f"/v1/sessions/{session.session_id}/frames/0/messages"
+        scope = {"type": "http", "method": "GET", "path": url, "query_string": b"", "headers": headers}
+        unread = asyncio.create_task(served.http._transport.app({**scope, "client": ("127.0.0.1", 1)}, receive, send))
+        while len(taken) < 2:
+            await asyncio.sleep(0.005)
+        assert dict(taken[0]["headers"])[b"content-length"] == str(len(kept)).encode()
+        assert len(taken[1]["body"]) == PAGE_BYTES
+        assert room.nbytes == len(kept)
+        answer = await served.http.get(url, headers={"Authorization": f"Bearer {session.ego_token}"})
+        problem(answer, 503, "overloaded")
+        unread.cancel()
+        await asyncio.gather(unread, return_exceptions=True)
+        assert room.nbytes == 0
