@@ -95,6 +95,8 @@ class Deciding:
     async def _decide(self, asked: Asked, work: Work) -> Answered:
         """As `answer`, from the session as this process knows it."""
         record = await self.sessions.current(asked.caller)
+        if record.digests != asked.caller.live.digests:
+            raise SessionChanged("the session goes on with other weights of its detector; try again")
         present, left_out = self._who_takes_part(asked, record)
         try:
             decided = await self._fuse(asked, work, record, present)

@@ -55,6 +55,11 @@ class SessionRecord:
     """Changes to the session so far, other than to its log."""
 
     @property
+    def digests(self) -> tuple[str | None, str | None]:
+        """Of the weights and the calibration that it goes on with."""
+        return self.weights_digest, self.calibration_digest
+
+    @property
     def purging(self) -> bool:
         """Whether its log is being purged, and is not whole any more."""
         return not self.token_ids

@@ -17,7 +17,7 @@ def has_changed(record: SessionRecord, info: DetectorInfo) -> bool:
     """Whether a detector has other weights or another calibration than the session's, where these are known."""
     if record.weights_digest is None:
         return False
-    return (record.weights_digest, record.calibration_digest) != (info.weights_digest, calibration_digest(info))
+    return record.digests != (info.weights_digest, calibration_digest(info))
 
 
 def detector_changed(info: DetectorInfo, *, accepted: bool) -> DetectorChanged:

@@ -53,6 +53,8 @@ class LiveSession:
     budget_s: float
     key: str = ""
     """Which API key opened it (`service.sessions.identity.ApiKeys`)."""
+    digests: tuple[str | None, str | None] = (None, None)
+    """As `service.keeping.record.SessionRecord.digests` when it began here."""
     answered: int | None = None
     ego_proof: Proof | None = None
     lock: asyncio.Lock = field(default_factory=asyncio.Lock)

@@ -257,14 +257,15 @@ class Sessions:
             Motion(settings.max_speed_mps, record.frame_period_ms / 1e3, settings.max_range_m),
             record.latency_budget_ms / 1e3,
             record.key_id,
+            record.digests,
         )
 
     async def _noting_other_weights(self, record: SessionRecord) -> SessionRecord:
         """The session, after a start with other weights of its detector's name with these, if that is allowed; it goes
-        on record either way, once in the life of a process.
+        on record either way, once in the life of a process, or as often as another one lets it go on with its own.
         """
         detector = self.engine.detectors.get(record.detector)
-        if record.session_id in self._live or detector is None or not has_changed(record, detector.info):
+        if self._held(record) is not None or detector is None or not has_changed(record, detector.info):
             return record
         event = detector_changed(detector.info, accepted=self.settings.allow_other_weights)
         logger.warning("other weights", session_id=record.session_id, detector=record.detector, accepted=event.accepted)
@@ -303,10 +304,18 @@ class Sessions:
         return True
 
     def _live_session(self, record: SessionRecord) -> LiveSession:
-        live = self._live.get(record.session_id)
+        live = self._held(record)
         if live is None:
             live = self._live[record.session_id] = self._revive(record)
         return live
+
+    def _held(self, record: SessionRecord) -> LiveSession | None:
+        """What this process holds of a session, unless another let it go on with other weights since."""
+        live = self._live.get(record.session_id)
+        if live is None or live.digests == record.digests:
+            return live
+        self._forget(record.session_id)
+        return None
 
     async def _holder(self, record: SessionRecord, token: str | None) -> str:
         """The vehicle of the session that a token belongs to; a refusal goes on record, but only so many of them."""

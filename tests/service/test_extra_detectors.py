@@ -126,6 +126,29 @@ async def test_other_weights_of_the_same_name_are_recorded_and_have_to_be_allowe
     assert replay.replay(decision, body, EmbeddedDetector(ADVERSARIAL_WEIGHTS)) == []
 
 
+@pytest.mark.parametrize("allowed", [True, False])
+async def test_two_gateways_with_different_weights_decide_each_as_the_log_says(tmp_path, good_frame, allowed):
+    shared = {"database_url": f"sqlite:///{tmp_path}/robosac.db", "keep_frames": 9}
+    one = serve(**shared, allow_other_weights=allowed)
+    other = serve(**shared, allow_other_weights=True, extra_detectors=(str(ADVERSARIAL_WEIGHTS),))
+    detectors_of_both = EmbeddedDetector(), EmbeddedDetector(ADVERSARIAL_WEIGHTS)
+    own = {detector.info.weights_digest: detector for detector in detectors_of_both}
+    async with one as first, other as second:
+        session = await first.open(defense={"kind": "sample_consensus"})
+        for frame, served in enumerate((first, second, first, second)):
+            answer = await served.post(session, "frames", good_frame(frame))
+            if allowed or frame != 2:
+                assert answer.status_code == 200
+            else:
+                problem(answer, 503, "detector-unavailable")
+                assert await served.ego(session).audit_lines()
+        lines = [line.encode() for line in await second.ego(session).audit_lines()]
+        assert verify(lines) == []
+        for frame in (0, 1, 2, 3) if allowed else (0, 1, 3):
+            decision, body = replay.find(lines, frame), await second.ego(session).kept_messages(frame)
+            assert replay.replay(decision, body, own[decision.session.weights_digest]) == []
+
+
 async def test_a_precision_is_served_logged_and_needed_for_replay(good_frame):
     name = "intersection-mean@bfloat16"
     async with serve(extra_detectors=name, keep_frames=9) as served:
