@@ -54,6 +54,8 @@ class Deciding:
         ------
         SessionChanged
             If the session keeps being changed.
+        TokenReplaced
+            If the ego's token counts no more by now.
         FrameDecided, SessionOver, StoreUnavailable, StoreTooSlow
             As `service.deciding.keeping.Keeping.keep`. The frame can be asked for again, with the messages that are in.
         """
@@ -95,6 +97,7 @@ class Deciding:
     async def _decide(self, asked: Asked, work: Work) -> Answered:
         """As `answer`, from the session as this process knows it."""
         record = await self.sessions.current(asked.caller)
+        asked.caller.check_token(record)
         if record.digests != asked.caller.live.digests:
             raise SessionChanged("the session goes on with other weights of its detector; try again")
         present, left_out = self._who_takes_part(asked, record)

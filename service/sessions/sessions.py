@@ -155,6 +155,8 @@ class Sessions:
     async def close(self, caller: Caller) -> str:
         """End a session, after the frame in hand; the head of its log, which is complete by then."""
         async with caller.live.lock:
+            with contextlib.suppress(SessionOver):  # somebody else has just ended it
+                caller.check_token(await self.current(caller))
             await self._end(caller.record.session_id, "closed")
         record = await self.store.get(caller.record.session_id)
         if record is None:

@@ -1,4 +1,5 @@
 import asyncio
+import dataclasses
 import json
 import time
 from datetime import datetime
@@ -127,6 +128,21 @@ async def test_a_vehicle_that_leaves_while_it_waits_for_a_token_gets_none(served
     with pytest.raises(AccessDenied):
         await waiting
     assert "rsu" not in (await served.ego(session).state())["teammates"]
+
+
+async def test_what_the_ego_asked_with_a_token_that_is_replaced_meanwhile_is_not_done(served, good_frame):
+    session = await served.open()
+    async with (await served.gateway.sessions.authenticate(session.session_id, session.ego_token)).live.lock:
+        renewing = asyncio.create_task(served.ego(session).renew())
+        await asyncio.sleep(0.05)
+        asking = asyncio.create_task(served.post(session, "frames", good_frame(0)))
+        ending = asyncio.create_task(served.ego(session).close())
+        await asyncio.sleep(0.05)
+    session = dataclasses.replace(session, ego_token=(await renewing).token)
+    problem(await asking, 401, "unauthenticated")
+    with pytest.raises(AccessDenied):
+        await ending
+    assert (await served.post(session, "frames", good_frame(0))).status_code == 200
 
 
 async def test_renewals_are_bounded_between_two_frames(served, ego_message, benign):
