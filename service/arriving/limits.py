@@ -58,6 +58,8 @@ async def read_bounded(request: Request, limit: int) -> bytes:
 class BodyLimit:
     """Bounds every body, whatever route reads it: one that is too large is refused by its announced length, else when
     it outgrows the limit; one that is too slow, when its time is over. Hangs up where much of a body was not wanted.
+    Nobody wants one that comes beside an answer that goes on: it may take its time, and ends the answer if it is too
+    large.
 
     Parameters
     ----------
@@ -81,7 +83,7 @@ class BodyLimit:
         announced = announced_bytes(headers)
         unannounced = announced == 0 and "transfer-encoding" in headers
         taken = 0
-        complete = False
+        complete = started = False
         end: float | None = None
 
         async def bounded() -> Message:
@@ -90,17 +92,23 @@ class BodyLimit:
                 return await receive()
             end = asyncio.get_running_loop().time() + self._timeout_s if end is None else end
             try:
-                async with asyncio.timeout_at(end):
+                async with asyncio.timeout_at(None if started else end):
                     message = await receive()
             except TimeoutError as error:
+                if started:
+                    return await bounded()
                 raise Refused(Kind.SLOW_BODY, "the body did not come in time") from error
             complete = not message.get("more_body", False)
             taken += len(message.get("body", b""))
             if taken > self._limit:
+                if started:
+                    return {"type": "http.disconnect"}
                 raise too_large(self._limit)
             return message
 
         async def hanging_up(message: Message) -> None:
+            nonlocal started
+            started = started or message["type"] == "http.response.start"
             if message["type"] == "http.response.start" and not complete:
                 left = math.inf if unannounced else announced - taken
                 if left > UNREAD_BYTES and "connection" not in Headers(raw=message["headers"]):

@@ -9,12 +9,13 @@ import pytest
 from cryptography.hazmat.primitives.asymmetric.ed25519 import Ed25519PrivateKey
 from pydantic import BaseModel, field_validator
 from starlette.requests import Request
+from starlette.responses import StreamingResponse
 
 from robosac.signatures import show_public_key
 from service.app import create_app
 from service.arriving import bodies
 from service.arriving.doors import HEADER_BYTES, HEADERS, TARGET_BYTES
-from service.arriving.limits import UNREAD_BYTES
+from service.arriving.limits import UNREAD_BYTES, BodyLimit
 from service.settings import Settings
 from tests.service.conftest import problem, serve
 from tests.service.test_identity import ANYBODY, EGO_ONLY, KEY, KEY_HOLDER, OTHER_KEY, RULES, bearer
@@ -249,3 +250,23 @@ async def test_idle_connections_do_not_use_up_a_small_limit_of_open_files():
     )
     process = await asyncio.create_subprocess_exec(sys.executable, "-c", code, stdout=asyncio.subprocess.PIPE)
     assert (await process.communicate())[0].strip() == b"True"
+
+
+@pytest.mark.parametrize(("piece", "sent"), [(b"", b"abc"), (b"x" * 60, b"a")])
+async def test_a_body_beside_an_answer_that_goes_on_is_no_fault(piece, sent):
+    async def answer():
+        for part in (b"a", b"b", b"c"):
+            yield part
+            await asyncio.sleep(0.1)
+
+    async def receive():
+        await asyncio.sleep(0.02 if piece else 3600.0)
+        return {"type": "http.request", "body": piece, "more_body": True}
+
+    async def send(message):
+        answered.append(message.get("body", b""))
+
+    answered: list[bytes] = []
+    scope = {"type": "http", "method": "GET", "headers": [(b"transfer-encoding", b"chunked")]}
+    await BodyLimit(StreamingResponse(answer()), 100, 0.05)(scope, receive, send)
+    assert b"".join(answered) == sent
