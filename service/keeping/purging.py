@@ -21,6 +21,8 @@ from service.keeping.tables import audit_lines, kept_messages, sessions
 
 LINES_TOGETHER = 512
 SESSIONS_TOGETHER = 256
+BARE_TOGETHER = 4096
+"""Sessions of which nothing else is left, in PostgreSQL: nobody waits for them."""
 MESSAGES_TOGETHER = 1
 """Frames, of a megabyte or so each."""
 
@@ -73,7 +75,11 @@ async def _drop_parts(database: Database, moment: float) -> None:
     for session_id in await _ids(database, pinned):
         while await _done(database, _lines(session_id)):
             pass
-    await _done(database, delete(sessions).where(purged, ~exists().where(its_line)))
+    # all other lines are of parts that are still there
+    gone = ENDED, purged, sessions.c.touched_at < partitions.day(moment) * partitions.DAY_S, ~exists().where(its_line)
+    some = select(sessions.c.session_id).where(*gone).limit(BARE_TOGETHER).scalar_subquery()
+    while await _done(database, delete(sessions).where(sessions.c.session_id.in_(some))):
+        pass
 
 
 async def _ids(database: Database, query: Select[Any]) -> list[str]:

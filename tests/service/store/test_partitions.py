@@ -142,6 +142,27 @@ async def test_a_day_goes_as_a_whole_once_nobody_can_read_its_logs(url):
             await store.log(other, note())
 
 
+async def test_many_sessions_of_a_day_go_a_few_at_a_time(url, monkeypatch):
+    monkeypatch.setattr("service.keeping.purging.BARE_TOGETHER", 10)
+    store, old, now = Store(url, limits=Limits(statement_s=0.5)), day() - 9, time.time()
+    try:
+        await store.start()
+        for number in range(100):
+            await store.end(await added(store, number), THE_END)
+        await written_on(url, f"{0:032x}", old)
+        await run(
+            url,
+            f"UPDATE audit_lines SET day = {old}",
+            f"UPDATE sessions SET touched_at = {now - 9 * DAY_S}",
+            "CREATE FUNCTION slow() RETURNS trigger AS 'BEGIN PERFORM pg_sleep(.01); RETURN OLD; END' LANGUAGE plpgsql",
+            "CREATE TRIGGER slow BEFORE DELETE ON sessions FOR EACH ROW EXECUTE FUNCTION slow()",
+        )
+        await store.purge(now - 7 * DAY_S)
+        assert await run(url, "SELECT * FROM sessions") == []
+    finally:
+        await store.close()
+
+
 async def test_parts_go_where_logs_are_kept_for_less_than_a_day(url):
     now, old = time.time(), day() - 2
     async with opened(url) as store:
