@@ -12,7 +12,7 @@ from collections.abc import Callable, Iterator, Sequence
 from functools import partial
 from typing import Any
 
-from sqlalchemy import Delete, Select, Update, delete, exists, select, update
+from sqlalchemy import Column, Delete, Select, Table, Update, delete, exists, select, tuple_, update
 
 from service.keeping import partitions
 from service.keeping.database import Database
@@ -39,10 +39,10 @@ async def purge(database: Database, moment: float, *forget: Callable[[str], None
         while some := await _ids(database, ended.where(sessions.c.token_ids != "{}").limit(SESSIONS_TOGETHER)):
             await _forget_together(database, some)
             _tell(forget, *some)
-    for session_id in () if in_parts else await _ids(database, ended):
-        await _done(database, _locked([session_id]))
-        _tell(forget, session_id)
-        for part in parts(session_id):
+    while not in_parts and (some := await _ids(database, ended.limit(SESSIONS_TOGETHER))):
+        await _done(database, _locked(some))
+        _tell(forget, *some)
+        for part in parts(some):
             while await _done(database, part):
                 pass
     if has_parts:
@@ -60,7 +60,7 @@ async def _forget_together(database: Database, session_ids: Sequence[str]) -> No
     await _done(database, _locked(session_ids))
     with_messages = select(kept_messages.c.session_id).where(kept_messages.c.session_id.in_(session_ids)).distinct()
     for session_id in await _ids(database, with_messages):
-        while await _done(database, _messages(session_id)):
+        while await _done(database, _messages([session_id])):
             pass
 
 
@@ -73,7 +73,7 @@ async def _drop_parts(database: Database, moment: float) -> None:
         purged, exists().where(its_line, audit_lines.c.day < partitions.day(moment))
     )
     for session_id in await _ids(database, pinned):
-        while await _done(database, _lines(session_id)):
+        while await _done(database, _lines([session_id])):
             pass
     # all other lines are of parts that are still there
     gone = ENDED, purged, sessions.c.touched_at < partitions.day(moment) * partitions.DAY_S, ~exists().where(its_line)
@@ -96,23 +96,26 @@ def _locked(session_ids: Sequence[str]) -> Update:
     return update(sessions).where(sessions.c.session_id.in_(session_ids)).values(token_ids="{}")
 
 
-def parts(session_id: str) -> Iterator[Delete]:
-    """What to delete, one after another, each as often as there is something: messages, then the log, then the rest."""
-    yield _messages(session_id)
-    yield _lines(session_id)
-    yield delete(sessions).where(sessions.c.session_id == session_id)
+def parts(session_ids: Sequence[str]) -> Iterator[Delete]:
+    """What to delete, one after another, each as often as there is something: messages, then logs, then the rest."""
+    yield _messages(session_ids)
+    yield _lines(session_ids)
+    yield delete(sessions).where(sessions.c.session_id.in_(session_ids))
 
 
-def _messages(session_id: str) -> Delete:
-    of_session = kept_messages.c.session_id == session_id
-    oldest = select(kept_messages.c.frame).where(of_session).order_by(kept_messages.c.frame).limit(MESSAGES_TOGETHER)
-    return delete(kept_messages).where(of_session, kept_messages.c.frame.in_(oldest.scalar_subquery()))
+def _messages(session_ids: Sequence[str]) -> Delete:
+    return _oldest(kept_messages, kept_messages.c.frame, session_ids, MESSAGES_TOGETHER)
 
 
-def _lines(session_id: str) -> Delete:
-    of_session = audit_lines.c.session_id == session_id
-    oldest = select(audit_lines.c.seq).where(of_session).order_by(audit_lines.c.seq).limit(LINES_TOGETHER)
-    return delete(audit_lines).where(of_session, audit_lines.c.seq.in_(oldest.scalar_subquery()))
+def _lines(session_ids: Sequence[str]) -> Delete:
+    return _oldest(audit_lines, audit_lines.c.seq, session_ids, LINES_TOGETHER)
+
+
+def _oldest(table: Table, number: Column[int], session_ids: Sequence[str], most: int) -> Delete:
+    """The first so many rows of these sessions, to be deleted."""
+    key = table.c.session_id, number
+    first = select(*key).where(table.c.session_id.in_(session_ids)).order_by(*key).limit(most)
+    return delete(table).where(table.c.session_id.in_(session_ids), tuple_(*key).in_(first))
 
 
 def older_messages(session_id: str, before: int) -> Delete:
