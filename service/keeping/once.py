@@ -7,7 +7,7 @@ from __future__ import annotations
 from collections.abc import Callable
 from secrets import token_hex
 
-from sqlalchemy import Connection, delete, func, insert, literal, select, text
+from sqlalchemy import Connection, Delete, delete, func, insert, literal, select, text
 
 from service.errors import Kind, Refused
 from service.keeping.partitions import day
@@ -60,3 +60,8 @@ def use_proof(
     )
     row = {"session_id": session_id, "vehicle_id": vehicle_id, "proof_id": proof_id, "ends_at": ends_at}
     return connection.execute(keep, row).rowcount == 1
+
+
+def forget_proofs(session_id: str) -> Delete:
+    """The proofs of a session that ends, to be deleted: none can count any more."""
+    return delete(used_proofs).where(used_proofs.c.session_id == session_id)

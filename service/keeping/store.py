@@ -265,6 +265,7 @@ class Store:
 
         def keep(connection: Connection) -> None:
             connection.execute(ADD_MESSAGES, {"this": session_id})
+            connection.execute(once.forget_proofs(session_id))
 
         first = partial(check_unused, session_id=session_id, since=unused_since)
         await self._append(session_id, event, lambda _: {"ended_at": event.time}, keep, first=first)

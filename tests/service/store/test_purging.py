@@ -29,3 +29,11 @@ async def test_many_sessions_go_in_few_transactions(store, monkeypatch):
     assert {row.session_id for row in await left_in(store, "sessions")} == {sids[0]}
     assert {row.session_id for row in await left_in(store, "audit_lines")} == {sids[0]}
     assert len(await store.audit(sids[0], 0, 300)) == 201
+
+
+async def test_of_a_session_that_has_ended_no_proof_is_kept(store):
+    ended, other = await added(store), await added(store, 1)
+    for sid in (ended, other):
+        assert await store.use_proof(sid, "a", "p", time.time() + 80, time.time())
+    await store.end(ended, THE_END)
+    assert [row.session_id for row in await left_in(store, "used_proofs")] == [other]
