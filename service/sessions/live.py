@@ -78,6 +78,7 @@ class LiveSession:
             known = [one for one in record.teammates if self.public_keys.get(one) == record.public_keys.get(one)]
             self.gathering.change_team(known)  # what those with another key now have sent does not count
             self.gathering.change_team(record.teammates)
+            self.motion.forget_all_but((record.ego_id, *record.teammates))
             self.team, self.public_keys = record.teammates, record.public_keys
         if record.last_frame is not None and record.last_frame > self.gathering.closed:
             self.gathering.close(record.last_frame)

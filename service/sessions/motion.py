@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+from collections.abc import Collection
+
 import numpy as np
 
 from robosac.boxes import FloatArray
@@ -48,3 +50,7 @@ class Motion:
     def moved(self, vehicle: str, frame: int, pose: FloatArray) -> None:
         """Remember a pose that was believed."""
         self._last[vehicle] = (frame, pose[:3, 3].copy())
+
+    def forget_all_but(self, vehicles: Collection[str]) -> None:
+        """Let go of those who have left."""
+        self._last = {name: last for name, last in self._last.items() if name in vehicles}

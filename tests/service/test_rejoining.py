@@ -106,3 +106,12 @@ async def test_what_waits_at_one_gateway_does_not_count_for_whoever_joins_at_ano
         await ego.enrol(["rsu"], {"rsu": show_public_key(OTHER_KEY)})
         assert (await one.ego(session).ask(0, messages[EGO])).rejected["rsu"].reason == "missing"
         assert await faults(ego) == []
+
+
+async def test_nothing_is_remembered_of_where_those_were_who_left(served, messages, benign):
+    session = await served.open(defense=NONE)
+    ego, live = served.ego(session), served.gateway.sessions.in_use(session.session_id)
+    await ego.post_frame(0, messages[EGO], benign)
+    for name in TEAM[1:]:
+        await ego.dismiss(name)
+    assert set(live.motion._last) == {EGO, TEAM[0]}
