@@ -53,8 +53,8 @@ class Opening:
         """
         info = self._detector(self.settings.detector if request.detector is None else request.detector)
         check_size(request.teammates, self.settings.max_teammates)
-        defense, state = await asyncio.to_thread(_defense, request, info)  # files are read the first time
-        _check_hypotheses(defense, self.settings.max_hypotheses)
+        most = self.settings.max_hypotheses
+        defense, state = await asyncio.to_thread(_defense, request, info, most)  # files are read the first time
         budget_ms, gather_ms = self._times(request)
         self.sessions.quota.check(key_id)
         session_id = secrets.token_hex(16)
@@ -133,9 +133,9 @@ class Opening:
         return already_open
 
 
-def _defense(request: SessionRequest, info: DetectorInfo) -> tuple[DefenseSettings, State]:
-    """Settings of the session's defence, and its state before the first frame."""
-    settings = (request.defense or default_defense(info)).at_period(request.frame_period_ms)
+def _defense(request: SessionRequest, info: DetectorInfo, most: int) -> tuple[DefenseSettings, State]:
+    """Settings of the session's defence, of so many hypotheses a frame at most, and its state before the first one."""
+    settings = _within(request.defense or default_defense(info), most).at_period(request.frame_period_ms)
     try:
         if settings.needs_calibration:
             settings = settings.at_calibration(calibration_of(info))
@@ -146,12 +146,17 @@ def _defense(request: SessionRequest, info: DetectorInfo) -> tuple[DefenseSettin
     return settings, defense.initial_state(request.teammates)
 
 
-def _check_hypotheses(defense: DefenseSettings, most: int) -> None:
-    """Refuse a defence that is to test more hypotheses in a frame than an operator allows."""
-    for name in defense.budgets:
-        if (getattr(defense, name) or 0) > most:
+def _within(defense: DefenseSettings, most: int) -> DefenseSettings:
+    """A defence that tests no more hypotheses in a frame than an operator allows.
+
+    A default is lowered. Refused is only what a session asks for itself.
+    """
+    beyond = [name for name in defense.budgets if (getattr(defense, name) or 0) > most]
+    for name in beyond:
+        if name in defense.model_fields_set:
             detail = f"at most {most} hypotheses of a frame are tested (ROBOSAC_MAX_HYPOTHESES)"
             raise Refused(Kind.INVALID_REQUEST, detail, f"defense.{name}")
+    return defense.model_copy(update=dict.fromkeys(beyond, most))
 
 
 def _first_record(record: SessionRecord, info: DetectorInfo) -> SessionOpened:

@@ -219,7 +219,7 @@ async def test_a_body_counts_as_what_its_tensors_hold_once_they_are_expanded(mes
             {"defense": {"kind": "sample_consensus", "sampling_budget": 10}},
             "defense.sampling_budget",
         ),
-        ("max_hypotheses", 6, {"defense": {"kind": "group_testing"}}, "defense.first_budget"),
+        ("max_hypotheses", 6, {"defense": {"kind": "group_testing", "first_budget": 7}}, "defense.first_budget"),
     ],
 )
 async def test_what_exceeds_a_cap_is_refused_by_its_name(setting, most, request_, field):
@@ -229,6 +229,15 @@ async def test_what_exceeds_a_cap_is_refused_by_its_name(setting, most, request_
         assert refused["field"] == field
         assert str(most) in refused["detail"]
         assert f"ROBOSAC_{setting.upper()}" in refused["detail"]
+
+
+@pytest.mark.parametrize("request_", [{}, {"defense": {"kind": "group_testing"}}])
+async def test_a_cap_on_hypotheses_lowers_what_a_session_leaves_open(request_):
+    async with serve(max_hypotheses=3) as served:
+        opened = await served.http.post("/v1/sessions", json={"ego_id": EGO, "teammates": list(TEAM), **request_})
+        assert opened.status_code == 201, opened.text
+        defense = opened.json()["defense"]
+        assert (defense["kind"], defense["first_budget"], defense["budget"]) == ("group_testing", 3, 3)
 
 
 async def test_a_frame_tests_no_more_hypotheses_than_allowed(messages):
