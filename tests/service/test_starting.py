@@ -4,6 +4,7 @@ from contextlib import closing
 import pytest
 
 from service.app import create_app
+from service.engine import Engine
 from service.settings import Settings
 from service.watching.starting import Starting
 from tests.service.conftest import serve
@@ -31,6 +32,10 @@ async def started(app):
     [
         ({"extra_detectors": "nonesuch:build"}, "ROBOSAC_EXTRA_DETECTORS: nonesuch:build: ModuleNotFoundError: No "),
         ({"extra_detectors": "pyproject.toml"}, "ROBOSAC_EXTRA_DETECTORS: pyproject.toml is not a readable "),
+        (
+            {"extra_detectors": "tests.service.test_starting:Fragile"},
+            "ROBOSAC_EXTRA_DETECTORS: intersection-mean cannot answer a frame of zeros: ZeroDivisionError: ",
+        ),
         ({"device": "nonesuch"}, "ROBOSAC_DEVICE: torch cannot compute on the device 'nonesuch' here: "),
         ({"detector": "nonesuch"}, "ROBOSAC_DETECTOR: unknown detector 'nonesuch'"),
         ({"database_url": "sqlite:////nowhere/x.db"}, "ROBOSAC_DATABASE_URL: /nowhere/x.db: OperationalError: "),
@@ -62,9 +67,12 @@ async def test_a_database_that_cannot_be_used_is_named_in_a_line(tmp_path):
         assert "\n" not in told
 
 
-async def test_a_fault_that_is_no_setting_keeps_its_traceback():
-    app = create_app(Settings(database_url="sqlite://", extra_detectors="tests.service.test_starting:Fragile"))
-    told, raised = await started(app)
+async def test_a_fault_that_is_no_setting_keeps_its_traceback(monkeypatch):
+    async def broken(engine):
+        1 / 0  # noqa: B018
+
+    monkeypatch.setattr(Engine, "find_device", broken)
+    told, raised = await started(create_app(Settings(database_url="sqlite://")))
     assert isinstance(raised, ZeroDivisionError)
     assert told.startswith("Traceback")
 
