@@ -17,7 +17,6 @@ from typing import TYPE_CHECKING, Any  # noqa: E402
 import structlog  # noqa: E402
 from fastapi import FastAPI  # noqa: E402
 
-from robosac.extras import MissingExtra  # noqa: E402
 from service import problems  # noqa: E402
 from service.alone import check_alone  # noqa: E402
 from service.arriving.arrival import Arrival  # noqa: E402
@@ -55,7 +54,7 @@ from service.viewing.feed import Feed  # noqa: E402
 from service.watching.logs import log_as_the_gateway, logging_to_stderr  # noqa: E402
 from service.watching.metrics import Metrics  # noqa: E402
 from service.watching.stalls import LoopWatch  # noqa: E402
-from service.watching.starting import Starting, blamed_on  # noqa: E402
+from service.watching.starting import Starting, asked_by, blamed_on  # noqa: E402
 from service.watching.tracing import Traced, Tracing, provider_from_environment  # noqa: E402
 
 if TYPE_CHECKING:
@@ -146,12 +145,15 @@ def _built(
 ) -> Gateway:
     engine, metrics = Engine(settings.torch_threads, settings.extra_detectors, settings.device), Metrics()
     admission = Admission(settings.max_hypotheses, engine)
-    store = Store(
-        settings.database_url,
-        full_every=settings.audit_full_every,
-        most_records=settings.audit_max_records,
-        limits=Limits(settings.database_connections, settings.database_statement_s),
-    )
+    with asked_by("ROBOSAC_DATABASE_URL"):
+        store = Store(
+            settings.database_url,
+            full_every=settings.audit_full_every,
+            most_records=settings.audit_max_records,
+            limits=Limits(settings.database_connections, settings.database_statement_s),
+        )
+    with asked_by("ROBOSAC_RECORD"):
+        recorder = Recorder(settings, metrics)
     keys = GatewayKeys(settings.gateway_key_file)
     sessions = Sessions(settings, store, engine, metrics, tokens, keys, len(api_keys) > 1, seeds)
     feed = Feed(store.audit, settings.max_viewers, frames_event)
@@ -174,7 +176,7 @@ def _built(
         watch=LoopWatch(),
         feed=feed,
         viewer_tokens=ViewerTokens(settings, open_to_all=not api_keys),
-        recorder=Recorder(settings, metrics),
+        recorder=recorder,
     )
 
 
@@ -223,8 +225,6 @@ async def _running(gateway: Gateway, settings: Settings, tokens: Tokens, tracing
 
 try:
     app = create_app()
-except MissingExtra as missing:
-    raise SystemExit(f"Error: {missing}") from missing
 except ValueError as fault:  # a setting, named in the message
     print(f"Error: {fault}", file=sys.stderr)
     raise SystemExit(2) from fault

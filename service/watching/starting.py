@@ -3,16 +3,33 @@
 from __future__ import annotations
 
 import sys
-from collections.abc import Awaitable
+from collections.abc import Awaitable, Iterator
+from contextlib import contextmanager
 from typing import TypeVar
 
 from starlette.types import ASGIApp, Message, Receive, Scope, Send
 
+from robosac.extras import MissingExtra
 from robosac.faults import describe
 from service.errors import StoreUnavailable
 from service.settings import PREFIX
 
 T = TypeVar("T")
+
+
+@contextmanager
+def asked_by(variable: str) -> Iterator[None]:
+    """Say which variable asks for what an extra brings.
+
+    Raises
+    ------
+    ValueError
+        If the extra is not installed.
+    """
+    try:
+        yield
+    except MissingExtra as missing:
+        raise ValueError(f"{variable}: {missing}") from missing
 
 
 async def blamed_on(variable: str, starting: Awaitable[T], file: str | None = None) -> T:

@@ -48,6 +48,12 @@ async def test_a_setting_that_keeps_the_gateway_from_starting_is_named_in_a_line
     assert "\n" not in told
 
 
+def test_a_setting_that_needs_an_extra_is_named_in_a_line(monkeypatch, tmp_path):
+    monkeypatch.setattr("robosac.extras.find_spec", lambda name: None)
+    with pytest.raises(ValueError, match=r"^ROBOSAC_RECORD: mcap is not installed, .*'robosac\[recordings\]'$"):
+        create_app(Settings(database_url="sqlite://", record=tmp_path))
+
+
 async def test_a_database_that_cannot_be_used_is_named_in_a_line(tmp_path):
     url = f"sqlite:///{tmp_path / 'sessions.db'}"
     async with serve(database_url=url):

@@ -30,7 +30,7 @@ def test_the_gateway_ends_in_one_line_and_serves_sqlite_all_the_same():
     ended = subprocess.run(
         serve, env=environment | {"ROBOSAC_DATABASE_URL": URL}, capture_output=True, text=True, timeout=60, check=False
     )
-    assert (ended.returncode, ended.stderr) == (1, f"Error: {MESSAGE}\n")
+    assert (ended.returncode, ended.stderr) == (2, f"Error: ROBOSAC_DATABASE_URL: {MESSAGE}\n")
     made = [sys.executable, "-W", "error", "-c", WITHOUT + "import service.app"]
     subprocess.run(made, env=environment | {"ROBOSAC_DATABASE_URL": "sqlite://"}, timeout=60, check=True)
 
