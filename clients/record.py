@@ -26,7 +26,7 @@ from robosac.cli.outputs import Force, check_file, make_folder
 from robosac.defenses import Defense, build
 from robosac.detectors import Detector
 from robosac.extras import need
-from robosac.figures import need_figures
+from robosac.figures import check_film, need_figures
 from robosac.recording.reading import RecordedSession, RecordingError, sessions
 
 app = typer.Typer(no_args_is_help=True, add_completion=False, help=__doc__)
@@ -144,19 +144,14 @@ def export(
     """Write what was recorded in another form."""
     from robosac.playback import plain, rerun_file, views  # noqa: PLC0415 (a second to import)
 
+    _check_form(to, out)
     if to is not Form.PICTURES:
         check_file(out, "--out", force)
     (chosen,) = _with_frames([_one(_read(file), session)])
     if to is Form.PICTURES:
         make_folder(out, "--out", force, *(f"{frame.number:06d}.png" for frame in chosen.frames[:1]))
-    if to is Form.RERUN:
-        need("rerun", "files of rerun")
-    if to in (Form.PICTURES, Form.VIDEO):
-        need_figures()
-    if to is Form.VIDEO and out.suffix.lower() not in views.MOVING:
-        raise typer.BadParameter(f"must end with one of {', '.join(views.MOVING)}", param_hint="--out")
     console = Console()
-    with failing(OSError, RecordingError, views.NoFfmpeg), progress(console) as bar:
+    with failing(OSError, RecordingError), progress(console) as bar:
         task = bar.add_task("frames", total=len(chosen.frames))
         tick: Callable[[], None] = lambda: bar.advance(task)  # noqa: E731
         score = chosen.opening.least_score
@@ -169,6 +164,19 @@ def export(
         }[to]()
         bar.update(task, completed=len(chosen.frames))
     console.print(f"{out}: {len(chosen.frames)} frames of {chosen.opening.ego_id}", highlight=False)
+
+
+def _check_form(to: Form, out: Path) -> None:
+    """Refuse before any work what cannot be written here."""
+    if to is Form.RERUN:
+        need("rerun", "files of rerun")
+    elif to is Form.ROS2:
+        need("rosbags", "recordings")
+    elif to is Form.PICTURES:
+        need_figures()
+    elif to is Form.VIDEO:
+        with blaming("--out", ValueError):
+            check_film(out)
 
 
 def _read(file: Path) -> list[RecordedSession]:

@@ -90,7 +90,8 @@ def make_folder(path: Path | None, option: str, report: str, force: bool, *, for
         if for_pictures:
             need_figures()
     except MissingExtra as missing:
-        sys.exit(f"Error: {missing}")
+        typer.echo(f"Error: {missing}", err=True)
+        raise typer.Exit(2) from missing
     outputs.make_folder(path, option, force, report)
 
 

@@ -101,7 +101,7 @@ class Commands(TyperGroup):
             raise
         except MissingExtra as missing:
             typer.echo(f"Error: {missing}", err=True)
-            raise typer.Exit(1) from missing
+            raise typer.Exit(2) from missing
 
 
 def _as_typed(refused: Any, words: Sequence[str]) -> Any:

@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import shutil
 from collections.abc import Callable, Sequence
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
@@ -10,7 +9,7 @@ from typing import TYPE_CHECKING, Any
 import numpy as np
 
 from robosac.boxes import from_world
-from robosac.figures import new_figure, save_figure
+from robosac.figures import check_film, new_figure, save_figure
 from robosac.files import replacing
 from robosac.recording.reading import RecordedFrame, RecordedSession
 from robosac.scenes.drawing import TRUE_COLOUR, VIEW_M, draw_answer, draw_boxes, frame_axes
@@ -18,13 +17,8 @@ from robosac.scenes.drawing import TRUE_COLOUR, VIEW_M, draw_answer, draw_boxes,
 if TYPE_CHECKING:
     from matplotlib.axes import Axes
 
-MOVING = (".gif", ".mp4")
 _TAKEN, _LEFT_OUT = "#762a83", "#d55e00"
 _INCHES, _DPI = 8.0, 80
-
-
-class NoFfmpeg(RuntimeError):
-    """A video is wanted, and there is no ffmpeg."""
 
 
 def write_pictures(session: RecordedSession, folder: Path, least_score: float, tick: Callable[[], None]) -> None:
@@ -41,14 +35,14 @@ def write_moving(session: RecordedSession, path: Path, least_score: float, tick:
 
     Raises
     ------
-    NoFfmpeg
+    MissingExtra, ValueError
+        As `robosac.figures.check_film`.
     """
+    check_film(path)
     from matplotlib.animation import FFMpegWriter, PillowWriter  # noqa: PLC0415 (a second to import)
     from matplotlib.backends.backend_agg import FigureCanvasAgg  # noqa: PLC0415
 
     video = path.suffix.lower() == ".mp4"
-    if video and shutil.which("ffmpeg") is None:
-        raise NoFfmpeg("there is no ffmpeg, which makes videos; .gif needs none")
     writer: Any = (FFMpegWriter if video else PillowWriter)(fps=max(1, round(1e3 / session.opening.frame_period_ms)))
     figure = new_figure(_INCHES, _INCHES)
     FigureCanvasAgg(figure)

@@ -13,6 +13,6 @@ def test_without_matplotlib_a_report_is_refused_in_one_line_before_any_work(main
     command = typer.Typer()
     command.command()(main)
     result = CliRunner().invoke(command, ["--report", str(tmp_path / "report")])
-    assert result.exit_code == 1
+    assert result.exit_code == 2
     assert result.output == "Error: matplotlib is not installed, for pictures: pip install 'robosac[plots]'\n"
     assert not (tmp_path / "report").exists()

@@ -1,6 +1,7 @@
 import asyncio
 import io
 import json
+import sys
 
 import pytest
 from rich.console import Console
@@ -10,6 +11,7 @@ from clients.fleet import FleetOptions, run_fleet
 from clients.local_gateway import GatewayProcess
 from clients.playing import play_against
 from clients.record import app
+from robosac import cli
 from robosac.recording.reading import RecordingError, sessions
 from tests.recorded import write
 
@@ -99,7 +101,8 @@ def test_replay_ends_with_1_only_if_the_recorded_defence_differs(path, detector,
         (("replay", "{path}", "--defense", "nonesuch"), "Invalid value for --defense"),
         (("replay", "{path}", "--detector", "nonesuch"), "Invalid value for --detector"),
         (("replay", "{path}", "--url", "http://127.0.0.1:9", "--detector", "x"), "the gateway has its own"),
-        (("export", "{path}", "--to", "video", "--out", "{folder}/x.avi"), "must end with one of .gif, .mp4"),
+        (("export", "{path}", "--to", "video", "--out", "{folder}/x.avi"), "ends with .gif or .mp4, not with .avi"),
+        (("export", "{path}", "--to", "video", "--out", "{folder}/x.mp4"), "ffmpeg is not installed"),
         (("export", "{path}", "--to", "cpm", "--out", "{path}"), "is there already; --force"),
         (
             ("export", "{path}", "--to", "cpm", "--out", "{folder}/x", "--session", "nonesuch"),
@@ -107,10 +110,22 @@ def test_replay_ends_with_1_only_if_the_recorded_defence_differs(path, detector,
         ),
     ],
 )
-def test_what_cannot_be_done_is_said_before_it_is_begun(words, why, path, tmp_path):
+def test_what_cannot_be_done_is_said_before_it_is_begun(words, why, path, tmp_path, monkeypatch):
+    monkeypatch.setenv("PATH", str(tmp_path))  # no ffmpeg
     status, said = run(*(word.format(path=path, folder=tmp_path) for word in words))
     assert status == 2
     assert why in said
+
+
+@pytest.mark.parametrize(("form", "package"), [("pictures", "matplotlib"), ("ros2", "rosbags"), ("rerun", "rerun")])
+def test_a_form_that_needs_an_extra_is_refused_before_any_work(form, package, path, tmp_path, monkeypatch):
+    monkeypatch.setitem(sys.modules, package, None)
+    words = ["record", "export", path, "--to", form, "--out", tmp_path / "out"]
+    result = CliRunner().invoke(cli.app, list(map(str, words)))
+    assert result.exit_code == 2
+    assert result.output.startswith(f"Error: {package} is not installed, for ")
+    assert "frames" not in result.output
+    assert not (tmp_path / "out").exists()
 
 
 def test_a_defence_that_does_not_ship_has_to_be_named(detector, recorded_moments, tmp_path):

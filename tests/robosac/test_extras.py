@@ -36,6 +36,6 @@ def test_a_command_that_draws_says_at_once_that_it_cannot(arguments, monkeypatch
     monkeypatch.chdir(tmp_path)
     monkeypatch.setitem(sys.modules, "matplotlib", None)
     result = CliRunner().invoke(app, arguments)
-    assert result.exit_code == 1
+    assert result.exit_code == 2
     assert result.output == PLOTS
     assert not list(tmp_path.iterdir())

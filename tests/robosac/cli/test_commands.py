@@ -102,5 +102,5 @@ def test_a_missing_extra_ends_a_command_in_one_line(brought, tmp_path):
     )
     brought({"need": "needing_package:main"})
     result = runner.invoke(app, ["need"])
-    assert result.exit_code == 1
+    assert result.exit_code == 2
     assert result.output == "Error: matplotlib is not installed\n"

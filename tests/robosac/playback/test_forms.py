@@ -10,7 +10,7 @@ from PIL import Image
 from robosac.boxes import pose_matrix
 from robosac.interfaces.ros2 import TOPICS
 from robosac.playback.plain import write_cpm, write_ros2
-from robosac.playback.views import NoFfmpeg, write_moving, write_pictures
+from robosac.playback.views import write_moving, write_pictures
 from robosac.recording.reading import sessions
 from tests.recorded import write
 
@@ -97,5 +97,5 @@ def test_a_moving_picture(session, tmp_path):
 
 def test_without_ffmpeg_a_video_is_refused(session, tmp_path, monkeypatch):
     monkeypatch.setenv("PATH", str(tmp_path))
-    with pytest.raises(NoFfmpeg, match="there is no ffmpeg"):
+    with pytest.raises(ValueError, match="ffmpeg is not installed"):
         write_moving(session, tmp_path / "one.mp4", 0.3, lambda: None)
