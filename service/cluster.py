@@ -21,7 +21,8 @@ from starlette.types import ASGIApp, Scope
 from robosac.extras import need
 from service.arriving.paths import path_of
 from service.errors import Kind, Refused
-from service.settings import PREFIX
+from service.keeping.urls import file_of, read_url
+from service.settings import PREFIX, settings_of_environment
 
 SESSION_HEADER = "x-session-id"
 """What Ray's router reads by default."""
@@ -43,6 +44,25 @@ RAY = {
 """What Ray reads of the environment, where nobody has chosen otherwise."""
 ROUTER = "ray.serve.experimental.consistent_hash_router.ConsistentHashRouter"
 NAME = "gateway"
+LOGS = "/tmp/ray/session_latest/logs/serve"
+"""Where Ray puts the replicas' logs, unless it is told otherwise."""
+
+
+class NotDeployed(RuntimeError):
+    """The replicas did not start."""
+
+
+def check_settings() -> None:
+    """Refuse settings with which no replica starts, or of which each replica would make a store of its own.
+
+    Raises
+    ------
+    ValueError
+        It names the variable.
+    """
+    url = read_url(settings_of_environment().database_url)
+    if url.get_backend_name() == "sqlite" and file_of(url) is None:
+        raise ValueError("ROBOSAC_DATABASE_URL: replicas need a database that they share, not one in memory")
 
 
 def check_routed(scope: Scope) -> None:
@@ -127,6 +147,8 @@ def run(host: str, port: int, scale: Scale, address: str | None) -> None:
     ------
     MissingExtra
         If Ray is not installed.
+    NotDeployed
+        If the replicas do not start.
     """
     need("ray", "a cluster")
     for name, value in RAY.items():
@@ -144,7 +166,10 @@ def run(host: str, port: int, scale: Scale, address: str | None) -> None:
         for number in (signal.SIGTERM, signal.SIGINT, signal.SIGHUP):  # Ray has set its own by now
             signal.signal(number, lambda number, _: told.put(number))
         for version in itertools.count():
-            serve.run(application(scale, version), name=NAME)
+            try:
+                serve.run(application(scale, version), name=NAME)
+            except RuntimeError as error:
+                raise NotDeployed(f"the replicas did not start; their logs tell why, see {LOGS}") from error
             print(f"version {version} at http://{host}:{port}", flush=True)
             if told.get() != signal.SIGHUP:
                 return

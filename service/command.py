@@ -19,9 +19,11 @@ FAILED_START = 3
 """What uvicorn ends with where the application cannot start; it has said why."""
 WORKERS = "WEB_CONCURRENCY"
 """The environment's variable by which uvicorn starts several workers."""
+OF_A_CLUSTER = ("replicas", "most_replicas", "vehicles", "address")
 
 
 def main(
+    ctx: typer.Context,
     host: Annotated[str, typer.Option(help="Address to listen on; other machines need an API key.")] = "127.0.0.1",
     port: Annotated[int, typer.Option(min=0, max=65535, help="Port; 0 takes a free one.")] = 8000,
     cluster: Annotated[
@@ -36,13 +38,11 @@ def main(
 ) -> None:
     """Run the gateway, with the settings of the environment (ROBOSAC_...), until SIGTERM or Ctrl-C."""
     if cluster:
-        from service import cluster as on_ray  # noqa: PLC0415 (others do without)
-
-        try:
-            on_ray.run(host, port, on_ray.Scale(replicas, max(replicas, most_replicas), vehicles), address)
-        except MissingExtra as missing:
-            raise typer.BadParameter(str(missing), param_hint="--cluster") from missing
+        _serve_on_ray(host, port, (replicas, max(replicas, most_replicas), vehicles), address)
         return
+    for name in OF_A_CLUSTER:
+        if getattr(ctx.get_parameter_source(name), "name", "DEFAULT") != "DEFAULT":
+            raise typer.BadParameter("only with --cluster", param_hint=f"--{name.replace('_', '-')}")
     try:
         socket.getaddrinfo(host or None, port, flags=socket.AI_PASSIVE)
     except (OSError, UnicodeError) as error:
@@ -69,3 +69,21 @@ def main(
         )
     except SystemExit as end:
         raise SystemExit(2 if end.code == FAILED_START else end.code) from end
+
+
+def _serve_on_ray(host: str, port: int, scale: tuple[int, int, int], address: str | None) -> None:
+    """Serve with replicas; what keeps them from starting is said in a line."""
+    from service import cluster as on_ray  # noqa: PLC0415 (others do without)
+
+    try:
+        on_ray.check_settings()
+    except ValueError as fault:
+        typer.echo(f"Error: {fault}", err=True)
+        raise typer.Exit(2) from fault
+    try:
+        on_ray.run(host, port, on_ray.Scale(*scale), address)
+    except MissingExtra as missing:
+        raise typer.BadParameter(str(missing), param_hint="--cluster") from missing
+    except on_ray.NotDeployed as failed:
+        typer.echo(f"Error: {failed}", err=True)
+        raise typer.Exit(1) from failed

@@ -53,6 +53,33 @@ def test_a_host_that_there_is_not_is_named_before_anything_starts():
 
 
 @pytest.mark.parametrize(
+    "option", [("--replicas", "2"), ("--most-replicas", "3"), ("--vehicles", "9"), ("--address", "auto")]
+)
+def test_options_of_a_cluster_are_not_passed_over_without_one(option):
+    own = typer.Typer()
+    own.command()(main)
+    result = CliRunner().invoke(own, [*option, "--host", "999.1.1.1"], env={"COLUMNS": "300"})
+    assert result.exit_code == 2
+    assert f"Invalid value for {option[0]}: only with --cluster" in result.output
+
+
+@pytest.mark.parametrize(
+    ("variable", "value", "complaint"),
+    [
+        ("ROBOSAC_LATENCY_BUDGET_MS", "soon", "Error: ROBOSAC_LATENCY_BUDGET_MS: Input should be a valid number, "),
+        ("ROBOSAC_DATABASE_URL", "sqlite://", "Error: ROBOSAC_DATABASE_URL: replicas need a database that they share"),
+    ],
+)
+def test_a_setting_with_which_no_cluster_serves_is_told_before_one_starts(variable, value, complaint, monkeypatch):
+    monkeypatch.setattr("service.cluster.run", None)
+    own = typer.Typer()
+    own.command()(main)
+    result = CliRunner().invoke(own, ["--cluster"], env={variable: value})
+    assert result.exit_code == 2
+    assert result.output.startswith(complaint)
+
+
+@pytest.mark.parametrize(
     ("variable", "value", "complaint"),
     [
         ("ROBOSAC_LATENCY_BUDGET_MS", "soon", "Error: ROBOSAC_LATENCY_BUDGET_MS: Input should be a valid number, "),
