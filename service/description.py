@@ -39,12 +39,14 @@ TAGS = [
     {"name": "live", "description": "What the gateway decides, for people who watch; the page at `/` shows it."},
     {"name": "operations", "description": "For whoever runs the gateway: no key or token is needed."},
 ]
-_SESSION, _TIME, _HASH = "Fv0Zk7mXQ2yq1Jr3", "2026-11-21T09:30:00.000Z", "3b0c44298fc1c149afbf4c8996fb9242" * 2
+_SESSION, _TIME = "2b0ad4d408dfd8e567f71489d518bb9a", "2026-11-21T09:30:00.000Z"
+_HASH = "3b0c44298fc1c149afbf4c8996fb9242" * 2
 _TOKEN = "eyJhbGciOiJIUzI1NiJ9.eyJzdWIiOiJjYXItMSJ9.c2lnbmF0dXJl"
-_KEY = "MCowBQYDK2VwAyEA0Z1Jc4mXQ2yq1Jr3T4u5v6w7x8y="
+_KEY, _KEY_ID = "11qYAYKxCrfVS/7TyWQHOg7hcvPapiMlrwIaaPcHURo=", "21fe31dfa154a261"  # of RFC 8032, section 7.1
 _DEFENSE = {"kind": "sample_consensus", "attacker_ratio": 0.3, "sampling_budget": 7, "collaborators": 2}
 _TIMING = {"latency_budget_ms": 200.0, "gather_ms": 100.0, "frame_period_ms": 200.0}
-_RECEIPT = {"session": _SESSION, "seq": 2, "head": _HASH, "key_id": "5f2b8c", "signature": "c2lnbmF0dXJl"}
+_SIGNATURE = "YJSMFUWCgrtOsV2lte5DGoM5DKxaXB/xtRa6vfORvegNYZpndkdTfML+jAJU6PPdx2CBOGGyqho+xiX/eh2FDQ=="
+_RECEIPT = {"session": _SESSION, "seq": 2, "head": _HASH, "key_id": _KEY_ID, "signature": _SIGNATURE}
 _FEATURES = {"features": {"dtype": "float16", "shape": [64, 32, 32]}}
 _DETECTOR = {
     "name": "intersection-mean",
@@ -67,7 +69,7 @@ EXAMPLES: Mapping[type[BaseModel], dict[str, Any]] = {
     },
     EnrolmentRequest: {"teammates": ["car-4"]},
     DetectorList: {"detectors": [_DETECTOR]},
-    GatewayKeyList: {"keys": [{"key_id": "5f2b8c", "public_key": _KEY, "signs": True}]},
+    GatewayKeyList: {"keys": [{"key_id": _KEY_ID, "public_key": _KEY, "signs": True}]},
     SessionCreated: {
         "session_id": _SESSION,
         "ego_token": _TOKEN,

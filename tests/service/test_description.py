@@ -13,6 +13,7 @@ from fastapi import FastAPI
 from robosac import wire
 from robosac.audit.events import event_on
 from robosac.detectors import TensorSpec, blank
+from robosac.signatures import key_id, read_public_key
 from service import tensor_bodies
 from service.app import create_app
 from service.description import AUDIT_LINE, EXAMPLES, TAGS
@@ -20,6 +21,7 @@ from service.operations import operations
 from service.pages import pages
 from service.problems import ANSWERS, TYPE_PREFIX
 from service.routes import v1
+from service.schemas import GatewayKeyList, SessionCreated
 from service.settings import Settings
 from tests.robosac.test_wire import EGO as TINY_EGO
 from tests.robosac.test_wire import INFO as TINY
@@ -293,6 +295,13 @@ def test_the_schemas_of_tensor_bodies_allow_what_the_codec_does(spoil, code):
         with pytest.raises(wire.WireError) as refused:
             checked(part)
         assert refused.value.code == code
+
+
+def test_the_keys_of_the_examples_are_keys():
+    (key,) = EXAMPLES[GatewayKeyList]["keys"]
+    assert len(base64.b64decode(key["public_key"], validate=True)) == 32
+    assert key["key_id"] == key_id(read_public_key(key["public_key"])) == EXAMPLES[SessionCreated]["receipt"]["key_id"]
+    assert len(base64.b64decode(EXAMPLES[SessionCreated]["receipt"]["signature"], validate=True)) == 64
 
 
 def served_info(name):
