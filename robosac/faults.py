@@ -51,6 +51,11 @@ def told(error: Exception) -> str:
     return str(error)
 
 
+def unreadable(error: OSError | UnicodeError) -> str:
+    """Why a file cannot be read as text, without anything of what is in it."""
+    return (error.strerror or type(error).__name__) if isinstance(error, OSError) else "it is no text"
+
+
 def in_words(fault: Mapping[str, Any]) -> str:
     """What is wrong with a value by one of `pydantic.ValidationError.errors`, without where it stands."""
     return _PLAIN.get(fault["type"]) or str(fault["msg"]).removeprefix("Value error, ")

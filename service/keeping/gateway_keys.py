@@ -14,6 +14,7 @@ from pathlib import Path
 from cryptography.hazmat.primitives.asymmetric.ed25519 import Ed25519PrivateKey
 
 from robosac.answers import LogReceipt
+from robosac.faults import unreadable
 from robosac.signatures import key_id, show_public_key, sign_head
 from service.keeping.record import SessionRecord
 from service.keeping.store import Store
@@ -78,7 +79,7 @@ def _read(file: Path) -> str:
             raise ValueError(f"ROBOSAC_GATEWAY_KEY_FILE: others may read {file}; take that right away (chmod 600)")
         return file.read_text()
     except (OSError, UnicodeError) as error:
-        raise ValueError(f"ROBOSAC_GATEWAY_KEY_FILE: {file} cannot be read: {type(error).__name__}") from error
+        raise ValueError(f"ROBOSAC_GATEWAY_KEY_FILE: {file} cannot be read: {unreadable(error)}") from error
 
 
 def _make(file: Path) -> None:

@@ -20,6 +20,7 @@ from typing import Any, NamedTuple
 
 import jwt
 
+from robosac.faults import unreadable
 from service.errors import RENEWED, Kind, Refused, TokenRefused
 from service.keeping.record import SessionRecord
 from service.keeping.store import Store
@@ -80,7 +81,7 @@ class ApiKeys:
             try:
                 lines = [line.strip() for line in path.read_text().splitlines()]
             except (OSError, UnicodeError) as error:
-                raise ValueError(f"ROBOSAC_API_KEYS_FILE: {path} cannot be read: {type(error).__name__}") from error
+                raise ValueError(f"ROBOSAC_API_KEYS_FILE: {path} cannot be read: {unreadable(error)}") from error
             found = [(f"ROBOSAC_API_KEYS_FILE: line {i}", line) for i, line in enumerate(lines, 1) if line]
             if not found:
                 raise ValueError(f"ROBOSAC_API_KEYS_FILE: {path} holds no key")

@@ -4,7 +4,7 @@ import torch
 from hypothesis import given
 from hypothesis import strategies as st
 
-from robosac.faults import MESSAGE_CHARS, describe, in_short
+from robosac.faults import MESSAGE_CHARS, describe, in_short, unreadable
 
 
 @pytest.mark.parametrize(
@@ -66,3 +66,14 @@ def test_an_exception_without_a_message_is_told_too():
 def test_what_is_short_stays(text):
     assert in_short(in_short(text)) == in_short(text)
     assert len(in_short(text)) <= MESSAGE_CHARS
+
+
+def test_a_file_that_cannot_be_read_is_told_without_its_content(tmp_path):
+    (tmp_path / "secret").write_bytes(b"a-secret-\xff")
+    with pytest.raises(UnicodeError) as no_text:
+        (tmp_path / "secret").read_text("utf-8")
+    assert unreadable(no_text.value) == "it is no text"
+    with pytest.raises(FileNotFoundError) as no_file:
+        (tmp_path / "none").read_text()
+    assert unreadable(no_file.value) == "No such file or directory"
+    assert unreadable(OSError()) == "OSError"

@@ -150,7 +150,10 @@ async def test_the_key_is_asked_for_before_the_body_is_read():
         ({"api_keys": "has a blank inside it"}, "ROBOSAC_API_KEYS: key 1 has characters"),
         ({"api_keys": "schlüssel-0123456789"}, "ROBOSAC_API_KEYS: key 1 has characters"),
         ({"token_secrets": SECRET + "," + "x" * 31}, "ROBOSAC_TOKEN_SECRETS: secret 2 has fewer than 32"),
-        ({"api_keys_file": "/nonesuch/keys"}, "ROBOSAC_API_KEYS_FILE: /nonesuch/keys cannot be read"),
+        (
+            {"api_keys_file": "/nonesuch/keys"},
+            "ROBOSAC_API_KEYS_FILE: /nonesuch/keys cannot be read: No such file",
+        ),
     ],
 )
 def test_a_weak_or_missing_secret_keeps_the_gateway_from_starting(settings, hint):

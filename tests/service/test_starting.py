@@ -39,7 +39,7 @@ async def started(app):
         ({"device": "nonesuch"}, "ROBOSAC_DEVICE: torch cannot compute on the device 'nonesuch' here: "),
         ({"detector": "nonesuch"}, "ROBOSAC_DETECTOR: unknown detector 'nonesuch'"),
         ({"database_url": "sqlite:////nowhere/x.db"}, "ROBOSAC_DATABASE_URL: /nowhere/x.db: OperationalError: "),
-        ({"gateway_key_file": "/nowhere/key"}, "ROBOSAC_GATEWAY_KEY_FILE: /nowhere/key cannot be read: "),
+        ({"gateway_key_file": "/nowhere/key"}, "ROBOSAC_GATEWAY_KEY_FILE: /nowhere/key cannot be read: No such file"),
     ],
 )
 async def test_a_setting_that_keeps_the_gateway_from_starting_is_named_in_a_line(settings, complaint):
