@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import asyncio
 import contextlib
+import os
 import re
 import shutil
 import signal
@@ -17,6 +18,7 @@ from clients.errors import GatewayUnreachable
 from clients.local_gateway import STOP_TIMEOUT_S, GatewayProcess, free_port
 
 _BIND = re.compile(r"bind :8443 ssl crt \S+")
+_USER = re.compile(r"^    (?:user|group) .*\n", re.MULTILINE)
 _SERVER = re.compile(r"^    server p1 127\.0\.0\.1:8001(.*)\n    server p2 .*\n", re.MULTILINE)
 
 
@@ -28,6 +30,8 @@ def program() -> str | None:
 def configured(text: str, ports: list[int], port: int, certificate: Path | None) -> str:
     """The shipped configuration for these processes, on this port, with TLS where there is a certificate.
 
+    Whoever is not root cannot become another user, and keeps its own.
+
     Raises
     ------
     ValueError
@@ -35,6 +39,7 @@ def configured(text: str, ports: list[int], port: int, certificate: Path | None)
     """
     bind = f"bind 127.0.0.1:{port}" + ("" if certificate is None else f" ssl crt {certificate}")
     alpn = " alpn h2,http/1.1"
+    text = text if os.geteuid() == 0 else _USER.sub("", text)
     text, binds = _BIND.subn(bind, text if certificate else text.replace(alpn, ""))
 
     def servers(found: re.Match[str]) -> str:

@@ -3,6 +3,7 @@
 import asyncio
 import datetime
 import ipaddress
+import re
 import subprocess
 from pathlib import Path
 
@@ -51,6 +52,13 @@ def test_what_ships_is_a_configuration(tmp_path, certificate):
         [program(), "-c", "-f", tmp_path / "haproxy.cfg"], check=False, capture_output=True, text=True
     )
     assert (checked.returncode, checked.stderr) == (0, "")
+    assert re.search(r"^global\n    user haproxy\b.*\n    group haproxy\n", text, re.MULTILINE)  # else it stays root
+
+
+def test_who_is_not_root_keeps_its_own_user(monkeypatch):
+    for user, kept in ((0, True), (1000, False)):
+        monkeypatch.setattr("os.geteuid", lambda user=user: user)
+        assert ("user haproxy" in configured(CONFIG.read_text(), [1, 2], 3, None)) == kept
 
 
 def test_only_the_shipped_configuration_is_changed():
