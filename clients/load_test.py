@@ -219,7 +219,9 @@ def main(  # the options of a command line
         ),
     ] = None,
     seconds: trial.Seconds = 10.0,
-    egos: Annotated[list[int] | None, typer.Option(min=1, help="Egos at a time; give it several times.")] = None,
+    egos: Annotated[
+        list[int] | None, typer.Option(min=1, help="Egos at a time, by default 1 and 8; give it several times.")
+    ] = None,
     teammates: Annotated[
         list[int] | None,
         typer.Option(min=1, max=len(TEAM), help="Teammates of an ego, by default all; give it several times."),

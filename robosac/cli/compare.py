@@ -70,8 +70,12 @@ def run(  # the options of a command line
         list[str] | None,
         typer.Option(help="CAMPAIGN:NUMBER of attackers, as in erase@asleep:2; may be repeated."),
     ] = None,
-    scenes: Annotated[int | None, typer.Option(min=1, help="Test sequences.")] = None,
-    frames: Annotated[int | None, typer.Option(min=EARLY + 1, help="Of each sequence.")] = None,
+    scenes: Annotated[
+        int | None, typer.Option(min=1, help=f"Test sequences; {FULL.scenes}, or {QUICK.scenes} if quick.")
+    ] = None,
+    frames: Annotated[
+        int | None, typer.Option(min=EARLY + 1, help=f"Of each sequence; {FULL.frames}, or {QUICK.frames} if quick.")
+    ] = None,
     recordings: Annotated[
         Path | None, typer.Option(metavar="DIR", help="Folder in which recorded frames are kept, to be used again.")
     ] = None,

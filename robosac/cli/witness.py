@@ -33,7 +33,9 @@ def run(  # the options of a command line
         ),
     ],
     detector: DetectorName = DEFAULT_DETECTOR,
-    data: Annotated[list[str] | None, typer.Option(help=f"{DATA_HELP} May be repeated.")] = None,
+    data: Annotated[
+        list[str] | None, typer.Option(help=f"{DATA_HELP} May be repeated; by default {_DEFAULTS.data[0]}.")
+    ] = None,
     scenes: Annotated[int, typer.Option(min=1, help="Scenes of each source to train on.")] = _DEFAULTS.scenes,
     check_scenes: Annotated[int, typer.Option(min=1, help="Further ones to check on.")] = _DEFAULTS.check_scenes,
     frames: Annotated[int, typer.Option(min=1, help="Frames of each, 1 s apart.")] = _DEFAULTS.frames_per_scene,
