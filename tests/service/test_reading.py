@@ -14,7 +14,7 @@ from tests.service.credentials import KEY, OTHER_KEY
 
 async def opened_with(served, key):
     client = GatewayClient("http://gateway", key, transport=served.http._transport)
-    return await client.open_session(EGO, TEAM)
+    return await client.open_session(EGO, TEAM, latency_budget_ms=5000.0)
 
 
 async def test_bodies_are_read_by_turns_of_keys(monkeypatch, good_frame):
@@ -51,3 +51,25 @@ async def test_a_small_body_that_may_be_compressed_is_not_read_on_the_event_loop
         body = wire.pack({"frame": 0, "vehicle_id": EGO, "pose": pose, "tensors": {"features": {**fields, **more}}})
         problem(await served.post(session, "messages", body), 400, "malformed-msgpack")
     assert read == [True, False]
+
+
+async def test_a_body_that_waits_for_half_of_its_budget_is_refused_unread(monkeypatch, good_frame):
+    going_on = threading.Event()
+
+    def never(*_):
+        going_on.wait(10)
+        raise InFrame(wire.WireError("malformed-msgpack", "", "it is read for ever"), None)
+
+    async with serve() as served:
+        slow, session = [await served.open() for _ in range(AT_A_TIME)], await served.open(latency_budget_ms=200.0, gather_ms=50.0)
+        with monkeypatch.context() as patch:
+            patch.setattr("service.arriving.giving_way.TURN_S", 10.0)
+            patch.setattr("service.arriving.frames.read_frame", never)
+            posts = [asyncio.create_task(served.post(one, "frames", good_frame(0))) for one in slow]
+            await asyncio.sleep(0.05)
+            began = time.perf_counter()
+            problem(await served.post(session, "frames", good_frame(0)), 503, "overloaded")
+            assert time.perf_counter() - began < 5.0
+            going_on.set()
+            await asyncio.gather(*posts)
+        assert (await served.post(session, "frames", good_frame(0))).status_code == 200
