@@ -35,6 +35,8 @@ class Attack(StrEnum):
     """Ten sessions of one key do so at once, one frame after the other."""
     TEAMS = "large teams"
     """Sessions of 63 teammates send whole frames, with the default defence."""
+    STALE = "stale frames"
+    """Frames of 63 teammates, small when compressed, that are answered already."""
     BODIES = "body flood"
     """Bodies as large as allowed that are no messages, with a good token, some sent very slowly."""
     HEADS = "heads without end"
@@ -65,6 +67,8 @@ class Attack(StrEnum):
     """A body in as many chunks as it has bytes."""
     HEADERS = "thousands of headers"
     """Heads of many short lines."""
+    LISTS = "lists in a header"
+    """Good messages with an `Accept` of thousands of parts."""
     DATABASE = "locked database"
     """Another process holds the database's write lock."""
 
@@ -74,6 +78,7 @@ _PLAYED: dict[Attack, Callable[[Attacker], Awaitable[object]]] = {
     Attack.LONG: lambda attacker: sessions.long(attacker, 1),
     Attack.MANY: lambda attacker: sessions.long(attacker, sessions.SESSIONS),
     Attack.TEAMS: sessions.large_teams,
+    Attack.STALE: sessions.stale,
     Attack.BODIES: connections.flood,
     Attack.HEADS: connections.heads,
     Attack.SMALL: requests.small_messages,
@@ -89,6 +94,7 @@ _PLAYED: dict[Attack, Callable[[Attacker], Awaitable[object]]] = {
     Attack.PIPELINE: connections.pipeline,
     Attack.CHUNKS: connections.chunks,
     Attack.HEADERS: connections.headers,
+    Attack.LISTS: sessions.long_accepts,
 }
 
 

@@ -5,13 +5,19 @@ from __future__ import annotations
 import asyncio
 
 import msgpack
+import numpy as np
 
-from clients.hostile.attacker import PAUSE_S, Attacker
+from clients.client import MSGPACK
+from clients.hostile.attacker import PAUSE_S, Attacker, bearer
 from robosac import wire
+from robosac.detectors import Message
 
 IDLE_SESSIONS = 9
 SESSIONS = 10
 LARGE_TEAMS, TEAMMATES = 4, 63
+FEW = 8
+FAR_AHEAD = 10**9
+LONG_ACCEPT = "," * 31_000
 LONG = {"kind": "sample_consensus", "attacker_ratio": 0.5, "sampling_budget": 600, "collaborators": 5}
 
 
@@ -36,6 +42,50 @@ async def large_teams(attacker: Attacker) -> None:
     teammates = {f"t{number}": strangers[number % len(strangers)] for number in range(TEAMMATES)}
     fields = {**attacker.frame, "teammates": teammates}
     await _frames(attacker, fields, LARGE_TEAMS, {"latency_budget_ms": 60_000})
+
+
+async def stale(attacker: Attacker) -> None:
+    """Send frames again that are answered: small, as they are compressed, and long to look through."""
+    team = [f"mate-{number}" for number in range(TEAMMATES)]
+    opened = [await attacker.open(team, latency_budget_ms=60_000) for _ in range(FEW)]
+    message, packing = _nothing(attacker), wire.Packing("int8", compress=True)
+    earlier, later = (wire.pack_frame(k, message, dict.fromkeys(team, message), packing=packing) for k in range(2))
+    for session in opened:
+        await attacker.post(session["session_id"], "frames", session["ego_token"], later)
+
+    async def one() -> None:
+        session = opened.pop()
+        try:
+            await attacker.post(session["session_id"], "frames", session["ego_token"], earlier)
+        finally:
+            opened.append(session)
+
+    await attacker.again_and_again(FEW, one)
+
+
+async def long_accepts(attacker: Attacker) -> None:
+    """Send good messages, with a header that is a list of thousands."""
+    opened = [(await attacker.open(["mate"]), [FAR_AHEAD]) for _ in range(FEW)]
+    message, packing = _nothing(attacker), wire.Packing("int8", compress=True)
+
+    async def one() -> None:
+        session, number = opened.pop()
+        try:
+            headers = {"Accept": LONG_ACCEPT, "Content-Type": MSGPACK} | bearer(session["teammate_tokens"]["mate"])
+            body = wire.pack_message(number[0], "mate", message, packing=packing)
+            await attacker.ask("POST", f"/v1/sessions/{session['session_id']}/messages", content=body, headers=headers)
+            number[0] -= 1  # earlier ones take the place of later ones
+        finally:
+            opened.append((session, number))
+
+    await attacker.again_and_again(FEW, one)
+
+
+def _nothing(attacker: Attacker) -> Message:
+    """A message in which there is nothing, as the honest ego sends them."""
+    fields = attacker.frame["ego"]
+    tensors = {name: np.zeros(each["shape"], each["dtype"]) for name, each in fields["tensors"].items()}
+    return Message(np.array(fields["pose"]).reshape(4, 4), tensors)
 
 
 async def _frames(attacker: Attacker, fields: dict[str, object], number: int, options: dict[str, object]) -> None:

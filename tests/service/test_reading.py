@@ -61,7 +61,8 @@ async def test_a_body_that_waits_for_half_of_its_budget_is_refused_unread(monkey
         raise InFrame(wire.WireError("malformed-msgpack", "", "it is read for ever"), None)
 
     async with serve() as served:
-        slow, session = [await served.open() for _ in range(AT_A_TIME)], await served.open(latency_budget_ms=200.0, gather_ms=50.0)
+        slow = [await served.open() for _ in range(AT_A_TIME)]
+        session = await served.open(latency_budget_ms=200.0, gather_ms=50.0)
         with monkeypatch.context() as patch:
             patch.setattr("service.arriving.giving_way.TURN_S", 10.0)
             patch.setattr("service.arriving.frames.read_frame", never)
