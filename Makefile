@@ -10,11 +10,12 @@ PORT ?= 8000
 
 # tests that start several processes, a browser, a cluster or a database server: they come after the others
 SEVERAL := $(addprefix tests/,$(addsuffix .py,clients/test_crash_test service/test_cluster service/test_live_page \
-	clients/test_fleet service/test_behind_a_proxy clients/test_trial clients/test_load_test service/test_alone))
+	clients/test_fleet clients/test_flood service/test_behind_a_proxy clients/test_trial clients/test_load_test \
+	service/test_alone))
 # tests that take time themselves: nothing else should run beside them
 ALONE := $(addprefix tests/service/test_,$(addsuffix .py,adversary connections deadlines fair_shares gathering \
 	overload shared_database stalls turns)) tests/service/store/test_faults.py \
-	$(addprefix tests/clients/test_,$(addsuffix .py,adversary flood overload))
+	$(addprefix tests/clients/test_,$(addsuffix .py,adversary overload))
 
 IN_TWO := -n 2 --dist loadfile --no-loadscope-reorder
 

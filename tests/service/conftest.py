@@ -11,7 +11,8 @@ from opentelemetry.sdk.trace import TracerProvider
 
 from clients.client import GatewayClient, OpenedSession, VehicleClient
 from robosac import wire
-from robosac.detectors import EmbeddedDetector
+from robosac.detectors import Detector, EmbeddedDetector, load
+from robosac.detectors.loading import warm_up
 from service.app import create_app
 from service.gateway import Gateway
 from service.settings import Settings
@@ -44,6 +45,29 @@ class Hooked(EmbeddedDetector):
 
 
 HOOKED = "tests.service.conftest:Hooked"
+
+
+@pytest.fixture(scope="package", autouse=True)
+def shipped_detectors_are_ready():
+    """A thousand gateways start in these tests. Those that ship are loaded, and warm, once in a process."""
+    ready: dict[str, Detector] = {}
+
+    def load_once(name, device="cpu"):
+        if (name, device) != (EmbeddedDetector.name, "cpu"):
+            return load(name, device)
+        if name not in ready:
+            ready[name] = load(name)
+            warm_up(ready[name])
+        return ready[name]
+
+    def warm_up_once(detector):
+        if detector is not ready.get(EmbeddedDetector.name):
+            warm_up(detector)
+
+    with pytest.MonkeyPatch.context() as patch:
+        patch.setattr("service.engine.load", load_once)
+        patch.setattr("service.engine.warm_up", warm_up_once)
+        yield
 
 
 @dataclass
