@@ -56,7 +56,7 @@ class Frames:
 
         ``room`` is that of bodies, in which this one is counted as it came.
         """
-        frame, received = await self._read(caller, body, arrived, read_message)
+        frame, received = await self._read(caller, body, read_message)
         if not caller.is_ego:
             record = await self._keep(caller, frame, received)
             return Receipt(frame=frame, vehicle_id=caller.vehicle_id, receipt=self.sessions.keys.receipt(record))
@@ -69,7 +69,7 @@ class Frames:
         """A whole frame from the ego, whose request came then. A teammate whose part is malformed is left out, and the
         frame is answered. ``room`` as for `post_message`.
         """
-        frame, parts = await self._read(caller, body, arrived, read_frame)
+        frame, parts = await self._read(caller, body, read_frame)
         for name in parts.malformed:
             self.metrics.refused(parts.unusable[name].reason.value)
         asked = Asked(caller, frame, parts.ego, arrived, parts.messages, parts.unusable, whole=True)
@@ -97,12 +97,12 @@ class Frames:
             caller.live.gathering.refuse(caller.vehicle_id, frame, reason, error.detail)
         await self.sessions.journal.refusal(caller, reason, error.detail, frame, error.field or "")
 
-    async def _read(self, caller: Caller, body: bytes, arrived: float, read: Callable[[Caller, bytes], T]) -> T:
+    async def _read(self, caller: Caller, body: bytes, read: Callable[[Caller, bytes], T]) -> T:
         """What a body holds, read off the event loop where that takes long; a refusal goes on record."""
         try:
             if len(body) <= SMALL_BYTES and _COMPRESSED not in body:
                 return read(caller, body)
-            turn = await self._turn(caller, arrived + READING_SHARE * caller.live.budget_s)
+            turn = await self._turn(caller)
             try:
                 return await asyncio.to_thread(read, caller, body)
             finally:
@@ -111,10 +111,10 @@ class Frames:
             await self.refuse(caller, error.what, error.frame)
             raise error.what from error.what.__cause__
 
-    async def _turn(self, caller: Caller, until: float) -> Turn:
-        """A turn to read a body, if it comes in time."""
+    async def _turn(self, caller: Caller) -> Turn:
+        """A turn to read a body, if it comes in time. For how long the body itself was on its way does not count."""
         try:
-            async with asyncio.timeout(until - time.perf_counter()):
+            async with asyncio.timeout(READING_SHARE * caller.live.budget_s):
                 return await self.reading.turn((caller.live.key, caller.record.session_id))
         except TimeoutError:
             detail = "bodies of other requests took the time that this one had"
