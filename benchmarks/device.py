@@ -1,4 +1,5 @@
-"""What a frame takes on a device: seven hypotheses one by one and in one batch, and batches of several sizes.
+"""What a frame takes on a device: seven hypotheses one by one and in one batch, batches of several sizes, and passes
+that frames of several sessions share.
 
 A frame of ROBOSAC's sampling is one in which nothing is in consensus, so that all seven hypotheses are tested. Its
 messages begin and its boxes end on the processor. Times are wall-clock, taken turn by turn.
@@ -6,6 +7,7 @@ messages begin and its boxes end on the processor. Times are wall-clock, taken t
 
 import time
 from collections.abc import Callable, Mapping
+from functools import partial
 from itertools import chain, combinations, cycle, islice
 from typing import Annotated
 
@@ -66,6 +68,12 @@ def main(
     batches = {str(size): list(islice(cycle(every), size)) for size in SIZES}
     frames = in_turns({"one by one": lambda: frame(1), f"{AT_ONCE} at once": lambda: frame(AT_ONCE)}, turns)
     decodes = in_turns({name: lambda s=subsets: prepared.detect_all(s) for name, subsets in batches.items()}, turns)
+    frames_of = [placed[AT_ONCE].prepare(ego, messages) for _ in range(max(SIZES))]
+    sessions = {
+        str(size): partial(frames_of[0].detect_together, [(frame, every[-1:]) for frame in frames_of[:size]])
+        for size in SIZES
+    }
+    shared = in_turns(sessions, turns)
     decodes |= in_turns({"1, not as a batch": lambda: prepared.detect(every[-1])}, turns)
 
     console, face = Console(), placed[1].info
@@ -77,6 +85,10 @@ def main(
     table = Table("subsets decoded at once", "ms", "ms a subset")
     for name, ms in decodes.items():
         table.add_row(name, f"{ms:.2f}", f"{ms / int(name.partition(',')[0]):.2f}")
+    console.print(table)
+    table = Table("frames of several sessions, one subset each, at once", "ms", "ms a frame")
+    for name, ms in shared.items():
+        table.add_row(name, f"{ms:.2f}", f"{ms / int(name):.2f}")
     console.print(table)
 
 

@@ -8,13 +8,13 @@ meanwhile. After it only fusions and their comparison are left. The answer is th
 from __future__ import annotations
 
 import time
-from collections.abc import Collection, Mapping, Sequence
+from collections.abc import Mapping
 
 from robosac.boxes import FloatArray
 from robosac.calibrated import witness_of
 from robosac.defenses import EGO
 from robosac.detectors import DetectorInfo, Message, PreparedFrame, Preparer
-from robosac.detectors.base import Batching, Growing
+from robosac.detectors.base import Growing
 from robosac.detectors.witness import Float16Array
 
 
@@ -34,6 +34,8 @@ class Ahead:
     said : dict of agent to (LAYERS, H, W) ndarray
         What messages say by themselves (`robosac.detectors.witness.Witness.read_message`), as far as they were read;
         the ego's under `robosac.defenses.EGO`.
+    alone : (n, 6) ndarray, optional
+        What the ego perceives alone, if it is known.
     pass_s : float
         What the ego's own pass took, seconds; 0 before it.
 
@@ -59,7 +61,7 @@ class Ahead:
         self._prepared: PreparedFrame | None = None
         self._laid: dict[str, Message] = {}
         self._read: dict[str, Message] = {}
-        self._alone: FloatArray | None = None
+        self.alone: FloatArray | None = None
         self.said: dict[str, Float16Array] = {}
         self.pass_s = 0.0
 
@@ -71,7 +73,7 @@ class Ahead:
     def see_alone(self) -> None:
         """What the ego perceives alone."""
         started = time.perf_counter()
-        self._alone = self._begun().detect(())
+        self.alone = self._begun().detect(())
         self.pass_s = time.perf_counter() - started
 
     def lay(self, name: str, message: Message) -> None:
@@ -100,37 +102,9 @@ class Ahead:
             prepared.add({name: each for name, each in teammates.items() if self._laid.get(name) is not each})
         elif teammates:
             prepared = self._detector.prepare(ego, teammates)
-        return _Seen(prepared, self._alone)
+        return prepared
 
     def _begun(self) -> PreparedFrame:
         if self._prepared is None:
             self._prepared = self._detector.prepare(self._ego, {})
         return self._prepared
-
-
-class _Seen:
-    """A prepared frame of which it may be known what the ego sees alone."""
-
-    def __init__(self, prepared: PreparedFrame, alone: FloatArray | None) -> None:
-        self._prepared = prepared
-        self._alone = alone
-
-    def detect(self, teammates: Collection[str] = ()) -> FloatArray:
-        """As `robosac.detectors.base.PreparedFrame.detect`."""
-        if self._alone is not None and not teammates:
-            return self._alone
-        return self._prepared.detect(teammates)
-
-    @property
-    def worth(self) -> int:
-        """As `robosac.detectors.base.Batching.worth`; 1 where the detector's frames have none."""
-        return self._prepared.worth if isinstance(self._prepared, Batching) else 1
-
-    def detect_all(self, subsets: Sequence[Collection[str]]) -> list[FloatArray]:
-        """As `robosac.detectors.base.Batching.detect_all`."""
-        unknown = [subset for subset in subsets if subset or self._alone is None]
-        if isinstance(self._prepared, Batching):
-            found = iter(self._prepared.detect_all(unknown) if unknown else ())
-        else:
-            found = (self._prepared.detect(subset) for subset in unknown)
-        return [self._alone if not subset and self._alone is not None else next(found) for subset in subsets]

@@ -183,7 +183,9 @@ class FrameRun:
 
     def _prepare(self, teammates: Mapping[str, Message]) -> Passes:
         with self._spending("prepare"):
-            return Passes(self.detector.prepare(self.ego, teammates), self.deadline, self.boxes)
+            prepared = self.detector.prepare(self.ego, teammates)
+            alone = self.detector.alone if isinstance(self.detector, Ahead) else None
+            return Passes(prepared, self.deadline, self.boxes, {} if alone is None else {(): alone})
 
     def _hear(self, teammates: Mapping[str, Message], trusted: Collection[str]) -> Steps[None]:
         """Ask the witness what each message says by itself, of as many as there is time for: the ego's first, then
@@ -240,9 +242,8 @@ class FrameRun:
         tested: list[Outcome] = []
         for i, subset in enumerate(batch):
             reference = yield from self._reference(passes, likely_after(batch, i))
-            if takes := passes.takes(subset):
-                yield
-            if not self.deadline.another_fits(takes):
+            yield from self._before(passes, subset, likely_after(batch, i))
+            if not self.deadline.another_fits(passes.takes(subset)):
                 self.out_of_time = True
                 break
             boxes = self._decoded(passes, subset, likely_after(batch, i))
@@ -263,12 +264,18 @@ class FrameRun:
         return self._confident((yield from self._decode(passes, (), likely)))
 
     def _decode(self, passes: Passes, subset: Hypothesis, likely: Iterable[Hypothesis] = ()) -> Steps[FloatArray]:
-        if passes.takes(subset):
-            yield
+        yield from self._before(passes, subset, likely)
         return self._decoded(passes, subset, likely)
 
+    def _before(self, passes: Passes, subset: Hypothesis, likely: Iterable[Hypothesis]) -> Steps[None]:
+        """Pause, if it takes a pass to decode a subset. Whoever lets the frame go on may have done it then."""
+        if passes.takes(subset):
+            yield (coming := passes.coming(subset, likely))
+            if coming is not None:
+                self.timings[_stage(subset)] += coming.spent_s * 1e3
+
     def _decoded(self, passes: Passes, subset: Hypothesis, likely: Iterable[Hypothesis]) -> FloatArray:
-        with self._spending("hypotheses" if subset else "ego_only"):
+        with self._spending(_stage(subset)):
             return passes.decode(subset, likely)
 
     def _confident(self, boxes: FloatArray) -> FloatArray:
@@ -279,3 +286,8 @@ class FrameRun:
         started = self.deadline.clock()
         yield
         self.timings[stage] += (self.deadline.clock() - started) * 1e3
+
+
+def _stage(subset: Hypothesis) -> str:
+    """Whose time it is to decode a subset."""
+    return "hypotheses" if subset else "ego_only"

@@ -3,11 +3,11 @@
 from __future__ import annotations
 
 from collections.abc import Generator
-from typing import TypeVar
+from typing import Any, TypeVar
 
 T = TypeVar("T")
-Steps = Generator[None, None, T]
-"""Work that pauses before each of its larger parts."""
+Steps = Generator[Any, None, T]
+"""Work that pauses before each of its larger parts. What it yields may tell what comes (`robosac.passes.Pass`)."""
 
 
 def finished(steps: Steps[T]) -> T:

@@ -9,9 +9,8 @@ import math
 import threading
 import time
 from collections.abc import Callable, Iterable, Mapping, Sequence
-from concurrent.futures import CancelledError, Future, ThreadPoolExecutor
+from concurrent.futures import ThreadPoolExecutor
 from copy import copy
-from dataclasses import dataclass
 from functools import partial
 from typing import TypeVar
 
@@ -25,75 +24,15 @@ from robosac.defenses import EGO
 from robosac.detectors import Detector, Message, Preparer, available, load
 from robosac.detectors.device import as_device
 from robosac.detectors.loading import warm_up
-from robosac.fusion import FusionResult
+from robosac.passes import together
 from robosac.session import Session
-from robosac.steps import Steps
 from service.errors import Kind, Refused
+from service.jobs import TOGETHER, Decided, Job, waiting, with_company
 from service.turns import Turns, Work
 
 logger = logging.getLogger(__name__)
 
 T = TypeVar("T")
-
-LEAST = 0.8
-"""Part of what a frame is expected to take that it takes at least, however little is tested."""
-
-
-@dataclass(frozen=True)
-class Decided:
-    """A frame that is decided."""
-
-    result: FusionResult
-    worked_s: float
-    """For how long it had the engine's thread."""
-    waited_s: float
-    """For how long it waited for its turns."""
-
-
-class _Job:
-    """A frame that is being decided."""
-
-    def __init__(self, work: Work, steps: Steps[FusionResult], others_s: float) -> None:
-        self.work = work
-        self.done: Future[Decided] = Future()
-        self.outcome: Decided | BaseException = CancelledError()
-        self._steps = steps
-        self._submitted = time.perf_counter()
-        self._had_s = work.had_s
-        self._others_s = others_s
-        """What all had when it was submitted."""
-
-    def step(self) -> bool:
-        """Do the next step; whether there are more. If not, what came of it waits to be told."""
-        began = time.perf_counter()
-        try:
-            next(self._steps)
-        except StopIteration as stop:
-            now = time.perf_counter()
-            worked_s = self.work.had_s - self._had_s + now - began
-            self.outcome = Decided(stop.value, worked_s, now - self._submitted - worked_s)
-            return False
-        except BaseException as error:
-            self.outcome = error
-            return False
-        return True
-
-    def is_hopeless(self, now: float, others_s: float) -> bool:
-        """Whether it cannot be in time any more, for the time that others had."""
-        late_s = now + LEAST * self.work.expected_s - self.work.due
-        return self.work.had_s == 0 and 0 < late_s <= others_s - self._others_s
-
-    def tell(self) -> None:
-        """Tell whoever waits what came of it.
-
-        That one may ask for the same work anew at once, so the job must be nobody's any more.
-        """
-        if not self.done.set_running_or_notify_cancel():
-            return
-        if isinstance(self.outcome, Decided):
-            self.done.set_result(self.outcome)
-        else:
-            self.done.set_exception(self.outcome)
 
 
 class Begun:
@@ -158,7 +97,7 @@ class Engine:
         self._executor = ThreadPoolExecutor(1, "fusion", initializer=torch.set_num_threads, initargs=(threads,))
         self._lock = threading.Lock()
         self._turns = Turns()
-        self._jobs: dict[Work, _Job] = {}
+        self._jobs: dict[Work, Job] = {}
         self._working = False
         self._detectors: dict[str, Detector] = {}
         self.ready = False
@@ -224,7 +163,7 @@ class Engine:
         steps = copy(session).decide_in_steps(frame, ego, teammates, rng, deadline, detector=ahead)
         work = Work("", "", math.inf, 0.0) if work is None else work
         with self._lock:
-            self._jobs[work] = job = _Job(work, steps, self._turns.charged_s)
+            self._jobs[work] = job = Job(work, steps, self._turns.charged_s)
             work.over = False
             self._turns.add(work)
             wake, self._working = not self._working, True
@@ -262,8 +201,11 @@ class Engine:
         thread step by step, since whoever hands work to a thread waits for the interpreter's lock.
         """
         try:
-            while (job := self._next()) is not None:
-                began = time.perf_counter()
+            while jobs := self._next():
+                if len(jobs) > 1:
+                    self._pass(jobs)
+                    continue
+                job, began = jobs[0], time.perf_counter()
                 goes_on = not job.done.cancelled() and job.step()
                 with self._lock:
                     self._turns.charge(job.work, time.perf_counter() - began)
@@ -275,8 +217,10 @@ class Engine:
             self._working = False
             raise
 
-    def _next(self) -> _Job | None:
-        """The frame whose turn it is. Those that have become hopeless are refused."""
+    def _next(self) -> list[Job]:
+        """The frame whose turn it is, with those whose passes are made with its own. Those that have become hopeless
+        are refused.
+        """
         with self._lock:
             now = time.perf_counter()
             for job in [job for job in self._jobs.values() if job.is_hopeless(now, self._turns.charged_s)]:
@@ -284,9 +228,24 @@ class Engine:
                 job.outcome = Refused(Kind.OVERLOADED, "other frames took the time that this one had", retry_after_s=1)
                 job.tell()
             self._working = len(self._turns) > 0
-            return self._jobs[self._turns.next(now)] if self._working else None
+            if not self._working:
+                return []
+            jobs = self._jobs.values()
+            return with_company(self._jobs[self._turns.next(now, waiting(jobs, now))], jobs)
 
-    def _remove(self, job: _Job) -> None:
+    def _pass(self, jobs: Sequence[Job]) -> None:
+        """Make the passes of several frames as one. Each goes on when it has its turn."""
+        coming = [job.coming for job in jobs if job.coming is not None]
+        try:
+            together(coming, TOGETHER)
+        except Exception:  # each then makes its own, and whatever is wrong shows there
+            logger.warning("passes of %d frames could not be made together", len(jobs), exc_info=True)
+        with self._lock:
+            for job, made in zip(jobs, coming, strict=True):
+                self._turns.charge(job.work, made.spent_s)
+                job.coming = None
+
+    def _remove(self, job: Job) -> None:
         job.work.over = True
         self._turns.remove(job.work)
         del self._jobs[job.work]

@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from collections import Counter, OrderedDict, defaultdict
-from collections.abc import Iterable
+from collections.abc import Collection, Iterable
 from dataclasses import dataclass, field
 from operator import itemgetter
 
@@ -132,8 +132,8 @@ class Turns:
         self._sessions.setdefault(work.key, _Shares()).join(work.session_id)
         self._sessions.move_to_end(work.key)
 
-    def next(self, now: float) -> Work:
-        """The work whose turn it is.
+    def next(self, now: float, waiting: Collection[Work] = ()) -> Work:
+        """The work whose turn it is, of that which does not wait for other work.
 
         Raises
         ------
@@ -144,7 +144,8 @@ class Turns:
             raise IndexError("nothing waits")
         if len(self._works) == 1:
             return self._works[0]
-        by_key = self._by_key(self._works)
+        works = [work for work in self._works if work not in waiting] if waiting else self._works
+        by_key = self._by_key(works)
         claims = {key: self._keys.had(key) + of_key[0][1].left_s for key, of_key in by_key.items()}
         most_s = min(claims.values()) + SLACK_S
         first = [
@@ -154,7 +155,7 @@ class Turns:
             for claim_s, work in of_key
             if claim_s <= of_key[0][0] + SLACK_S
         ]
-        return min([work for work in self._works if work.is_urgent(now)] or first, key=lambda work: work.due)
+        return min([work for work in works if work.is_urgent(now)] or first, key=lambda work: work.due)
 
     def order(self, works: Iterable[Work]) -> list[Work]:
         """Work in the order in which it would be over if no other came, as far as claims tell.

@@ -208,6 +208,18 @@ class Batching(Protocol):
         """What `PreparedFrame.detect` gives for each, but for rounding."""
 
 
+@runtime_checkable
+class Joining(Batching, Protocol):
+    """A prepared frame whose subsets can be decoded at once with those of other frames."""
+
+    @property
+    def family(self) -> object:
+        """Frames of the same one, and no others, can be decoded together. It can be hashed."""
+
+    def detect_together(self, wanted: Sequence[tuple[Any, Sequence[Collection[str]]]]) -> list[list[FloatArray]]:
+        """What `Batching.detect_all` gives for each frame with its subsets. The frames are of this one's family."""
+
+
 class Preparer(Protocol):
     """What fusion needs of a detector."""
 

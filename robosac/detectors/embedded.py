@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import hashlib
-from collections.abc import Mapping
+from collections.abc import Mapping, Sequence
 from copy import copy, deepcopy
 from pathlib import Path
 from typing import Any, ClassVar, Self
@@ -22,7 +22,7 @@ from robosac.detectors.base import (
     witness_beside,
 )
 from robosac.detectors.decoding import cell_centres, decode_all
-from robosac.detectors.map_fusion import FEATURES, Decode, Finder, Heads, MapFusionDetector, Maps, combined
+from robosac.detectors.map_fusion import FEATURES, Decode, Heads, MapFusionDetector, Maps, combined
 from robosac.detectors.network import CHANNELS, MAP, FastDecoder, MeanFusionNetwork, fold_batchnorm
 from robosac.detectors.voxels import AREA_M, occupancy
 from robosac.detectors.weights_file import WeightsError, read_weights
@@ -135,14 +135,13 @@ class EmbeddedDetector(MapFusionDetector):
 
         return decode
 
-    def finder(self, ego: Message, own: torch.Tensor) -> Finder:  # noqa: ARG002
+    def context(self, ego: Message, own: torch.Tensor) -> None:
+        """Nothing of a fusion is the ego's own."""
+
+    def find(self, fused: torch.Tensor, contexts: Sequence[None]) -> list[FloatArray]:  # noqa: ARG002
         """Boxes as `decode_all` makes them."""
-
-        def find(fused: torch.Tensor) -> list[FloatArray]:
-            logits, codes = self._placed.decode(fused.to(self._dtype))
-            return decode_all(logits.float(), codes.float(), self._score_threshold)
-
-        return find
+        logits, codes = self._placed.decode(fused.to(self._dtype))
+        return decode_all(logits.float(), codes.float(), self._score_threshold)
 
     def places(self, codes: torch.Tensor) -> torch.Tensor:
         """Boxes (64, 64, 6) of all cells."""

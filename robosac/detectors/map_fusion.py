@@ -9,6 +9,7 @@ from __future__ import annotations
 from abc import ABC, abstractmethod
 from collections.abc import Callable, Collection, Iterator, Mapping, Sequence
 from copy import deepcopy
+from itertools import islice
 from typing import Any, ClassVar, Self
 
 import numpy as np
@@ -32,8 +33,7 @@ Heads = tuple[torch.Tensor, torch.Tensor]
 """The class logit of each place where there might be a vehicle, and the codes of all boxes."""
 Decode = Callable[[Maps], Heads]
 """From maps to fuse, the ego's first and all in its frame."""
-Finder = Callable[[torch.Tensor], list[FloatArray]]
-"""From fused maps (n, C, H, W) to the boxes of each."""
+Subsets = Sequence[Collection[str]]
 
 
 class MapFusionDetector(ABC):
@@ -72,15 +72,19 @@ class MapFusionDetector(ABC):
         """
 
     @abstractmethod
-    def finder(self, ego: Message, own: torch.Tensor) -> Finder:
-        """As `decoder`, but of fused maps, to the boxes of `robosac.detectors.base.PreparedFrame.detect`.
+    def context(self, ego: Message, own: torch.Tensor) -> Any:
+        """As `decoder`, but what `find` wants of it. ``own`` is on the detector's device."""
 
-        It is on the detector's device, and without gradients.
+    @abstractmethod
+    def find(self, fused: torch.Tensor, contexts: Sequence[Any]) -> list[FloatArray]:
+        """Boxes, as `robosac.detectors.base.PreparedFrame.detect` gives them, of each of some fused maps (n, C, H, W).
+
+        ``contexts`` are those of their frames, n of them. It is on the detector's device, and without gradients.
         """
 
     @abstractmethod
     def place(self) -> None:
-        """Put what `finder` needs onto the detector's device."""
+        """Put what `context` and `find` need onto the detector's device."""
 
     def on_device(self, device: str, worth: int | None = None) -> Self:
         """As `robosac.detectors.base.Placeable.on_device`.
@@ -146,7 +150,7 @@ def combined(maps: torch.Tensor, weights: FloatArray) -> torch.Tensor:
 class PreparedMaps:
     """A frame to be decoded for many subsets.
 
-    See `robosac.detectors.base.PreparedFrame`, and `Growing` and `Batching` there.
+    See `robosac.detectors.base.PreparedFrame`, and `Growing` and `Joining` there.
     """
 
     def __init__(self, detector: MapFusionDetector, ego: Message) -> None:
@@ -154,7 +158,7 @@ class PreparedMaps:
         self._ego = ego
         with torch.inference_mode():
             self.own = by_cell(_features([ego]), detector.device)[0] / detector.gain
-            self._find = detector.finder(ego, self.own)
+            self._context = detector.context(ego, self.own)
         self.warped: dict[str, torch.Tensor] = {}
         self._together: torch.Tensor | None = None
 
@@ -162,6 +166,11 @@ class PreparedMaps:
     def worth(self) -> int:
         """As the detector's."""
         return self._detector.worth
+
+    @property
+    def family(self) -> object:
+        """The detector."""
+        return self._detector
 
     def add(self, teammates: Mapping[str, Message]) -> None:
         """Warp the maps of these teammates."""
@@ -175,21 +184,33 @@ class PreparedMaps:
         """Boxes (n, 6) of the ego fused with these teammates; with none, of the ego alone."""
         with torch.inference_mode():
             fused = self._detector.fused([self.own, *(self.warped[name] for name in teammates)])
-            return self._find(fused[None])[0]
+            return self._detector.find(fused[None], [self._context])[0]
 
-    def detect_all(self, subsets: Sequence[Collection[str]]) -> list[FloatArray]:
+    def detect_all(self, subsets: Subsets) -> list[FloatArray]:
         """Boxes (k, 6) of each subset, as `detect` gives them but for rounding."""
+        return self.detect_together([(self, subsets)])[0]
+
+    @staticmethod
+    def detect_together(wanted: Sequence[tuple[PreparedMaps, Subsets]]) -> list[list[FloatArray]]:
+        """As `detect_all`, of several frames of a detector, each with subsets of its own."""
+        contexts = [frame._context for frame, subsets in wanted for _ in subsets]
+        with torch.inference_mode():
+            fused = [frame._fused_for(subsets) for frame, subsets in wanted]
+            found = iter(wanted[0][0]._detector.find(torch.cat(fused), contexts))
+        return [list(islice(found, len(subsets))) for _, subsets in wanted]
+
+    def _fused_for(self, subsets: Subsets) -> torch.Tensor:
+        """The fused map (n, C, H, W) of each subset."""
         row = {name: i for i, name in enumerate(self.warped, 1)}
         chosen = np.zeros((len(subsets), 1 + len(row)), dtype=np.float32)
         chosen[:, 0] = 1.0
         for i, subset in enumerate(subsets):
             chosen[i, [row[name] for name in subset]] = 1.0
-        with torch.inference_mode():
-            if self._together is None:
-                # a map that overflowed is none of those that are fused without it, but infinity times 0 is no number
-                cells = torch.stack([each.permute(1, 2, 0) for each in (self.own, *self.warped.values())])
-                self._together = torch.nan_to_num(cells).permute(0, 3, 1, 2)
-            return self._find(self._detector.fused_of_each(self._together, chosen))
+        if self._together is None:
+            # a map that overflowed is none of those that are fused without it, but infinity times 0 is no number
+            cells = torch.stack([each.permute(1, 2, 0) for each in (self.own, *self.warped.values())])
+            self._together = torch.nan_to_num(cells).permute(0, 3, 1, 2)
+        return self._detector.fused_of_each(self._together, chosen)
 
 
 class MapSurface:

@@ -16,8 +16,9 @@ from robosac.defenses import Rejection
 from service.deciding.admission import Admission
 from service.deciding.asked import Answered, Asked
 from service.deciding.keeping import Keeping
-from service.engine import Decided, Engine
+from service.engine import Engine
 from service.errors import SessionChanged, StoreTooSlow
+from service.jobs import Decided
 from service.keeping.patience import GRACE_S
 from service.keeping.record import SessionRecord
 from service.sessions.gathering import Received

@@ -80,27 +80,6 @@ def test_the_ego_is_not_decoded_again_and_its_pass_still_tells_what_one_costs():
     assert deadline.another_fits()
 
 
-@pytest.mark.parametrize("known", [True, False])
-def test_batches_are_passed_on_and_the_ego_alone_is_not_decoded_again(known, detector, ego_message, benign):
-    batching = detector.on_device("cpu", worth=3)
-    ahead = Ahead(batching, ego_message)
-    if known:
-        ahead.see_alone()
-    prepared = ahead.prepare(ego_message, benign)
-    assert prepared.worth == 3
-    first, alone, last = prepared.detect_all([("rsu",), (), ("car-2", "rsu")])
-    assert (alone is prepared.detect(())) == known
-    for boxes, subset in ((first, ("rsu",)), (alone, ()), (last, ("car-2", "rsu"))):
-        np.testing.assert_allclose(boxes, prepared.detect(subset), atol=1e-4)
-    assert prepared.detect_all([()])[0].shape == alone.shape
-
-
-def test_of_a_detector_without_batches_one_subset_is_worth_decoding():
-    prepared = Ahead(FakeDetector(), fusing.EGO).prepare(fusing.EGO, fusing.TEAM)
-    assert prepared.worth == 1
-    assert len(prepared.detect_all([(), ("a",)])) == 2
-
-
 def test_a_detector_that_adds_nobody_later_is_asked_for_the_whole_frame():
     detector = FakeDetector()
     ahead = Ahead(detector, fusing.EGO)

@@ -9,7 +9,7 @@ from robosac.ahead import Ahead
 from robosac.answers import Verdict
 from robosac.deadline import Deadline
 from robosac.defenses import A2CP, Batch, Decision, Halving, SampleConsensus, Source
-from robosac.passes import Passes
+from robosac.passes import Passes, together
 from robosac.session import Session, defense_for
 from tests.robosac.fusing import TEAM, FakeDetector, Stubborn, run
 
@@ -201,11 +201,78 @@ def test_nothing_is_offered_where_one_is_decoded_at_a_time():
     assert run(FakeDetector(), Offering(sampling_budget=7, collaborators=3), TEAM).fault is None
 
 
-def test_what_the_ego_sees_alone_may_be_known_before(detector, ego_message, attacked):
-    batching = detector.on_device("cpu", worth=8)
-    ahead = Ahead(batching, ego_message)
-    ahead.see_alone()
-    session = Session(batching, list(attacked), defense_for(DEFENSES[0], detector.info), rng=np.random.default_rng(3))
+@pytest.mark.parametrize("known", [True, False])
+def test_what_the_ego_sees_alone_may_be_known_before(known, detector, ego_message, attacked):
+    several = Together(detector, 8)
+    ahead = Ahead(several, ego_message)
+    if known:
+        ahead.see_alone()
+        several.passes.clear()
+    defense = defense_for(DEFENSES[0], detector.info)
+    session = Session(detector, list(attacked), defense, rng=np.random.default_rng(3))
     result = session.answer(0, ego_message, attacked, detector=ahead)
     assert result.fault is None
     assert result.sampling_steps > 0
+    assert (() in several.passes[0]) != known
+    assert len(several.passes[0]) > 1
+
+
+class Family:
+    """Frames that are decoded together; ``passes`` has what was."""
+
+    worth, family = 4, "family"
+
+    def __init__(self, passes):
+        self.passes = passes
+
+    def detect(self, teammates=()):
+        return self.detect_all([teammates])[0]
+
+    def detect_all(self, subsets):
+        return self.detect_together([(self, subsets)])[0]
+
+    def detect_together(self, wanted):
+        self.passes.append([tuple(subsets) for _, subsets in wanted])
+        return [[np.full((1, 6), len(subset)) for subset in subsets] for _, subsets in wanted]
+
+
+def test_passes_of_several_frames_are_made_as_one():
+    made, boxes = [], [{}, {}]
+    frames = [Passes(Family(made), Deadline(), of_frame) for of_frame in boxes]
+    coming = [frames[0].coming(("a",), [("b",), ("c",)]), frames[1].coming((), [("a", "b")])]
+    assert made == []
+    together(coming, most=5)
+    assert made == [[(("a",), ("b",)), ((), ("a", "b"))]]
+    assert all(each.spent_s > 0 for each in coming)
+    assert boxes == [{}, {}]
+    assert frames[0].decode(("b",))[0, 0] == 1
+    assert frames[1].decode(("a", "b"))[0, 0] == 2
+    assert not frames[1].takes(())
+    assert frames[0].takes(("c",))
+    assert len(made) == 1
+
+
+def test_what_is_asked_for_is_decoded_however_many_ask():
+    made = []
+    coming = [Passes(Family(made), Deadline(), {}).coming(("a",), [("b",)]) for _ in range(3)]
+    together(coming, most=2)
+    assert made == [[(("a",),)] * 3]
+
+
+def test_a_pass_with_others_tells_what_one_takes():
+    clock = SimpleNamespace(now=0.0)
+    deadline = Deadline(at=1.0, clock=lambda: clock.now)
+    passes = Passes(Family([]), deadline, {})
+    passes.keep([("a",)], [np.zeros((0, 6))], took_s=0.5)
+    assert deadline.another_fits()
+    clock.now = 0.45
+    assert not deadline.another_fits()
+    assert deadline.another_fits(takes_a_pass=False)
+
+
+def test_what_takes_no_pass_or_is_decoded_alone_is_not_made_with_others():
+    single = Together(FakeDetector(), 4).prepare(None, {})
+    assert Passes(single, Deadline(), {}).coming(("a",)) is None
+    passes = Passes(Family([]), Deadline(), {}, {(): np.zeros((0, 6))})
+    assert passes.coming(()) is None
+    assert passes.coming(("a",)) is not None

@@ -6,10 +6,10 @@ from contextlib import ExitStack
 import pytest
 
 from robosac import wire
-from service import engine as engine_module
 from service.deciding.admission import MARGIN_S, SESSION_FRAMES, Admission
 from service.engine import Engine
 from service.errors import Kind, Refused
+from service.jobs import Job
 from service.turns import Turns, Work
 from tests.service.conftest import EGO, problem, serve
 
@@ -263,7 +263,7 @@ async def test_a_frame_that_others_held_up_until_it_cannot_be_in_time_is_refused
 
 async def test_work_may_be_asked_for_anew_as_soon_as_it_is_decided(monkeypatch):
     """As where the session changed meanwhile: the engine is done with it then, however slowly it goes on."""
-    step = engine_module._Job.step
+    step = Job.step
 
     def slow(job):
         goes_on = step(job)
@@ -271,7 +271,7 @@ async def test_work_may_be_asked_for_anew_as_soon_as_it_is_decided(monkeypatch):
             time.sleep(0.05)
         return goes_on
 
-    monkeypatch.setattr(engine_module._Job, "step", slow)
+    monkeypatch.setattr(Job, "step", slow)
     engine, work = Engine(1), Work("key", "s", math.inf, 0.0)
     try:
         for _ in range(3):

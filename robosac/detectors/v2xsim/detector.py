@@ -8,7 +8,7 @@ checkpoint.
 from __future__ import annotations
 
 import hashlib
-from collections.abc import Callable, Mapping
+from collections.abc import Callable, Mapping, Sequence
 from copy import copy
 from pathlib import Path
 from typing import Any, ClassVar, Self
@@ -26,9 +26,9 @@ from robosac.detectors.base import (
     witness_beside,
 )
 from robosac.detectors.device import CPU, stacked
-from robosac.detectors.map_fusion import FEATURES, Decode, Finder, Heads, MapFusionDetector, Maps, combined
+from robosac.detectors.map_fusion import FEATURES, Decode, Heads, MapFusionDetector, Maps, combined
 from robosac.detectors.v2xsim.anchors import SCORE_THRESHOLD, detections_of_each, geometry
-from robosac.detectors.v2xsim.fast import FastDecoder
+from robosac.detectors.v2xsim.fast import Context, FastDecoder, of_all
 from robosac.detectors.v2xsim.network import CHANNELS, MAP, V2XSimNetwork, select_published
 from robosac.detectors.v2xsim.voxels import AREA_M, PACKED_SHAPE, occupancy, pack, unpack
 from robosac.detectors.weights_file import WeightsError, read_weights, save_weights
@@ -169,15 +169,14 @@ class V2XSimDetector(MapFusionDetector):
 
         return decode
 
-    def finder(self, ego: Message, own: torch.Tensor) -> Finder:
+    def context(self, ego: Message, own: torch.Tensor) -> Context:
+        """The decoder's part that is the ego's own."""
+        return self._fast.context(_grid(ego, self.device), own[None])
+
+    def find(self, fused: torch.Tensor, contexts: Sequence[Context]) -> list[FloatArray]:
         """Boxes by the fast decoder, in this detector's precision."""
-        context = self._fast.context(_grid(ego, self.device), own[None])
-
-        def find(fused: torch.Tensor) -> list[FloatArray]:
-            logits, codes = self._fast.decode(fused, context)
-            return [boxes for boxes, _ in detections_of_each(logits, codes, self._score_threshold)]
-
-        return find
+        logits, codes = self._fast.decode(fused, of_all(contexts))
+        return [boxes for boxes, _ in detections_of_each(logits, codes, self._score_threshold)]
 
     def places(self, codes: torch.Tensor) -> torch.Tensor:
         """Boxes (393216, 6) of all anchors."""

@@ -10,6 +10,7 @@ It computes what `robosac.detectors.v2xsim.network.V2XSimNetwork.decode` does, w
 
 from __future__ import annotations
 
+from collections.abc import Sequence
 from dataclasses import dataclass
 
 import torch
@@ -19,6 +20,8 @@ from robosac.detectors.base import Precision
 from robosac.detectors.device import CPU
 from robosac.detectors.v2xsim.network import ANCHORS, CODE, Conv, V2XSimNetwork, channels_last
 
+Context = tuple[torch.Tensor, ...]
+"""What of the decoder is an ego's own: maps (1, C, H, W)."""
 _DOUBLED = torch.tensor([[0, 0, 1], [0, 1, 1], [1, 1, 0], [1, 0, 0]], dtype=torch.float64)
 """Which of three neighbouring weights each of four taps of the transposed convolution sums up."""
 
@@ -63,7 +66,7 @@ class FastDecoder:
         self._codes_hidden = hidden.weight.permute(2, 3, 1, 0).reshape(-1, hidden.weight.shape[0]), hidden.bias
         self._codes = codes.weight[:, :, 0, 0].T, codes.bias
 
-    def context(self, grid: torch.Tensor, features: torch.Tensor) -> tuple[torch.Tensor, ...]:
+    def context(self, grid: torch.Tensor, features: torch.Tensor) -> Context:
         """What of the decoder no hypothesis changes, as `V2XSimNetwork.context` does."""
         maps, levels = channels_last(grid.to(self._dtype)), []
         for level in self._encoder:
@@ -76,14 +79,14 @@ class FastDecoder:
         skips = (skip(level) for skip, level in zip(self._skips[1:], reversed(levels), strict=True))
         return self._ups[0](deepest), *skips
 
-    def decode(self, fused: torch.Tensor, context: tuple[torch.Tensor, ...]) -> tuple[torch.Tensor, Codes]:
+    def decode(self, fused: torch.Tensor, context: Context) -> tuple[torch.Tensor, Codes]:
         """Fused message -> logits of every anchor, and the codes of those that one asks for.
 
         Parameters
         ----------
         fused : (n, 256, 32, 32) tensor
         context : tuple of tensors
-            As `context` returns it.
+            As `context` returns it; or `of_all` egos, in the order of their fused maps.
 
         Returns
         -------
@@ -101,6 +104,14 @@ class FastDecoder:
 
     def _join(self, i: int, below: torch.Tensor, skip: torch.Tensor) -> torch.Tensor:
         return self._seconds[i](below.add_(skip).relu_() if i else (below + skip).relu_()).relu_()
+
+
+def of_all(contexts: Sequence[Context]) -> Context:
+    """Contexts of fused maps in their order, as one; if all are the same, that."""
+    first = contexts[0]
+    if all(each is first for each in contexts):
+        return first
+    return tuple(channels_last(torch.cat(parts)) for parts in zip(*contexts, strict=True))
 
 
 @dataclass(frozen=True)

@@ -44,6 +44,22 @@ def test_they_do_so_in_bfloat16(ego_message, benign):
         np.testing.assert_allclose(boxes[:10], prepared.detect(subset)[:10], atol=0.1)
 
 
+@pytest.mark.parametrize("there", [True, False])
+def test_frames_of_several_egos_are_decoded_at_once(there, detector, messages):
+    teams = {ego: {name: message for name, message in messages.items() if name != ego} for ego in ("car-1", "car-3")}
+    with elsewhere() as device:
+        far = detector.on_device(device if there else "cpu", worth=2)
+        frames = {ego: far.prepare(messages[ego], team) for ego, team in teams.items()}
+        assert {frame.family for frame in frames.values()} == {far}
+        wanted = [(frames["car-1"], [("rsu",), ()]), (frames["car-3"], [("car-1", "rsu")]), (frames["car-1"], [()])]
+        found = frames["car-3"].detect_together(wanted)
+    assert [len(of_frame) for of_frame in found] == [2, 1, 1]
+    here = {ego: detector.prepare(messages[ego], team) for ego, team in teams.items()}
+    expected = [here["car-1"].detect(("rsu",)), here["car-1"].detect(()), here["car-3"].detect(("car-1", "rsu"))]
+    for boxes, right in zip([*found[0], *found[1], *found[2]], [*expected, expected[1]], strict=True):
+        np.testing.assert_allclose(boxes, right, atol=1e-4)
+
+
 def test_who_is_added_later_is_fused_too(detector, ego_message, benign, attacked):
     prepared = detector.prepare(ego_message, {"car-3": benign["car-3"]})
     prepared.detect_all([("car-3",)])

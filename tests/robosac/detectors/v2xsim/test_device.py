@@ -32,6 +32,25 @@ def test_a_frame_is_prepared_and_decoded_there(fusion, published_state, tmp_path
             np.testing.assert_allclose(boxes, right, atol=2e-4)
 
 
+@pytest.mark.parametrize("fusion", ["mean", "max", "sum"])
+@pytest.mark.parametrize("there", [True, False])
+def test_frames_of_several_egos_are_decoded_at_once(there, fusion, published_state, tmp_path, team):
+    path = tmp_path / f"{fusion}.safetensors"
+    write_weights(published_state, fusion, path)
+    teams = [(team[0], {"a": team[1], "b": team[2]}), (team[3], {"a": team[4]}), (team[4], {})]
+    subsets = [[("a",), (), ("a", "b")], [("a",)], [()]]
+    here = [load(path).prepare(ego, others) for ego, others in teams]
+    with elsewhere() as device:
+        far = load(path, device=device if there else "cpu")
+        frames = [far.prepare(ego, others) for ego, others in teams]
+        assert {frame.family for frame in frames} == {far}
+        found = frames[1].detect_together(list(zip(frames, subsets, strict=True)))
+    assert [len(of_frame) for of_frame in found] == [3, 1, 1]
+    for frame, asked, boxes in zip(here, subsets, found, strict=True):
+        for subset, of_subset in zip(asked, boxes, strict=True):
+            np.testing.assert_allclose(of_subset, frame.detect(subset), atol=2e-4)
+
+
 @pytest.mark.parametrize("fusion", ["mean", "sum"])
 def test_what_overflows_in_one_message_spoils_no_fusion_without_it(fusion, published_state, tmp_path, team):
     path = tmp_path / f"{fusion}.safetensors"
