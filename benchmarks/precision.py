@@ -1,6 +1,6 @@
 """What a narrower precision changes: verdicts, boxes, average precision and testimony, and the time that they take.
 
-Every subset of teammates is decoded in float32 and in the other precision, in frames of validation scenes with one
+Every subset of teammates is decoded in float32 and in the narrower precision, in frames of validation scenes with one
 attacker of five, and compared with the ego's own boxes in the same precision.
 """
 
@@ -21,12 +21,11 @@ from robosac.calibrated import witness_of
 from robosac.consensus import at_least, compare
 from robosac.defenses import EGO
 from robosac.detectors import DEFAULT_DETECTOR, Detector, load
+from robosac.detectors.base import Precision
 from robosac.evaluation.average_precision import AveragePrecision
 from robosac.evaluation.frames import EvaluationFrame, evaluation_frames
 from robosac.scenes import DEFAULT_DATA, SOURCES, Split
 from robosac.testimony import LIKELIHOOD
-
-PRECISIONS = ("float32", "bfloat16")
 
 
 def main(
@@ -36,10 +35,12 @@ def main(
     split: Split = "validation",
     scenes: Annotated[int, typer.Option(min=1)] = 20,
     frames: Annotated[int, typer.Option(min=1)] = 3,
+    narrow: Precision = "bfloat16",
 ) -> None:
+    precisions = ("float32", narrow)
     torch.set_num_threads(1)
     console = Console()
-    rivals = {precision: load(f"{detector}@{precision}") for precision in PRECISIONS}
+    rivals = {precision: load(f"{detector}@{precision}") for precision in precisions}
     wide = rivals["float32"]
     score = wide.info.consensus_score
     chosen = SOURCES.make(data).scenes(split)[:scenes]
@@ -74,15 +75,15 @@ def main(
                     precision[name]["honest"].add(found[name], frame.truth)
         for name in rivals:
             precision[name]["alone"].add(alone[name], frame.truth)
-    table = Table("", *PRECISIONS, title=f"{wide.info.name}: {verdicts} fusions of {data}, {split}, {attack} x 1")
+    table = Table("", *precisions, title=f"{wide.info.name}: {verdicts} fusions of {data}, {split}, {attack} x 1")
     for what, name in (("the ego alone", "alone"), ("all honest", "honest")):
         for iou in (0.5, 0.7):
-            row = [f"{precision[p][name].at(iou):.4f}" for p in PRECISIONS]
+            row = [f"{precision[p][name].at(iou):.4f}" for p in precisions]
             table.add_row(f"AP{iou * 100:.0f}, {what}", *row)
-    medians = [float(np.median(times[p])) for p in PRECISIONS]
+    medians = [float(np.median(times[p])) for p in precisions]
     table.add_row("CPU time of a fusion, of that in float32", *(f"{m / medians[0]:.2f}" for m in medians))
     if differs:
-        medians = [float(np.median(reading[p])) for p in PRECISIONS]
+        medians = [float(np.median(reading[p])) for p in precisions]
         table.add_row("CPU time of testimony, of that in float32", *(f"{m / medians[0]:.2f}" for m in medians))
         table.add_row("L of testimony: mean difference", "", f"{np.mean(differs):.3f}")
     table.add_row("verdicts that flip", "", f"{flips} of {verdicts}")

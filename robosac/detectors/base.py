@@ -22,7 +22,7 @@ if TYPE_CHECKING:
     from robosac.testimony import Testimony
 
 Role = Literal["ego", "teammate"]
-Precision = Literal["float32", "bfloat16"]
+Precision = Literal["float32", "bfloat16", "float16"]
 """The numbers in which a decoder computes."""
 
 

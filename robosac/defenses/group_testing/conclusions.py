@@ -74,7 +74,7 @@ def conclude(found: Findings, answer: Hypothesis) -> None:
             found.lies.effects[name] = frame
         if lies and found.seems_late(name):
             lies = [replace(lie, along=True) for lie in lies]
-        for kind in {lie.counts_as for lie in lies}:
+        for kind in sorted({lie.counts_as for lie in lies}):
             of_kind = [lie for lie in lies if lie.counts_as == kind]
             places = [found.placed(lie.place) for lie in of_kind]
             counts[kind] = found.lies.counting(name, kind, places, frame)

@@ -103,7 +103,7 @@ class Findings:
         if not lies:
             return lies
         parts: dict[Hypothesis, Hypothesis] = {(name,): part for name, part in one_out(answer, self.shown).items()}
-        for group in {self.vouching(answer, lie) for lie in lies} - {()}:
+        for group in sorted({self.vouching(answer, lie) for lie in lies} - {()}):
             parts[group] = tuple(name for name in answer if name not in group)
         for group, without in parts.items():
             if lies and without in self.shown:

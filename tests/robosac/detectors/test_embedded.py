@@ -10,7 +10,7 @@ from safetensors.torch import load_file, save_file
 from robosac import wire
 from robosac.boxes import pairwise_iou, pose_matrix
 from robosac.detectors import EmbeddedDetector, Message, WeightsError, available, load
-from robosac.detectors.base import in_precision
+from robosac.detectors.base import check_boxes, in_precision
 from robosac.detectors.embedded import SHIPPED_WEIGHTS
 from robosac.detectors.network import CHANNELS, MAP, FastDecoder, MeanFusionNetwork, fold_batchnorm
 from robosac.detectors.weights_file import read_weights
@@ -63,7 +63,7 @@ def test_a_folded_network_computes_the_same(rng):
         torch.testing.assert_close(folded.decode(maps), plain.decode(maps), atol=1e-5, rtol=1e-4)
 
 
-@pytest.mark.parametrize(("dtype", "near"), [(torch.float32, 1e-5), (torch.bfloat16, 0.1)])
+@pytest.mark.parametrize(("dtype", "near"), [(torch.float32, 1e-5), (torch.bfloat16, 0.1), (torch.float16, 0.02)])
 def test_the_fast_decoder_computes_the_same(dtype, near, rng):
     tensors, _ = read_weights(SHIPPED_WEIGHTS)
     network = MeanFusionNetwork()
@@ -74,15 +74,28 @@ def test_the_fast_decoder_computes_the_same(dtype, near, rng):
         torch.testing.assert_close(FastDecoder(network).decode(maps), network.decode(maps), atol=near, rtol=near)
 
 
-def test_in_bfloat16_it_sees_the_same(detector, ego_message, benign):
-    narrow = load("intersection-mean@bfloat16")
-    assert narrow.info == in_precision(detector.info, "bfloat16")
+@pytest.mark.parametrize("precision", ["bfloat16", "float16"])
+def test_in_a_narrow_precision_it_sees_the_same(precision, detector, ego_message, benign):
+    narrow = load(f"intersection-mean@{precision}")
+    assert narrow.info == in_precision(detector.info, precision)
     wide_boxes, boxes = (at.prepare(ego_message, benign).detect(list(benign)) for at in (detector, narrow))
     sure = wide_boxes[wide_boxes[:, 5] >= 0.3]
     assert len(sure) > 5
     overlap = pairwise_iou(sure, boxes)
     assert (overlap.max(axis=1) > 0.8).all()
     assert 0 < np.abs(boxes[overlap.argmax(axis=1), 5] - sure[:, 5]).max() < 0.05
+
+
+@pytest.mark.parametrize("precision", ["float32", "bfloat16", "float16"])
+def test_messages_of_enormous_numbers_make_sound_boxes_or_none(precision, detector, ego_message, benign, rng):
+    narrow, shape = detector.in_precision(precision), benign["rsu"].tensors["features"].shape
+    for largest in (300.0, 3e3, 65504.0):
+        for numbers in (np.full(shape, largest), largest * rng.random(shape), largest * rng.choice([0, 1], shape)):
+            hostile = Message(benign["rsu"].pose, {"features": numbers.astype(np.float16)})
+            for worth in (1, 2):
+                frame = narrow.on_device("cpu", worth).prepare(ego_message, {**benign, "rsu": hostile})
+                for boxes in frame.detect_all([("rsu",), tuple(benign)]):
+                    check_boxes(boxes)
 
 
 def test_a_message_lies_in_memory_as_one_that_was_received(detector, attacked, ego_message):

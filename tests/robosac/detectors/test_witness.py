@@ -83,14 +83,17 @@ def test_messages_are_read_as_the_network_reads_maps(mirrored, rng):
         np.testing.assert_allclose(found, maps, atol=1e-5 * np.abs(maps).max())
 
 
-def test_with_a_narrow_detector_messages_are_read_in_its_precision(detector, ego_message, benign):
+@pytest.mark.parametrize(("precision", "least", "most"), [("bfloat16", 0.01, 0.3), ("float16", 0.001, 0.03)])
+def test_with_a_narrow_detector_messages_are_read_in_its_precision(
+    precision, least, most, detector, ego_message, benign
+):
     """As the same, but for rounding."""
     sent = [ego_message, *benign.values()]
-    wide, narrow = (witness_of(each.info) for each in (detector, detector.in_precision("bfloat16")))
+    wide, narrow = (witness_of(each.info) for each in (detector, detector.in_precision(precision)))
     assert witness_of(detector.info) is wide
     wide_maps, maps = (np.stack([reader.read_message(each) for each in sent]) for reader in (wide, narrow))
     off = np.abs(maps.astype(np.float64) - wide_maps).max(axis=(0, 2, 3))
-    assert 0.01 < off[LIKELIHOOD] < 0.3
+    assert least < off[LIKELIHOOD] < most
     assert (off[X:] < 0.1).all()
 
 

@@ -68,8 +68,9 @@ def test_the_maps_of_a_frame_are_not_changed_by_decoding_it(network, frame):
     assert all(torch.equal(term, kept) for term, kept in zip(context, before, strict=True))
 
 
-def test_in_bfloat16_it_is_close(network, frame, plain):
-    logits, codes = decoded(network, frame, "bfloat16")
+@pytest.mark.parametrize("precision", ["bfloat16", "float16"])
+def test_in_a_narrow_precision_it_is_close(precision, network, frame, plain):
+    logits, codes = decoded(network, frame, precision)
     assert logits.dtype == torch.float32
     error = (logits - plain[0]).abs()
     scale = float(plain[0].std())
