@@ -20,7 +20,7 @@ honest vehicle that drives on an empty road, between walls or in a platoon are a
 from __future__ import annotations
 
 import math
-from collections.abc import Mapping, Sequence
+from collections.abc import Collection, Mapping, Sequence
 from dataclasses import dataclass, field, replace
 from typing import Any
 
@@ -122,7 +122,8 @@ class Screening:
         differs = None if EGO not in seen else seen[EGO].differing
         bound = self._repeating(differs)
         silent = {name: past for name, past in memory.items() if name not in seen and recent(past, frame)}
-        refused, earlier = {}, _earlier({**pasts, **{name: Past.from_json(past) for name, past in silent.items()}})
+        known = {**pasts, **{name: Past.from_json(past) for name, past in silent.items()}}
+        refused, earlier = {}, _earlier(known, {one.digest for one in prints.values()})
         for name, one in seen.items():
             if name != EGO and (why := self._implausible(one) or _copied(name, seen, earlier) or _repeated(one, bound)):
                 often = one.past.refused + 1 >= NAMED_AFTER
@@ -223,12 +224,13 @@ def _repeated(seen: _Seen, bound: float) -> Rejection | None:
     return _repetition(seen, anchor.frame, anchor.place, 1.0 - differs)
 
 
-def _earlier(pasts: Mapping[str, Past]) -> dict[str, list[tuple[str, int]]]:
+def _earlier(pasts: Mapping[str, Past], digests: Collection[str]) -> dict[str, list[tuple[str, int]]]:
     """By digest, who sent a message, and since which frame."""
     found: dict[str, list[tuple[str, int]]] = {}
     for name, past in pasts.items():
         for sent in past.sent:
-            found.setdefault(sent.digest, []).append((name, sent.first))
+            if sent.digest in digests:
+                found.setdefault(sent.digest, []).append((name, sent.first))
     return found
 
 
