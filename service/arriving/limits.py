@@ -15,6 +15,8 @@ from service.errors import Kind, Refused
 
 UNREAD_BYTES = 2**21
 """If more of a body is left when its request is answered, the connection is closed: to take the rest costs time."""
+_DIGITS = 20
+"""Of an announced length that are read: any bound is passed by then, and Python makes no number of thousands."""
 
 
 def too_large(limit: int) -> Refused:
@@ -25,7 +27,7 @@ def too_large(limit: int) -> Refused:
 def announced_bytes(headers: Headers) -> int:
     """The length that a request announces; 0 if it announces none."""
     announced = headers.get("content-length", "")
-    return int(announced) if announced.isdecimal() and len(announced) < 20 else 0
+    return int(announced.lstrip("0")[:_DIGITS] or 0) if announced.isdecimal() else 0
 
 
 def expected_bytes(request: Request, limit: int) -> int:

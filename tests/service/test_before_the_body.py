@@ -59,7 +59,15 @@ async def test_a_body_that_nobody_needs_is_not_read(route, served):
 
 @pytest.mark.parametrize(
     ("size", "token", "closes"),
-    [(UNREAD_BYTES + 1, None, True), (32 * 2**20, None, True), (33 * 2**20, None, True), (UNREAD_BYTES, None, False)],
+    [
+        (UNREAD_BYTES + 1, None, True),
+        (32 * 2**20, None, True),
+        (33 * 2**20, None, True),
+        (2**64 - 1, None, True),
+        (f"{32 * 2**20:05000}", None, True),
+        (UNREAD_BYTES, None, False),
+        (f"{UNREAD_BYTES:05000}", None, False),
+    ],
 )
 async def test_a_large_body_that_is_not_wanted_is_not_waited_for(size, token, closes):
     async with serve(api_key=KEY, api_keys=KEY) as served:
