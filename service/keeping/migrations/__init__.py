@@ -8,6 +8,8 @@ from sqlalchemy import Connection, func, inspect, select, text
 
 HEAD = "0007"
 """The latest step."""
+_ENCODINGS = ("UTF8", "SQL_ASCII")
+"""Of PostgreSQL, that take every character: a log repeats what vehicles send."""
 _LOCK = 0x0D5EAC
 """Number of the advisory lock that processes starting at once take in PostgreSQL, chosen at random."""
 
@@ -20,8 +22,9 @@ def upgrade(connection: Connection) -> None:
     Raises
     ------
     ValueError
-        If the database is of a later version than this one, or of another program.
+        If the database is of a later version than this one, or of another program, or cannot keep every text.
     """
+    _check_encoding(connection)
     lock(connection)
     revision = _revision(connection)
     if revision == HEAD:
@@ -45,6 +48,14 @@ def lock(connection: Connection) -> None:
     """Keep others from changing the schema until the transaction's end."""
     if connection.dialect.name == "postgresql":
         connection.execute(select(func.pg_advisory_xact_lock(_LOCK)))
+
+
+def _check_encoding(connection: Connection) -> None:
+    if connection.dialect.name != "postgresql":
+        return
+    encoding = connection.execute(text("SHOW server_encoding")).scalar()
+    if encoding not in _ENCODINGS:
+        raise ValueError(f"the database's encoding is {encoding}, in which not every text can be kept; make it UTF8")
 
 
 def _revision(connection: Connection) -> str | None:
