@@ -6,13 +6,18 @@ from dataclasses import dataclass
 
 UNBOUND = {
     "application_name": "robosac",
+    "default_transaction_isolation": "read committed",
     "statement_timeout": "0",
+    "lock_timeout": "0",
     "idle_in_transaction_session_timeout": "0",
     "tcp_keepalives_idle": "5",
     "tcp_keepalives_interval": "2",
     "tcp_keepalives_count": "3",
 }
-"""Settings of a connection that may take as long as it needs to."""
+"""Settings of a connection that may take as long as it needs to, whatever the server's operator has set.
+
+Whoever changes a session waits for its row, and then sees it as it is. Where transactions are isolated more, they fail.
+"""
 
 
 @dataclass(frozen=True)

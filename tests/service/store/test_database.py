@@ -16,7 +16,7 @@ from alembic.autogenerate import compare_metadata
 from alembic.config import Config
 from alembic.runtime.migration import MigrationContext
 from alembic.script import ScriptDirectory
-from sqlalchemy import text
+from sqlalchemy import make_url, text
 
 from clients.errors import SessionNotFound
 from robosac import wire
@@ -191,6 +191,7 @@ async def test_a_file_that_was_moved_takes_nothing(tmp_path, put_in_its_place):
 
 async def test_a_start_waits_for_another_one_as_long_as_it_takes(postgres):
     url, holding = await postgres.new_database(), asyncio.Event()
+    await postgres.do(f"ALTER DATABASE {make_url(url).database} SET lock_timeout = 100")  # as an operator may have it
     first, second = connect(url), Store(url, limits=Limits(statement_s=0.1))
 
     def slow(connection):
