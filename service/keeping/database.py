@@ -180,7 +180,7 @@ class Sqlite(_Failing):
 
     def __init__(self, url: URL) -> None:
         file = file_of(url)
-        place = Place(None if file is None else Path(file))
+        self._place = place = Place(None if file is None else Path(file))
         self._writer = _SqliteThreads(url, 1, place)
         event.listen(self._writer.engine, "begin", _begin_immediate)
         self._readers = None if file is None else _SqliteThreads(url, READERS, place)
@@ -203,6 +203,10 @@ class Sqlite(_Failing):
 
     async def prepare(self, work: Work[None]) -> None:
         await self.write(work)
+        with _unavailable():
+            file = self._place.of_everybody()
+        if file is not None:
+            logger.warning("everybody may read %s or write to it, and it holds secrets (chmod 600)", file)
 
     async def close(self) -> None:
         if self._writing is not None:

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import stat
 from pathlib import Path
 
 
@@ -26,6 +27,12 @@ class Place:
         """
         if self._file is not None and self._path is not None and self._file != self._found(self._path):
             raise FileNotFoundError("the database's file was moved, and another one put in its place")
+
+    def of_everybody(self) -> Path | None:
+        """The file, if everybody may read it or write to it; its group is for whoever runs the gateway to choose."""
+        if self._path is None or not self._path.stat().st_mode & stat.S_IRWXO:
+            return None
+        return self._path
 
     def _found(self, path: Path) -> tuple[int, int]:
         status = path.stat()

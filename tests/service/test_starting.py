@@ -73,6 +73,18 @@ async def test_a_database_that_cannot_be_used_is_named_in_a_line(tmp_path):
         assert "\n" not in told
 
 
+@pytest.mark.parametrize(("mode", "told"), [(0o600, False), (0o660, False), (0o644, True), (0o602, True)])
+async def test_a_database_that_everybody_may_read_is_told_at_the_start(mode, told, tmp_path, caplog):
+    path = tmp_path / "copy.db"
+    async with serve(database_url=f"sqlite:///{path}"):
+        pass
+    assert "everybody may read" not in caplog.text
+    path.chmod(mode)
+    async with serve(database_url=f"sqlite:///{path}"):
+        assert (f"everybody may read {path} or write to it" in caplog.text) is told
+    assert path.stat().st_mode & 0o777 == mode
+
+
 async def test_a_fault_that_is_no_setting_keeps_its_traceback(monkeypatch):
     async def broken(engine):
         1 / 0  # noqa: B018
