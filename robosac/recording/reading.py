@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import math
 from collections.abc import Iterator, Mapping, Sequence
 from contextlib import suppress
 from dataclasses import dataclass, field
@@ -32,13 +33,14 @@ from robosac.recording.content import (
     Poses,
     TrueFrame,
 )
+from robosac.recording.unpacking import records_in
 
 if TYPE_CHECKING:
     from mcap.records import Message as Written
 
 SUFFIX = ".mcap"
 MOST_BYTES = 2**30
-"""Of one chunk, unpacked: a frame of 64 vehicles has a tenth of it."""
+"""Of one chunk, or of one message, unpacked: a frame of 64 vehicles has a tenth of it."""
 MAGIC_BYTES = 8
 _KINDS = "fiu"
 """Of numbers in tensors."""
@@ -104,7 +106,7 @@ class RecordedFile:
         """See `RecordedFrame.messages`."""
         from mcap.records import Chunk  # noqa: PLC0415 (of an extra)
         from mcap.records import Message as Written  # noqa: PLC0415
-        from mcap.stream_reader import StreamReader, breakup_chunk  # noqa: PLC0415
+        from mcap.stream_reader import StreamReader  # noqa: PLC0415
 
         with self.path.open("rb") as file:
             for place in frame.chunks:
@@ -112,7 +114,7 @@ class RecordedFile:
                 record = next(StreamReader(file, skip_magic=True, emit_chunks=True).records)
                 if not isinstance(record, Chunk):
                     raise RecordingError(f"{self.path} was changed while it was read")
-                for told in breakup_chunk(record, validate_crc=True):
+                for told in records_in(record):
                     if isinstance(told, Written) and self._is_of(told, frame):
                         yield _message(told.data, self.path)
 
@@ -239,7 +241,7 @@ class _Scan:
     def _records(self, file: BinaryIO) -> Iterator[tuple[int, str, Written]]:
         from mcap.records import Channel, Chunk, Metadata  # noqa: PLC0415 (of an extra)
         from mcap.records import Message as Written  # noqa: PLC0415
-        from mcap.stream_reader import StreamReader, breakup_chunk  # noqa: PLC0415
+        from mcap.stream_reader import StreamReader  # noqa: PLC0415
 
         place = 0
         for record in StreamReader(file, emit_chunks=True, record_size_limit=MOST_BYTES).records:
@@ -249,7 +251,7 @@ class _Scan:
             if isinstance(record, Chunk):
                 if record.uncompressed_size > MOST_BYTES:
                     raise RecordingError(f"{self._path} has a chunk of {record.uncompressed_size} bytes")
-                for told in breakup_chunk(record, validate_crc=True):
+                for told in records_in(record):
                     if isinstance(told, Channel):
                         self.topics[told.id] = told.topic
                     elif isinstance(told, Written):
@@ -263,6 +265,8 @@ def _message(body: bytes, path: Path) -> tuple[str, Message]:
         envelope = wire.read_message(body)
         tensors = envelope.payload.get("tensors")
         specs = {name: _spec(sent) for name, sent in tensors.items()} if isinstance(tensors, dict) else {}
+        if sum(_bytes(spec) for spec in specs.values()) > MOST_BYTES:
+            raise RecordingError(f"{path}: a message has tensors of more than {MOST_BYTES} bytes")
         layout = DetectorInfo("as recorded", {"ego": specs}, (0, 0, 0, 0), 1.0, "", 0.0)
         return envelope.vehicle_id, wire.check_message(envelope.payload, layout, "ego")
     except (wire.WireError, TypeError) as error:
@@ -275,3 +279,7 @@ def _spec(sent: Any) -> TensorSpec:
     if np.dtype(dtype).kind not in _KINDS:
         raise TypeError(f"tensors hold numbers, got {dtype!r}")
     return TensorSpec(dtype, tuple(shape))
+
+
+def _bytes(spec: TensorSpec) -> int:
+    return abs(math.prod(spec.shape)) * np.dtype(spec.dtype).itemsize
