@@ -270,12 +270,13 @@ class Sessions:
         if self._held(record) is not None or detector is None or not has_changed(record, detector.info):
             return record
         event = detector_changed(detector.info, accepted=self.settings.allow_other_weights)
+        if not event.accepted and record.session_id in self._standing:
+            return record
         logger.warning("other weights", session_id=record.session_id, detector=record.detector, accepted=event.accepted)
         if event.accepted:
             return await self.store.change_detector(record, event)
-        if record.session_id not in self._standing:
-            self._standing.add(record.session_id)
-            await self.store.log(record.session_id, event)
+        self._standing.add(record.session_id)
+        await self.store.log(record.session_id, event)
         return record
 
     def _forget(self, session_id: str) -> None:

@@ -99,7 +99,7 @@ def test_what_a_reference_makes_is_checked(load, attribute, complaint, monkeypat
         load(f"own:{attribute}")
 
 
-async def test_other_weights_of_the_same_name_are_recorded_and_have_to_be_allowed(tmp_path, good_frame):
+async def test_other_weights_of_the_same_name_are_recorded_and_have_to_be_allowed(tmp_path, good_frame, caplog):
     database = f"sqlite:///{tmp_path}/robosac.db"
     own = {"database_url": database, "extra_detectors": (str(ADVERSARIAL_WEIGHTS),)}
     async with serve(database_url=database) as served:
@@ -110,6 +110,7 @@ async def test_other_weights_of_the_same_name_are_recorded_and_have_to_be_allowe
             refused = await served.post(session, "frames", good_frame(1))
             fields = problem(refused, 503, "detector-unavailable")
             assert "ROBOSAC_ALLOW_OTHER_WEIGHTS" in fields["detail"]
+        assert caplog.text.count("'event': 'other weights'") == 1  # however often somebody asks
         assert [record["event"] for record in await served.ego(session).audit()][2:] == ["detector_changed"]
     async with serve(**own, allow_other_weights=True, keep_frames=9) as served:
         ego = served.ego(session)
