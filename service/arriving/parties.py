@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import ipaddress
 from collections.abc import Callable
 
 from starlette.datastructures import Headers
@@ -36,7 +37,7 @@ class Parties:
         """The party of a request."""
         credential = Headers(scope=scope).get("authorization", "").partition(" ")[2].strip()
         known = self._known(credential) if credential else None
-        return known or (f"address {(scope.get('client') or ('',))[0]}", "")
+        return known or (f"address {_place((scope.get('client') or ('',))[0])}", "")
 
     def _known(self, credential: str) -> Party | None:
         key_id = self._api_keys.id_of(credential)
@@ -50,3 +51,14 @@ class Parties:
         if named is None or record is None or record.token_ids.get(named.vehicle_id) != named.token_id:
             return None
         return f"key {record.key_id}", named.token_id
+
+
+def _place(address: str) -> str:
+    """Where somebody is: of IPv6 the network, since whoever has one address has 2**64 of them."""
+    if ":" not in address:
+        return address
+    try:
+        found = ipaddress.IPv6Address(address)
+    except ValueError:
+        return address
+    return str(found.ipv4_mapped or f"{int(found) >> 64:x}::/64")

@@ -102,6 +102,25 @@ async def test_only_credentials_that_count_make_a_party():
         assert party(renewed.token)[0] == party(KEY)[0]
 
 
+@pytest.mark.parametrize(
+    ("one", "other", "same"),
+    [
+        ("2001:db8::1", "2001:db8::ffff:2", True),  # of one network, as whoever has one address has all of it
+        ("2001:db8::1", "2001:db8:0:1::1", False),
+        ("::ffff:192.0.2.1", "192.0.2.1", True),
+        ("::ffff:192.0.2.1", "::ffff:192.0.2.2", False),
+        ("192.0.2.1", "192.0.2.2", False),
+        ("fe80::1%eth0", "fe80::2%eth0", True),
+        ("no:address", "no:other", False),
+    ],
+)
+async def test_strangers_are_told_apart_by_what_nobody_has_many_of(one, other, same):
+    async with serve(api_keys=KEY) as served:
+        parties = Parties(served.gateway.api_keys, served.gateway.viewer_tokens, served.gateway.store.seen)
+        first, second = (parties({"type": "http", "headers": [], "client": (address, 1)}) for address in (one, other))
+        assert (first == second) is same
+
+
 @pytest.mark.parametrize("path", ["/healthz", "/v1/sessions/abc/frames", "/v1/sessions/abc/messages", "/v1/live/abc"])
 async def test_frames_and_what_lasts_wait_for_nobody(path):
     requests, frames = Requests(line := Line(Frames())), Frames()
