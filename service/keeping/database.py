@@ -248,6 +248,8 @@ class _SqliteThreads:
         )
         event.listen(self.engine, "do_connect", _create_for_us_alone)
         event.listen(self.engine, "connect", _prepare)
+        event.listen(self.engine, "connect", lambda *_: place.opened())
+        event.listen(self.engine, "close", lambda *_: place.closed())
         self._place = place
         self._threads = ThreadPoolExecutor(number, "sqlite")
 
