@@ -5,11 +5,14 @@ from __future__ import annotations
 import json
 import logging
 import time
+from collections.abc import Mapping
 from dataclasses import fields
+from types import NoneType
 from typing import Any
 
 from sqlalchemy import Row, bindparam, false, func, select, update
 
+from robosac.faults import describe
 from service.errors import StoreUnavailable
 from service.keeping.record import SessionRecord
 from service.keeping.tables import kept_messages, sessions
@@ -18,6 +21,17 @@ logger = logging.getLogger(__name__)
 
 _JSON = frozenset({"teammates", "defense", "token_ids", "public_keys", "state"})
 FIELDS = tuple(field.name for field in fields(SessionRecord))
+_KINDS: Mapping[str, tuple[type, ...]] = {
+    "str": (str,),
+    "str | None": (str, NoneType),
+    "int": (int,),
+    "int | None": (int, NoneType),
+    "float": (float, int),
+    "tuple": (list,),
+    "Mapping": (dict,),
+}
+_READ_AS = {field.name: _KINDS[str(field.type).partition("[")[0]] for field in fields(SessionRecord)}
+"""What is in a column that is whole. SQLite keeps a value of any kind in any."""
 THIS = sessions.c.session_id == bindparam("this")
 OPEN = sessions.c.ended_at.is_(None)
 ENDED = sessions.c.ended_at.is_not(None)
@@ -53,8 +67,10 @@ def read_row(row: Row[Any], known: SessionRecord | None = None) -> SessionRecord
     """
     try:
         values = {name: json.loads(value) if name in _JSON else value for name, value in row._mapping.items()}
+        if wrong := [name for name, value in values.items() if not isinstance(value, _READ_AS[name])]:
+            raise TypeError(f"{', '.join(wrong)} of another kind")
     except (ValueError, TypeError, RecursionError) as error:
-        logger.error("the database failed: the row of session %s is damaged", row.session_id)
+        logger.error("the database failed: the row of session %s is damaged: %s", row.session_id, describe(error))
         raise StoreUnavailable from error
     if known is not None and "defense" not in values:
         values |= {"defense": known.defense, "state": known.state}

@@ -284,13 +284,27 @@ async def test_a_session_that_cannot_be_ended_keeps_no_other_from_it_nor_logs_fr
         assert await store.get(over.session_id) is None
 
 
-async def test_a_damaged_session_is_unavailable_and_no_fault_of_the_gateway(tmp_path, good_frame):
+@pytest.mark.parametrize(
+    ("column", "value"),
+    [
+        ("public_keys", "{"),
+        ("public_keys", "[]"),
+        ("teammates", "5"),
+        ("token_ids", "null"),
+        ("latency_budget_ms", "soon"),
+        ("last_frame", "the first"),
+        ("audit_seq", 1.5),
+        ("seed", b"\0"),
+    ],
+)
+async def test_a_damaged_session_is_unavailable_and_no_fault_of_the_gateway(column, value, tmp_path, good_frame):
     path = tmp_path / "robosac.db"
     async with serve(database_url=f"sqlite:///{path}") as served:
         damaged, whole = await served.open(), await served.open()
         database = sqlite3.connect(path)
         with database:
-            database.execute("UPDATE sessions SET public_keys = '{' WHERE session_id = ?", [damaged.session_id])
+            change = f"UPDATE sessions SET {column} = ? WHERE session_id = ?"
+            database.execute(change, [value, damaged.session_id])
         database.close()
         bearer = {"Authorization": f"Bearer {damaged.ego_token}"}
         answer = await served.http.get(f"/v1/sessions/{damaged.session_id}", headers=bearer)
