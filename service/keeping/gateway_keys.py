@@ -75,11 +75,19 @@ def _read(file: Path) -> str:
     try:
         if not file.exists():
             _make(file)
-        if stat.S_IMODE(file.stat().st_mode) & 0o077:
+        if _is_open_to_others(file.stat()):
             raise ValueError(f"ROBOSAC_GATEWAY_KEY_FILE: others may read {file}; take that right away (chmod 600)")
         return file.read_text()
     except (OSError, UnicodeError) as error:
         raise ValueError(f"ROBOSAC_GATEWAY_KEY_FILE: {file} cannot be read: {unreadable(error)}") from error
+
+
+def _is_open_to_others(status: os.stat_result) -> bool:
+    """Whether others may read a file, or write to it. One of root's, such as a secret of Kubernetes, is read by its
+    group: else the gateway could not read it.
+    """
+    of_others = stat.S_IRWXG | stat.S_IRWXO if status.st_uid == os.geteuid() else stat.S_IWGRP | stat.S_IRWXO
+    return bool(status.st_mode & of_others)
 
 
 def _make(file: Path) -> None:

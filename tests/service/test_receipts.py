@@ -110,6 +110,22 @@ async def test_a_bad_key_file_is_refused(tmp_path, text, mode, why):
         await GatewayKeys(file).start(None)
 
 
+@pytest.mark.parametrize(("mode", "taken"), [(0o440, True), (0o640, True), (0o660, False), (0o444, False)])
+async def test_a_key_file_of_somebody_else_may_be_read_by_its_group(tmp_path, monkeypatch, mode, taken):
+    """As a secret of Kubernetes is, which nobody but root owns."""
+    file = tmp_path / "gateway.key"
+    file.write_text(ANOTHER)
+    file.chmod(mode)
+    monkeypatch.setattr(os, "geteuid", lambda: file.stat().st_uid + 1)
+    keys = GatewayKeys(file)
+    if taken:
+        await keys.start(None)
+        assert len(keys.published()) == 1
+    else:
+        with pytest.raises(ValueError, match="others may read"):
+            await keys.start(None)
+
+
 async def test_a_key_file_is_made_whole_or_not_at_all(tmp_path, monkeypatch):
     file = tmp_path / "gateway.key"
 
