@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+from urllib.parse import parse_qsl
+
 from sqlalchemy.engine import URL, make_url
 from sqlalchemy.exc import ArgumentError
 
@@ -41,7 +43,7 @@ def read_url(text: str) -> URL:
     kind = url.get_backend_name()
     if kind == "sqlite" and "uri" in url.query:  # which can turn locks off, and name no file
         raise ValueError("a SQLite database is named by its path, not by a URI")
-    if not set(url.query) <= set(_OPTIONS[kind]):
+    if not _options_in(text, url) <= set(_OPTIONS[kind]):
         raise ValueError(f"the URL of a {kind} database may have no other option than {', '.join(_OPTIONS[kind])}")
     if kind == "sqlite" and "timeout" in url.query and not _is_timeout(url.query["timeout"]):
         raise ValueError(f"a SQLite database's timeout must be a number of seconds from 0 to {MOST_TIMEOUT_S:g}")
@@ -59,6 +61,15 @@ def file_of(url: URL) -> str | None:
     """The file of a SQLite database; None of one in memory, and of PostgreSQL."""
     path = url.database if url.get_backend_name() == "sqlite" else None
     return None if path in (None, "", ":memory:") else path
+
+
+def _options_in(text: str, url: URL) -> set[str]:
+    """Names of what stands behind the question mark, empty for what has no value. SQLAlchemy drops that, and would open
+    another file than one whose name has a question mark.
+    """
+    if url.get_backend_name() != "sqlite":
+        return set(url.query)  # a password may have a question mark
+    return {name if value else "" for name, value in parse_qsl(text.partition("?")[2], keep_blank_values=True)}
 
 
 def _number(value: object) -> int | None:

@@ -13,6 +13,7 @@ WRONG = [
     "sqlite://secret/x",
     *(f"sqlite:///x?{option}" for option in ("secret=1", "mode=ro", "isolation_level=DEFERRED", "timeout=1&secret=1")),
     *(f"sqlite:///x?timeout={value}" for value in ("secret", "-5", "nan", "inf", "1e300", "1&timeout=2")),
+    *("sqlite:///which?.db", "sqlite:///x?timeout", "sqlite:///x?timeout=", "sqlite:///a?b?timeout=1"),
     "postgresql://u:p@h:secret/d",
     "postgresql://u:p@h:99999/d",
     "postgresql://u:p@h:0/d",
