@@ -32,16 +32,15 @@ def test_a_frame_is_prepared_and_decoded_there(fusion, published_state, tmp_path
             np.testing.assert_allclose(boxes, right, atol=2e-4)
 
 
-@pytest.mark.parametrize("fusion", ["mean", "max", "sum"])
-@pytest.mark.parametrize("there", [True, False])
-def test_frames_of_several_egos_are_decoded_at_once(there, fusion, published_state, tmp_path, team):
+@pytest.mark.parametrize("fusion", ["mean", "max"])
+def test_frames_of_several_egos_are_decoded_at_once(fusion, published_state, tmp_path, team):
     path = tmp_path / f"{fusion}.safetensors"
     write_weights(published_state, fusion, path)
     teams = [(team[0], {"a": team[1], "b": team[2]}), (team[3], {"a": team[4]}), (team[4], {})]
     subsets = [[("a",), (), ("a", "b")], [("a",)], [()]]
     here = [load(path).prepare(ego, others) for ego, others in teams]
     with elsewhere() as device:
-        far = load(path, device=device if there else "cpu")
+        far = load(path, device=device)
         frames = [far.prepare(ego, others) for ego, others in teams]
         assert {frame.family for frame in frames} == {far}
         found = frames[1].detect_together(list(zip(frames, subsets, strict=True)))
