@@ -17,7 +17,7 @@ import numpy as np
 import torch
 from torch.nn import functional
 
-from robosac.attacks.returned import check_aim
+from robosac.attacks.returned import check_aim, of_attackers
 from robosac.attacks.situation import Situation
 from robosac.detectors.base import AttackSurface
 
@@ -106,8 +106,8 @@ class Attack(ABC):
 
         Raises
         ------
-        KeyError
-            If an attacker has no message in the frame.
+        robosac.attacks.returned.NoSuchAttacker
+            A `KeyError`: an attacker has no message in the frame.
         """
 
 
@@ -161,7 +161,7 @@ class IterativeAttack(Attack):
         warm : bool
             Whether to begin with the variables that the frame before ended with, and to keep those of this frame.
         """
-        clean = {name: surface.messages[name] for name in sorted(attackers)}
+        clean = of_attackers(surface.messages, attackers)
         if not clean or not self.prepare(surface, clean, rng, situation):
             return {}
         harm = self.aim(surface, clean, situation)

@@ -19,7 +19,7 @@ from robosac.attacks.alibi import Alibi, covering, framing, keeping
 from robosac.attacks.base import Attack, IterativeAttack, Tensors, Term
 from robosac.attacks.geometric import SHOWN
 from robosac.attacks.hearing import Hearing
-from robosac.attacks.returned import check_returned
+from robosac.attacks.returned import check_returned, of_attackers
 from robosac.attacks.situation import Past, Situation
 from robosac.boxes import FloatArray, pose_matrix
 from robosac.detectors.base import AttackSurface, Detector, Encoder, GeometricSurface, Message, Preparer, blank
@@ -89,7 +89,7 @@ class Campaign:
     Raises
     ------
     ValueError
-        If there is an alibi for an attack that does not optimise.
+        If the attack has no name, or there is an alibi for one that does not optimise.
     """
 
     attack: Attack | None
@@ -111,6 +111,8 @@ class Campaign:
     """So many times the attack's own bound."""
 
     def __post_init__(self) -> None:
+        if self.attack is not None and not isinstance(getattr(self.attack, "name", None), str):
+            raise ValueError(f"{type(self.attack).__name__} has no name: give the class a text, such as name = 'mine'")
         if self.softness and not isinstance(self.attack, IterativeAttack):
             raise ValueError(f"only an attack that optimises can be soft, not {self.name}")
         if self.words is not None and not self.softness:
@@ -176,8 +178,8 @@ class Campaign:
 
         Raises
         ------
-        KeyError
-            If an attacker has no message in the frame.
+        robosac.attacks.returned.NoSuchAttacker
+            A `KeyError`: an attacker has no message in the frame.
         AttackError
             If the attack returns what is no message of an attacker.
         NoGeometry
@@ -188,7 +190,7 @@ class Campaign:
         acting = list(self.schedule(frame, sorted(attackers)))
         if not acting or (self.attack is None and self.pose is None):
             return {}
-        sent = {name: benign[name] for name in acting}
+        sent = of_attackers(benign, acting)
         if self.pose is not None:
             sent = {name: replace(message, pose=self.pose(message.pose, frame)) for name, message in sent.items()}
         if self.attack is None:

@@ -9,6 +9,7 @@ import numpy as np
 import torch
 
 from robosac.attacks.base import Attack
+from robosac.attacks.returned import of_attackers
 from robosac.attacks.situation import Situation
 from robosac.detectors.base import AttackSurface
 
@@ -27,8 +28,7 @@ class GaussianNoise(Attack):
     ) -> dict[str, torch.Tensor]:
         """Add the noise."""
         sent = {}
-        for name in sorted(attackers):
-            clean = surface.messages[name]
+        for name, clean in of_attackers(surface.messages, attackers).items():
             noise = torch.from_numpy(rng.normal(0.0, self.epsilon, tuple(clean.shape)).astype(np.float32))
             sent[name] = clean + noise.clamp(-self.epsilon, self.epsilon)
         return sent

@@ -18,6 +18,7 @@ from torch.nn import functional
 from robosac.attacks.base import SEEN, Aim, IterativeAttack, Tensors
 from robosac.attacks.geometric import CERTAIN, SHOWN, Perception, average, balanced, displacement, geometric
 from robosac.attacks.places import Room
+from robosac.attacks.returned import AttackError
 from robosac.attacks.situation import Lie, Situation
 from robosac.boxes import FloatArray
 from robosac.detectors.base import AttackSurface
@@ -133,7 +134,11 @@ class OnObjects(IterativeAttack):
         situation: Situation,
     ) -> bool:
         """Choose the lies, and say them."""
-        situation.lies.extend(self.lies(Scope(situation, View.of(surface, situation), tuple(attackers)), rng))
+        told = self.lies(Scope(situation, View.of(surface, situation), tuple(attackers)), rng)
+        if not isinstance(told, list) or not all(isinstance(lie, Lie) for lie in told):
+            who = getattr(self, "name", type(self).__name__)
+            raise AttackError(f"{who}: lies must return a list of Lie, got {told!r:.100}")
+        situation.lies.extend(told)
         return bool(situation.lies)
 
     def aim(self, surface: AttackSurface, attackers: Collection[str], situation: Situation) -> Aim:  # noqa: ARG002

@@ -11,6 +11,7 @@ import numpy as np
 import torch
 
 from robosac.attacks.base import Attack
+from robosac.attacks.returned import of_attackers
 from robosac.attacks.situation import Situation
 from robosac.detectors.base import AttackSurface, Message
 
@@ -57,8 +58,7 @@ class Replay(Attack):
     ) -> dict[str, torch.Tensor]:
         """Look each attacker's map up."""
         heard, sent = Heard(surface.messages, attackers, situation or Situation()), {}
-        for name in sorted(attackers):
-            own = surface.messages[name]
+        for name, own in of_attackers(surface.messages, attackers).items():
             found = self.replayed(name, heard)
             if found is not None and found.shape == own.shape and not torch.equal(found, own):
                 sent[name] = found

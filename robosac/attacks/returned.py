@@ -1,16 +1,42 @@
-"""What an attack returns, looked at before it is sent: attacks of one's own return anything."""
+"""What an attack is given and returns, looked at before it is used: attacks of one's own return anything."""
 
 from __future__ import annotations
 
 from collections.abc import Collection, Mapping
+from typing import TypeVar
 
 import torch
 
 from robosac.detectors.base import AttackSurface
 
+T = TypeVar("T")
+
 
 class AttackError(ValueError):
-    """What an attack made is not what it has to be."""
+    """What an attack made, or was given, is not what it has to be."""
+
+
+class NoSuchAttacker(AttackError, KeyError):
+    """Somebody who sends nothing in the frame is to attack in it."""
+
+    __str__ = Exception.__str__  # a KeyError shows its message in quotes
+
+
+def of_attackers(messages: Mapping[str, T], attackers: Collection[str]) -> dict[str, T]:
+    """The attackers' messages, sorted by their names.
+
+    Raises
+    ------
+    TypeError
+        If one text is given in the place of several names.
+    NoSuchAttacker
+        If an attacker has no message.
+    """
+    if isinstance(attackers, str):
+        raise TypeError(f"attackers must be a collection of names, got the text {attackers!r}")
+    if absent := [name for name in attackers if name not in messages]:
+        raise NoSuchAttacker(f"the attacker {absent[0]!r} sends nothing in this frame; {', '.join(messages)} do")
+    return {name: messages[name] for name in sorted(attackers)}
 
 
 def check_returned(name: str, sent: object, surface: AttackSurface, acting: Collection[str]) -> None:
@@ -43,6 +69,8 @@ def check_returned(name: str, sent: object, surface: AttackSurface, acting: Coll
             raise AttackError(f"{part} must be a tensor, got a {type(tensor).__name__}")
         if tensor.shape != benign.shape:
             raise AttackError(f"{part} must be of shape {tuple(benign.shape)}, got {tuple(tensor.shape)}")
+        if tensor.is_complex():
+            raise AttackError(f"{part} must be of real numbers, got {tensor.dtype}")
         if not torch.isfinite(tensor).all():
             raise AttackError(f"{part} holds NaN or infinity")
 
@@ -61,6 +89,8 @@ def check_aim(name: str, value: object) -> None:
         got = f"a tensor of shape {tuple(value.shape)}"
     elif not value.requires_grad:
         got = "a number that does not depend on them"
+    elif value.isnan():
+        got = "NaN"
     else:
         return
     raise AttackError(f"{name}: what is minimised must be one number that follows from the messages, got {got}")

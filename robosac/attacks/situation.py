@@ -4,7 +4,7 @@ from __future__ import annotations
 
 from collections.abc import Callable, Hashable, Mapping
 from dataclasses import dataclass, field
-from typing import Any, Literal
+from typing import Any, Literal, get_args
 
 import numpy as np
 import torch
@@ -25,7 +25,13 @@ KEPT_S = 2.0
 
 @dataclass(frozen=True, eq=False)
 class Lie:
-    """What an attack on an object says about it in one frame."""
+    """What an attack on an object says about it in one frame.
+
+    Raises
+    ------
+    ValueError
+        If there is no such kind, or a box is not five finite numbers, or has no size.
+    """
 
     kind: LieKind
     box: FloatArray
@@ -36,6 +42,23 @@ class Lie:
     """Which of the attack's objects this is; the same one has the same number from frame to frame."""
     truth: FloatArray | None = None
     """(5,), ego frame: how a moved or reshaped vehicle really is."""
+
+    def __post_init__(self) -> None:
+        if self.kind not in get_args(LieKind):
+            raise ValueError(f"no lie is of kind {self.kind!r}; the kinds are {', '.join(get_args(LieKind))}")
+        for name, box in (("box", self.box), ("truth", self.truth)):
+            if box is not None or name == "box":
+                _check_box(f"{name} of a lie", box)
+
+
+def _check_box(what: str, box: object) -> None:
+    wanted = f"{what} must be x, y, length, width, yaw, an array of shape (5,)"
+    if not isinstance(box, np.ndarray) or box.dtype.kind not in "fiu":
+        raise ValueError(f"{wanted}, got {box!r:.100}")
+    if box.shape != (5,):
+        raise ValueError(f"{wanted}, got one of shape {box.shape}")
+    if not np.isfinite(box).all() or min(box[2:4]) <= 0:
+        raise ValueError(f"{wanted}, finite, length and width positive, got {box.tolist()}")
 
 
 @dataclass(frozen=True, eq=False)

@@ -4,7 +4,7 @@ import numpy as np
 import pytest
 import torch
 
-from robosac.attacks import Attack, AttackError, Campaign, IterativeAttack
+from robosac.attacks import PGD, Attack, AttackError, Campaign, IterativeAttack, Lie, OnObjects, load_campaign
 from robosac.attacks.returned import check_returned
 from robosac.scenes import IntersectionScene
 from tests.robosac.attacks.linear import Linear
@@ -21,6 +21,7 @@ SHAPE = (3, 4)
         ({"c": torch.zeros(SHAPE)}, "mine: run returned a message of 'c'; the attackers are a, b"),
         ({"b": np.zeros(SHAPE)}, "mine: the message of 'b' that run returned must be a tensor, got a ndarray"),
         ({"b": torch.zeros(1, 4)}, r"the message of 'b' .* must be of shape \(3, 4\), got \(1, 4\)"),
+        ({"b": torch.zeros(SHAPE, dtype=torch.complex64)}, "must be of real numbers, got torch.complex64"),
         ({"b": torch.full(SHAPE, torch.nan)}, "the message of 'b' that run returned holds NaN or infinity"),
     ],
 )
@@ -41,6 +42,7 @@ def test_messages_of_some_attackers_will_do():
         (lambda logits: 1.0, "got a float"),
         (lambda logits: logits, r"got a tensor of shape \(3, 4\)"),
         (lambda logits: torch.tensor(1.0), "got a number that does not depend on them"),
+        (lambda logits: logits.sum() * np.nan, "got NaN"),
     ],
 )
 def test_an_aim_that_cannot_be_descended_is_told(value, words):
@@ -79,3 +81,54 @@ def test_needs_are_a_tuple_of_names():
 
     with pytest.raises(ValueError, match=r"needs must be a tuple of names, such as \('class_logits',\)"):
         Needs()
+
+
+def test_an_attack_has_a_name():
+    @dataclass(frozen=True)
+    class Nameless(PGD):
+        name = None
+
+    with pytest.raises(ValueError, match=r"^Nameless has no name: give the class a text, such as name = 'mine'$"):
+        Campaign(Nameless())
+
+
+@pytest.mark.parametrize("attack", ["pgd", "noise", "frozen"])
+def test_an_attacker_that_sends_nothing_is_named(attack):
+    chosen = load_campaign(attack).attack
+    with pytest.raises(KeyError) as refused:
+        chosen.run(Linear(), ["a", "car-9"], np.random.default_rng(0))
+    assert str(refused.value) == "the attacker 'car-9' sends nothing in this frame; a, b, c do"
+    assert isinstance(refused.value, AttackError)
+    with pytest.raises(TypeError, match="attackers must be a collection of names, got the text 'car-2'"):
+        chosen.run(Linear(), "car-2", np.random.default_rng(0))
+
+
+BOX = np.array([10.0, 5.0, 4.6, 1.9, 0.0])
+
+
+@pytest.mark.parametrize(
+    ("lie", "words"),
+    [
+        (("swap", BOX), "no lie is of kind 'swap'; the kinds are ghost, erased, dimmed, moved, reshaped"),
+        (("ghost", BOX[:4]), r"^box of a lie must be x, y, length, width, yaw, .* got one of shape \(4,\)"),
+        (("ghost", BOX.tolist()), r"^box of a lie must be .*, got \[10.0"),
+        (("ghost", BOX * [1, 1, -1, 1, 1]), "finite, length and width positive, got"),
+        (("ghost", BOX * np.nan), "finite, length and width positive, got"),
+        (("moved", BOX, 0, BOX[None]), r"^truth of a lie must be .* got one of shape \(1, 5\)"),
+    ],
+)
+def test_a_lie_is_about_an_object_that_can_be(lie, words):
+    with pytest.raises(ValueError, match=words):
+        Lie(*lie)
+
+
+@pytest.mark.parametrize("told", [None, Lie("ghost", BOX), [BOX]])
+def test_lies_are_a_list_of_them(told):
+    class Mine(OnObjects):
+        name = "mine"
+
+        def lies(self, scope, rng):
+            return told
+
+    with pytest.raises(AttackError, match="mine: lies must return a list of Lie, got "):
+        Mine().run(Linear(), ["a"], np.random.default_rng(0))
