@@ -94,7 +94,7 @@ class Kind(Generic[T]):
 
     def check(self, candidate: object, contract: type[Any], who: str) -> None:
         """Refuse what does not fulfil a contract, with what it lacks; ``who`` made it."""
-        faults = [lacks(candidate, contract)]
+        faults = [lacks(candidate, contract), misfits(candidate, contract)]
         if not _is_protocol(contract) and not isinstance(candidate, contract):
             faults.insert(0, f"has to derive from {contract.__name__}")
         if any(faults):
@@ -123,9 +123,13 @@ def parts(contract: type[Any]) -> dict[str, str]:
         All public methods and properties of a protocol, the abstract ones of a class, each with the first line of its
         docstring.
     """
+    return {name: (inspect.getdoc(part) or "").partition("\n")[0] for name, part in _parts(contract).items()}
+
+
+def _parts(contract: type[Any]) -> dict[str, Any]:
     protocol = _is_protocol(contract)
     return {
-        name: (inspect.getdoc(part) or "").partition("\n")[0]
+        name: part
         for base in reversed(contract.__mro__)
         for name, part in vars(base).items()
         if not name.startswith("_")
@@ -149,9 +153,35 @@ def lacks(candidate: object, contract: type[Any], needed: Collection[str] | None
     str
         ``lacks NAME (PURPOSE), ...``; empty if it lacks nothing.
     """
-    purposes = parts(contract)
-    missing = [name for name in (purposes if needed is None else needed) if not hasattr(candidate, name)]
-    return f"lacks {', '.join(f'{name} ({purposes.get(name)})' for name in missing)}" if missing else ""
+    purposes, wanted = parts(contract), _parts(contract)
+    missing = [name for name in (purposes if needed is None else needed) if not _has(candidate, name, wanted.get(name))]
+    shown = [f"{name} ({purposes[name]})" if name in purposes else name for name in missing]
+    return f"lacks {', '.join(shown)}" if missing else ""
+
+
+def misfits(candidate: object, contract: type[Any]) -> str:
+    """Which methods of an object cannot be called as those of a contract are.
+
+    Returns
+    -------
+    str
+        ``has a method NAME that cannot be called with (PARAMETERS)``; empty if all can.
+    """
+    for name, part in _parts(contract).items():
+        method = getattr(candidate, name, None) if inspect.isfunction(part) else None
+        if callable(method):
+            called_with = list(inspect.signature(part).parameters)[1:]
+            try:
+                inspect.signature(method).bind(*called_with)
+            except TypeError as error:
+                return f"has a method {name} that cannot be called with ({', '.join(called_with)}): {error}"
+            except ValueError:  # of what is written in another language nothing is known
+                continue
+    return ""
+
+
+def _has(candidate: object, name: str, part: object) -> bool:
+    return callable(getattr(candidate, name, None)) if inspect.isfunction(part) else hasattr(candidate, name)
 
 
 def _is_protocol(contract: type[Any]) -> bool:

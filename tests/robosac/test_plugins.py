@@ -1,16 +1,18 @@
 """The one way in which defences, attacks, detectors and scene sources are found."""
 
+import re
 import shutil
 import subprocess
 import sys
 from abc import ABC, abstractmethod
 from pathlib import Path
+from types import SimpleNamespace
 from typing import Protocol
 
 import pytest
 
 import robosac
-from robosac.plugins import Kind, lacks, parts
+from robosac.plugins import Kind, lacks, misfits, parts
 
 FILES = {
     "__init__": "",
@@ -127,6 +129,26 @@ def test_a_class_asks_for_its_abstract_methods_and_to_be_derived_from():
     assert lacks(7, Room) == "lacks door (The way in.)"
     with pytest.raises(ValueError, match=r"x made no room but 7, which has to derive from Room and lacks door"):
         Kind("room", "house", Room).check(7, Room, "x")
+
+
+def test_what_cannot_be_called_is_lacking():
+    class Flat:
+        area = None
+
+    assert lacks(Flat(), Shape) == "lacks area (Square metres.)"
+    assert lacks(Flat(), Shape, ["edge"]) == "lacks edge"
+
+
+def test_a_method_is_called_as_the_contract_says():
+    class Scaled:
+        def area(self, scale):
+            return scale
+
+    told = "has a method area that cannot be called with (): missing a required argument: 'scale'"
+    assert misfits(Scaled(), Shape) == told
+    assert misfits(SimpleNamespace(area=lambda scale=1: scale), Shape) == ""
+    with pytest.raises(ValueError, match=f"x made no shape but .* which {re.escape(told)}$"):
+        shapes().check(Scaled(), Shape, "x")
 
 
 def test_all_parts_of_a_protocol_are_asked_for_those_inherited_too():
