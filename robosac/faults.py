@@ -3,7 +3,11 @@
 from __future__ import annotations
 
 import re
-from collections.abc import Mapping
+import sysconfig
+from collections.abc import Collection, Mapping
+from pathlib import Path
+from traceback import walk_tb
+from types import TracebackType
 from typing import Any
 
 MESSAGE_CHARS = 240
@@ -42,6 +46,36 @@ def describe(error: BaseException) -> str:
     except Exception as failure:
         message = f"no message, for a {type(failure).__name__}"
     return in_short(f"{type(error).__name__}: {message}")
+
+
+def in_one_line(error: BaseException) -> str:
+    """Type and message of an exception, whole, in a line."""
+    return " ".join(f"{type(error).__name__}: {error}".split()).removesuffix(":")
+
+
+def foreign_place(traceback: TracebackType | None, packages: Collection[str]) -> str | None:
+    """Where code failed that these packages called and that is neither theirs nor installed: the user's own.
+
+    Parameters
+    ----------
+    traceback : traceback or None
+        Of the exception.
+    packages : collection of str
+
+    Returns
+    -------
+    str or None
+        ``my_attack.py, line 12``, the last such line that was running; None if there was none.
+    """
+    installed = tuple(f"{sysconfig.get_path(name)}/" for name in ("stdlib", "platstdlib", "purelib", "platlib"))
+    called, place = False, None
+    for frame, line in walk_tb(traceback):
+        path, module = frame.f_code.co_filename, str(frame.f_globals.get("__name__"))
+        if module.partition(".")[0] in packages:
+            called = True
+        elif called and not path.startswith(("<", *installed)):
+            place = f"{Path(path).name}, line {line}"
+    return place
 
 
 def told(error: Exception) -> str:

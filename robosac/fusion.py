@@ -44,7 +44,7 @@ from robosac.result import FusionResult
 from robosac.screening import Screened, Screening, joined, separated
 from robosac.steps import Steps, finished
 from robosac.testimony import Testimony
-from robosac.verified import check_asked, check_decided
+from robosac.verified import check_asked, check_decided, first_state
 
 __all__ = ["FrameRun", "FusionResult", "UnverifiedAnswer", "fuse"]
 
@@ -138,7 +138,7 @@ class FrameRun:
         """Answer the frame, with a pause before each pass. Whether a pass still fits is looked at after the pause."""
         team = sorted(teammates)  # the draws must not depend on the order of arrival
         if state is None:
-            state = self.defense.initial_state(team)
+            state = first_state(self.defense, team)
         state, memory = separated(state)
         screened = Screened({}, (), memory)
         try:

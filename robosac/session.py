@@ -18,6 +18,7 @@ from robosac.fusion import FrameRun, FusionResult
 from robosac.previous import PreviousAnswer
 from robosac.screening import Screening, joined, separated
 from robosac.steps import Steps, finished
+from robosac.verified import first_state, state_of_team
 
 
 def default_defense(info: DetectorInfo) -> DefenseSettings:
@@ -42,11 +43,11 @@ def changed_team(defense: Defense, state: State, team: Sequence[str]) -> State:
     Raises
     ------
     robosac.budget.DomainError
-        If the defence's settings make no sense for it, or an id cannot be one.
+        If the defence's settings make no sense for it, it fails, or an id cannot be one.
     """
     check_team(team)
     alone, memory = separated(state)
-    return joined(defense.change_team(alone, list(team)), memory)
+    return joined(state_of_team(defense, alone, team), memory)
 
 
 class Session:
@@ -83,7 +84,7 @@ class Session:
     Raises
     ------
     robosac.budget.DomainError
-        If the id of a teammate cannot be one.
+        If the id of a teammate cannot be one, or the defence fails to say what it remembers at first.
 
     Examples
     --------
@@ -113,7 +114,7 @@ class Session:
         self.screening = screening_for(detector.info) if screening == "calibrated" else screening
         self.defense = defense or _default(detector)
         self._rng = rng or np.random.default_rng()
-        self.state: State = self.defense.initial_state(list(team)) if saved is None else saved["state"]
+        self.state: State = first_state(self.defense, team) if saved is None else saved["state"]
         before = None if saved is None else saved.get("previous")
         self.previous = None if before is None else PreviousAnswer.from_json(before)
 

@@ -2,14 +2,53 @@
 
 from __future__ import annotations
 
-from collections.abc import Collection, Iterable, Sequence
+from collections.abc import Callable, Collection, Iterable, Mapping, Sequence
+from typing import TypeVar
 
 import rfc8785
 
 from robosac.answers import Source
 from robosac.arguments import by_text
-from robosac.defenses import Decision, Defense, Hypothesis, shipped
+from robosac.budget import DomainError
+from robosac.defenses import Decision, Defense, Hypothesis, State, shipped
+from robosac.faults import in_one_line
 from robosac.provenance import Decoded, UnverifiedAnswer, unfounded
+
+T = TypeVar("T")
+
+
+def check_team_size(defense: Defense, team_size: int) -> None:
+    """Refuse a team for which a defence's settings make no sense, or of which it cannot say so: `DomainError`."""
+    _asked(defense, "check_team", lambda: defense.check_team(team_size))
+
+
+def first_state(defense: Defense, team: Sequence[str]) -> State:
+    """What a defence remembers before its first frame; `DomainError` if it fails, or nobody could keep that."""
+    return _state(defense, "initial_state", lambda: defense.initial_state(list(team)))
+
+
+def state_of_team(defense: Defense, state: State, team: Sequence[str]) -> State:
+    """What it remembers after teammates joined or left; ``team`` is the new one. It fails as `first_state`."""
+    return _state(defense, "change_team", lambda: defense.change_team(state, list(team)))
+
+
+def _state(defense: Defense, part: str, ask: Callable[[], State]) -> State:
+    state = _asked(defense, part, ask)
+    if defense.kind in shipped():
+        return state
+    if not isinstance(state, Mapping):
+        raise DomainError(f"{defense.kind}: {part} must return a dict of JSON values, got a {type(state).__name__}")
+    _asked(defense, f"{part} must return a dict of JSON values", lambda: rfc8785.dumps(dict(state)))
+    return state
+
+
+def _asked(defense: Defense, part: str, ask: Callable[[], T]) -> T:
+    try:
+        return ask()
+    except DomainError:
+        raise
+    except Exception as error:  # the user's code may raise anything
+        raise DomainError(f"{defense.kind}: {part}: {in_one_line(error)}") from error
 
 
 def check_asked(defense: Defense, batch: Sequence[Hypothesis], team: Sequence[str]) -> None:

@@ -16,6 +16,7 @@ from robosac.calibrated import calibration_digest, calibration_of, screening_for
 from robosac.defenses import DefenseSettings, State
 from robosac.detectors import DetectorInfo
 from robosac.session import default_defense, defense_for
+from robosac.verified import check_team_size, first_state
 from service.engine import Engine
 from service.errors import Kind, Refused
 from service.keeping.record import SessionRecord
@@ -140,10 +141,10 @@ def _defense(request: SessionRequest, info: DetectorInfo, most: int) -> tuple[De
         if settings.needs_calibration:
             settings = settings.at_calibration(calibration_of(info))
         defense = defense_for(settings, info)
-        defense.check_team(len(request.teammates))
+        check_team_size(defense, len(request.teammates))
+        return settings, first_state(defense, request.teammates)
     except DomainError as error:
         raise Refused(Kind.IMPOSSIBLE_DEFENSE, str(error), "defense") from error
-    return settings, defense.initial_state(request.teammates)
 
 
 def _within(defense: DefenseSettings, most: int) -> DefenseSettings:

@@ -2,6 +2,7 @@
 
 import json
 from dataclasses import replace
+from typing import Any, Literal
 
 import numpy as np
 import pytest
@@ -10,7 +11,7 @@ import torch
 import robosac
 from robosac.audit import verify
 from robosac.budget import DomainError
-from robosac.defenses import SampleConsensus, build
+from robosac.defenses import Halving, SampleConsensus, build
 from robosac.detectors import Message
 from robosac.detectors.v2xsim.voxels import occupancy as v2xsim_occupancy
 from robosac.detectors.voxels import occupancy
@@ -184,3 +185,37 @@ def test_settings_of_a_defence_are_a_mapping():
     for wrong in ("none", None, ["kind"]):
         with pytest.raises(DomainError, match=r"^settings must be a mapping with a kind"):
             build(wrong)
+
+
+class Own(Halving):
+    """A defence of the user's, whose first state is of another kind than it should be."""
+
+    kind: Literal["own"] = "own"
+    first: Any = None
+
+    def initial_state(self, team):
+        return self.first() if callable(self.first) else self.first
+
+    def change_team(self, state, team):
+        return self.initial_state(team)
+
+
+@pytest.mark.parametrize(
+    ("first", "why"),
+    [
+        (None, "own: initial_state must return a dict of JSON values, got a NoneType"),
+        ([], "own: initial_state must return a dict of JSON values, got a list"),
+        ({"met": {1}}, "own: initial_state must return a dict of JSON values: .*unsupported type: <class 'set'>"),
+        (lambda: {}["team"], "own: initial_state: KeyError: 'team'"),
+    ],
+)
+def test_a_session_says_what_is_wrong_with_what_a_defence_remembers_at_first(first, why, rng):
+    for begin in (
+        lambda: robosac.Session(FakeDetector(), ["a"], Own(first=first)),
+        lambda: fused(rng, defense=Own(first=first)),
+    ):
+        with pytest.raises(DomainError, match=f"^{why}$"):
+            begin()
+    session = robosac.Session(FakeDetector(), ["a"], Own(first=first), saved={"state": {}})
+    with pytest.raises(DomainError, match=f"^{why.replace('initial_state', 'change_team')}$"):
+        session.change_team(["b"])

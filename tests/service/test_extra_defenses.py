@@ -23,10 +23,19 @@ class Twin(Wary):
     kind: Literal["none"] = "none"
 
 
+class Forgetful(Wary):
+    def initial_state(self, team): ...
+
+
+class Picky(Wary):
+    def check_team(self, team_size):
+        raise LookupError("no team is good enough")
+
+
 @pytest.fixture(autouse=True)
 def own(monkeypatch):
     module = ModuleType("own")
-    module.Wary, module.Twin = Wary, Twin
+    module.Wary, module.Twin, module.Forgetful, module.Picky = Wary, Twin, Forgetful, Picky
     monkeypatch.setitem(sys.modules, "own", module)
 
 
@@ -107,3 +116,17 @@ async def test_a_defence_that_cannot_be_loaded_keeps_the_gateway_from_starting(e
 def test_several_are_separated_by_commas(monkeypatch):
     monkeypatch.setenv("ROBOSAC_EXTRA_DEFENSES", "own:Wary, mine:build,")
     assert Settings().extra_defenses == ("own:Wary", "mine:build")
+
+
+@pytest.mark.parametrize(
+    ("extra", "why"),
+    [
+        ("own:Forgetful", "wary: initial_state must return a dict of JSON values, got a NoneType"),
+        ("own:Picky", "wary: check_team: LookupError: no team is good enough"),
+    ],
+)
+async def test_a_defence_that_fails_before_the_first_frame_opens_no_session(extra, why):
+    async with serve(extra_defenses=extra) as served:
+        request = {"ego_id": "a", "teammates": ["b"], "defense": {"kind": "wary"}}
+        refused = problem(await served.http.post("/v1/sessions", json=request), 422, "impossible-defense")
+        assert (refused["field"], refused["detail"]) == ("defense", why)
