@@ -18,6 +18,7 @@ from typer.core import TyperCommand, TyperGroup
 
 from robosac.cli.outputs import spell_what_can_be
 from robosac.extras import MissingExtra
+from robosac.faults import foreign_place, in_one_line
 
 OWN = {
     "scene": "robosac.cli.scene:run",
@@ -35,6 +36,7 @@ OWN = {
 """Commands of the library, each ``module:attribute``: a function, or a typer application with commands of its own."""
 GROUP = "robosac.commands"
 """Entry points of other packages' commands, in the same form."""
+_OURS = ("robosac", "service", "clients")
 
 
 def places() -> dict[str, str]:
@@ -102,6 +104,14 @@ class Commands(TyperGroup):
         except MissingExtra as missing:
             typer.echo(f"Error: {missing}", err=True)
             raise typer.Exit(2) from missing
+        except Exception as error:
+            ends = type(error).__module__.partition(".")[0] in ("typer", "click")  # Exit and the like
+            below = error.__traceback__ and error.__traceback__.tb_next  # this very line called no code of the user's
+            place = None if ends else foreign_place(below, _OURS)
+            if place is None:
+                raise
+            typer.secho(f"Error: {place}: {in_one_line(error)}", fg="red", err=True)
+            raise typer.Exit(1) from error
 
 
 def _as_typed(refused: Any, words: Sequence[str]) -> Any:

@@ -14,6 +14,7 @@ from rich.console import Console
 
 from robosac import defenses
 from robosac.attacks import AttackError, lacking, load_campaign
+from robosac.budget import DomainError
 from robosac.cli.blame import blaming, check_known, failing, listed
 from robosac.cli.options import (
     WORLD_HELP,
@@ -46,6 +47,7 @@ from robosac.evaluation.comparison import (
 from robosac.evaluation.comparison.report import REPORT
 from robosac.evaluation.comparison.rows import EARLY
 from robosac.evaluation.comparison.worlds import WORLDS_REPORT
+from robosac.evaluation.playing import FaultyDefense
 from robosac.figures import need_figures
 from robosac.scenes import DEFAULT_DATA, SceneError, SceneSource
 
@@ -113,7 +115,7 @@ def run(  # the options of a command line
     plans = {name: Plan(*what, source) for name, source in sources.items()}
     started = time.monotonic()
     blamed = blaming("--world" if world else "--data", SceneError)
-    with failing(AttackError, DetectorError), blamed, progress(console) as bar:
+    with failing(AttackError, DetectorError, FaultyDefense, DomainError), blamed, progress(console) as bar:
         task = bar.add_task("frames", total=len(plans) * len(extent.settings) * extent.scenes * extent.frames)
         found = compare_plans(list(plans.values()), jobs, lambda: bar.advance(task))
     path = _write(dict(zip(plans, found, strict=True)), plans, out, command(context))

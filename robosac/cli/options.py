@@ -23,6 +23,7 @@ from robosac import detectors
 from robosac.attacks import Attack, Campaign, lacking
 from robosac.cli.blame import blaming
 from robosac.detectors import Detector
+from robosac.detectors.loading import warm_up
 from robosac.scenes import DATA_HELP, WORLDS, SceneSource, World, load_source
 
 DetectorName = Annotated[
@@ -40,9 +41,12 @@ Seed = Annotated[int, typer.Option(min=0, help="Of everything random.")]
 
 
 def load_detector(name: str) -> Detector:
-    """The detector of ``--detector``."""
+    """The detector of ``--detector``; one of the user's own has answered a frame of zeros."""
     with blaming("--detector", ValueError):
-        return detectors.load(name)
+        loaded = detectors.load(name)
+        if not type(loaded).__module__.startswith(f"{detectors.__name__}."):
+            warm_up(loaded)
+        return loaded
 
 
 def load_data(name: str) -> SceneSource:

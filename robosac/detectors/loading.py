@@ -81,6 +81,8 @@ def warm_up(detector: Preparer) -> None:
     try:
         for _ in range(2):
             prepared = detector.prepare(ego, {"a": teammate, "b": teammate})
+            if not callable(getattr(prepared, "detect", None)):
+                raise DetectorError(f"prepare must return a frame to detect in, got a {type(prepared).__name__}")
             check_boxes(prepared.detect())
             check_boxes(prepared.detect(["a", "b"]))
             if isinstance(prepared, Batching) and prepared.worth > 1:

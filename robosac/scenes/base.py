@@ -11,6 +11,8 @@ from collections.abc import Iterator, Mapping, Sequence
 from dataclasses import dataclass, field
 from typing import Literal, Protocol, runtime_checkable
 
+import numpy as np
+
 from robosac.boxes import FloatArray
 from robosac.detectors import DetectorError, Encoder, Message, TensorSpec
 
@@ -124,14 +126,21 @@ def encoded(view: View, detector: Encoder) -> Message:
     SceneError
         If it was recorded for a detector of another layout.
     DetectorError
-        If the detector encodes in another layout than it declares.
+        If the detector encodes in another layout than it declares, or something that is no finite number.
     """
     recorded: Message | None = getattr(view, "message", None)
     message = detector.encode(view.points, view.pose) if recorded is None else recorded
     if not isinstance(message, Message):
         raise DetectorError(f"{detector.info.name}: encode must return a Message, got a {type(message).__name__}")
+    for name, array in message.tensors.items():
+        if not isinstance(array, np.ndarray):
+            kind = type(array).__name__
+            raise DetectorError(f"{detector.info.name}: encode must return numpy arrays; {name} is a {kind}")
     held = {name: TensorSpec(array.dtype.name, array.shape) for name, array in message.tensors.items()}
     if any(wanted.items() <= held.items() for wanted in detector.info.tensors.values()):
+        for name in held if recorded is None else ():
+            if not np.isfinite(message.tensors[name]).all():
+                raise DetectorError(f"{detector.info.name}: encode must return finite numbers; {name} holds others")
         return message if recorded is None else Message(view.pose, recorded.tensors)
     takes, found = _listed(detector.info.tensors["ego"]), _listed(held)
     if recorded is None:

@@ -1,4 +1,5 @@
 import json
+import sys
 
 import pytest
 from typer.testing import CliRunner
@@ -87,3 +88,55 @@ def test_the_option_that_is_to_blame_is_named(words, option, why, tmp_path, monk
     said = " ".join(result.output.replace("│", "").split())
     assert f"for {option}: {why}" in said
     assert not list(tmp_path.iterdir())
+
+
+OWN = """
+from types import SimpleNamespace
+from typing import Literal
+from robosac.attacks import Attack
+from robosac.defenses import OneByOne
+from robosac.detectors import load
+
+class Failing(Attack):
+    name = "failing"
+    def run(self, surface, attackers, rng, situation=None):
+        return surface.messages["car-99"]
+
+class Silent(OneByOne):
+    kind: Literal["silent"] = "silent"
+    def converse(self, team, state, rng):
+        yield []
+
+class Forgetful(OneByOne):
+    kind: Literal["forgetful"] = "forgetful"
+    def initial_state(self, team):
+        pass
+
+def unprepared():
+    shipped = load("intersection-mean")
+    return SimpleNamespace(info=shipped.info, encode=shipped.encode, prepare=lambda ego, teammates: None)
+"""
+FEW = ["--scenes", "1", "--frames", "6", "--only", "halving", "--setting", "noise:1", "--out", "x"]
+
+
+@pytest.mark.parametrize(
+    ("words", "code", "why"),
+    [
+        (["evaluate", "--attack", "own:Failing"], 1, "Error: own.py, line 11: KeyError: 'car-99'"),
+        (
+            ["compare", *FEW, "--defense", "own:Silent"],
+            1,
+            "own:Silent, frame 0: TypeError: silent: converse must",
+        ),
+        (["compare", *FEW, "--defense", "own:Forgetful"], 1, "Error: forgetful: initial_state must return a dict"),
+        (["evaluate", "--detector", "own:unprepared"], 2, "prepare must return a frame to detect in, got a NoneType"),
+    ],
+)
+def test_what_fails_in_the_users_code_is_told_in_a_line(words, code, why, tmp_path, monkeypatch):
+    monkeypatch.chdir(tmp_path)
+    monkeypatch.syspath_prepend(tmp_path)
+    monkeypatch.delitem(sys.modules, "own", raising=False)
+    (tmp_path / "own.py").write_text(OWN)
+    result = runner.invoke(app, words)
+    assert result.exit_code == code, result.output
+    assert why in " ".join(result.output.replace("│", "").split())

@@ -77,3 +77,9 @@ def test_a_detector_that_answers_no_frame_of_zeros_is_told_with_the_place():
 
     with pytest.raises(DetectorError, match=r"^mine cannot answer a frame of zeros: ZeroDivision.*test_declared"):
         warm_up(detector(detect=detect))
+
+
+def test_what_is_prepared_has_to_detect():
+    unprepared = SimpleNamespace(info=INFO, prepare=lambda ego, teammates: None)
+    with pytest.raises(DetectorError, match=r"^mine: prepare must return a frame to detect in, got a NoneType$"):
+        warm_up(unprepared)

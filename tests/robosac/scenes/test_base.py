@@ -3,6 +3,7 @@ from types import SimpleNamespace
 
 import numpy as np
 import pytest
+import torch
 
 from robosac.detectors import DetectorError, Message, TensorSpec
 from robosac.scenes import IntersectionScene, SceneError, View, one_scene, whose_turn
@@ -81,6 +82,8 @@ class Odd:
         (Message(np.eye(4), {}), r"a message with map of float32 \[2, 2\], got none"),
         (Message(np.eye(4), {"map": np.zeros((2, 2))}), r"map of float32 \[2, 2\], got map of float64 \[2, 2\]"),
         (Message(np.eye(4), {"mop": np.zeros((2, 2), np.float32)}), r", got mop of float32 \[2, 2\]"),
+        (Message(np.eye(4), {"map": torch.zeros(2, 2)}), "numpy arrays; map is a Tensor"),
+        (Message(np.eye(4), {"map": np.full((2, 2), np.nan, np.float32)}), "finite numbers; map holds others"),
     ],
 )
 def test_what_a_detector_encodes_has_to_be_what_it_declares(made, words):
