@@ -148,6 +148,15 @@ AUDIT_LINE = (
 )
 
 
+_SESSION_HEADER = {
+    "name": "X-Session-Id",
+    "in": "header",
+    "required": False,
+    "description": "The session's id again. A cluster finds the session by it, and refuses the call without it (421).",
+    "schema": {"type": "string"},
+}
+
+
 def completed(document: dict[str, Any], infos: Sequence[DetectorInfo]) -> dict[str, Any]:
     """An API's description with what FastAPI cannot know: the tensors of these detectors, and nulls in examples.
 
@@ -157,6 +166,9 @@ def completed(document: dict[str, Any], infos: Sequence[DetectorInfo]) -> dict[s
     sent = {"messages": tensor_bodies.message_body(infos), "frames": tensor_bodies.frame_body(infos)}
     for name, told in sent.items():
         calls[f"{session}/{name}"]["post"]["requestBody"]["content"][MSGPACK] = told
+    for path in (path for path in calls if "{sid}" in path):
+        for call in calls[path].values():
+            call["parameters"] = [*call["parameters"], _SESSION_HEADER]
     kept = calls[f"{session}/frames/{{frame}}/messages"]["get"]["responses"]["200"]
     kept["content"][MSGPACK] = tensor_bodies.kept_frame(infos)
     examples = {f"#/components/schemas/{model.__name__}": example for model, example in EXAMPLES.items()}

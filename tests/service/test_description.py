@@ -311,3 +311,10 @@ def served_info(name):
 
 def checked(part):
     return wire.check_message(part, TINY, "teammate"), wire.read_signature(part)
+
+
+def test_calls_of_a_session_take_the_header_by_which_a_cluster_finds_it(description):
+    for path, calls in description["paths"].items():
+        for call in calls.values():
+            headers = [told["name"] for told in call.get("parameters", []) if told["in"] == "header"]
+            assert ("X-Session-Id" in headers) == ("{sid}" in path), path
