@@ -14,7 +14,7 @@ from rich.console import Console
 from clients import trial
 from clients.capacity.checking import WITHIN, Check, checks
 from clients.capacity.costs import Costs, costs_of
-from clients.capacity.needs import Machine, Needs, Scenario, needs_of
+from clients.capacity.needs import Machine, Needs, NoneInTime, Scenario, needs_of
 from clients.capacity.report import read_report
 from clients.capacity.sheets import Sheet, checks_sheet, city_sheet, needs_sheets, page
 from robosac.cli.blame import blaming
@@ -80,7 +80,9 @@ def main(  # the options of a command line
             told["checks"] = [asdict(one) | {"load": one.load.model_dump()} for one in found]
             sheets = [checks_sheet(found)]
         else:
-            planned, sheets = _planned(costs_of(measured), scenario, machine, np.random.default_rng(seed), frames, city)
+            with blaming("--budget-ms or --rate", NoneInTime):
+                rng = np.random.default_rng(seed)
+                planned, sheets = _planned(costs_of(measured), scenario, machine, rng, frames, city)
             told |= planned
     for sheet in sheets:
         console.print(sheet.rich())

@@ -108,6 +108,10 @@ class Needs:
         return {**asdict(self), "gpus": None, "breaks_first": self.breaks_first.resource}
 
 
+class NoneInTime(ValueError):
+    """No process could answer one vehicle's frames within the budget."""
+
+
 def patience_ms(costs: Costs, scenario: Scenario) -> float:
     """How long a frame may wait for others before it is refused."""
     own = costs.mixed(costs.latency_ms, scenario.teammates, scenario.attacked)
@@ -125,7 +129,9 @@ def needs_of(costs: Costs, scenario: Scenario, machine: Machine, sessions: int |
     Raises
     ------
     ValueError
-        If the load test tells nothing of such teams or of processor time, or if no frame could be answered in time.
+        If the load test tells nothing of such teams or of processor time.
+    NoneInTime
+        If no frame could be answered in time.
     """
     costs.check_team(scenario.teammates)
     cpu_ms, sent, received = (
@@ -137,7 +143,9 @@ def needs_of(costs: Costs, scenario: Scenario, machine: Machine, sessions: int |
     most_hz = queueing.most_rate(service, patience, scenario.late, scenario.busy) * 1e3 if patience else 0.0
     sessions = math.floor(most_hz / scenario.rate_hz) if sessions is None else sessions
     if sessions < 1:
-        raise ValueError(f"no process answers {scenario.rate_hz:g} frames a second within {scenario.budget_ms:g} ms")
+        own = costs.mixed(costs.latency_ms, scenario.teammates, scenario.attacked)
+        wanted = f"{scenario.rate_hz:g} frames a second within {scenario.budget_ms:g} ms"
+        raise NoneInTime(f"no process answers {wanted}: one takes {own:.3g} ms by itself")
     if scenario.message_bytes is not None:
         sent = scenario.message_bytes * (1 + scenario.teammates)
     inward, outward = (

@@ -73,3 +73,10 @@ def test_a_team_that_was_not_measured_is_explained(report):
     result = run(report, "--teammates", 9)
     assert result.exit_code == 2
     assert "measured 5 only" in " ".join(result.output.replace("│", "").split())
+
+
+def test_a_budget_without_time_for_a_frame_is_to_blame_itself(report):
+    result = run(report, "--budget-ms", 1)
+    assert result.exit_code == 2
+    said = " ".join(result.output.replace("│", "").split())
+    assert "for --budget-ms or --rate: no process answers 5 frames a second within 1 ms: one takes " in said
