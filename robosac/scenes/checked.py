@@ -8,7 +8,7 @@ says where it stands.
 from __future__ import annotations
 
 import math
-from collections.abc import Callable, Iterator, Mapping, Sequence
+from collections.abc import Callable, Iterable, Iterator, Mapping, Sequence
 from contextlib import contextmanager
 from dataclasses import dataclass
 from numbers import Integral, Real
@@ -20,6 +20,8 @@ from robosac.boxes import FloatArray, pose_fault
 from robosac.scenes.base import Frame, Scene, SceneAround, SceneError, SceneSource, Split, View
 
 BOX_COLUMNS = 5
+MOST_YAW = 4 * math.pi
+"""No heading in radians is beyond this, however it was added up; one in degrees soon is."""
 _FEW = 100
 """Returns that are looked at first, since of most views one of them is finite."""
 
@@ -48,7 +50,7 @@ class CheckedFrame:
         Raises
         ------
         SceneError
-            If they have another shape, or one is not finite, or they cannot be had.
+            If they have another shape, one is not finite, has no size or seems to be in degrees, or they cannot be had.
         """
         part = f"truth({ego!r})"
         with _said(f"{self.where}: {part}"):
@@ -59,6 +61,11 @@ class CheckedFrame:
             raise SceneError(f"{self.where}: {part} must be (G, {BOX_COLUMNS}), got {_shown(boxes)}")
         if not _finite(boxes).all():
             raise SceneError(f"{self.where}: {part} must be finite numbers")
+        if (boxes[:, 2:4] <= 0).any():
+            raise SceneError(f"{self.where}: {part} must have positive lengths and widths, got {boxes[:, 2:4].min():g}")
+        if (np.abs(boxes[:, 4]) > MOST_YAW).any():
+            yaw = boxes[np.abs(boxes[:, 4]).argmax(), 4]
+            raise SceneError(f"{self.where}: {part} must have yaws in radians, got {yaw:g}: is it in degrees?")
         return boxes
 
     def __getattr__(self, name: str) -> Any:
@@ -148,7 +155,7 @@ class CheckedScene(SceneAround):
         with _said(where):
             frame = self.scene.frame(index)
             for name, view in frame.views.items():
-                fault = view_fault(view)
+                fault = view_fault(view) if hasattr(view, "pose") else f"must be a View, got a {type(view).__name__}"
                 if fault is not None:
                     raise SceneError(f"{name}: {fault}")
         return CheckedFrame(frame, where)
@@ -171,12 +178,26 @@ class CheckedSource:
     def scenes(self, split: Split) -> Sequence[Scene]:
         """Those of the original, in its order."""
         with _said(self.name):
-            return [CheckedScene(scene, self.name) for scene in self.original.scenes(split)]
+            return _checked(self.original.scenes(split), self.name)
 
     def _training_scenes(self) -> Sequence[Scene]:
         with _said(self.name):
             kept: Sequence[Scene] = self.original.training_scenes()  # type: ignore[attr-defined]
-            return [CheckedScene(scene, self.name) for scene in kept]
+            return _checked(kept, self.name)
+
+
+def _checked(scenes: Iterable[Scene], source: str) -> list[Scene]:
+    known: set[int] = set()
+    checked: list[Scene] = []
+    for scene in scenes:
+        number = scene.number
+        if not isinstance(number, Integral) or number < 0:
+            raise SceneError(f"a scene's number must be an integer, not negative, got {number!r}")
+        if number in known:
+            raise SceneError(f"two scenes have the number {number}")
+        known.add(number)
+        checked.append(CheckedScene(scene, source))
+    return checked
 
 
 def view_fault(view: View) -> str | None:

@@ -1,5 +1,7 @@
 import pickle
 from dataclasses import dataclass, field, replace
+from functools import partial, partialmethod
+from types import SimpleNamespace
 
 import numpy as np
 import pytest
@@ -94,6 +96,8 @@ TILTED = pose_matrix(0.0, 0.0, 0.0, 0.0)[:, [2, 1, 0, 3]] * [-1, 1, 1, 1]
 @pytest.mark.parametrize(
     ("shown", "why"),
     [
+        (Frame(views={"van-0": None}), "van-0: must be a View, got a NoneType"),
+        (Frame(views={"van-0": (SOUND.pose, POINTS)}), "van-0: must be a View, got a tuple"),
         (seen(pose=np.eye(3)), "van-0: pose must be 4 x 4 finite numbers, got (3, 3)"),
         (seen(pose=[1, 2, 3]), "van-0: pose must be 4 x 4 finite numbers, got a list"),
         (seen(pose=SOUND.pose * np.nan), "van-0: pose must be 4 x 4 finite numbers, got some that are not"),
@@ -105,7 +109,6 @@ TILTED = pose_matrix(0.0, 0.0, 0.0, 0.0)[:, [2, 1, 0, 3]] * [-1, 1, 1, 1]
         (seen(points=POINTS[0]), "van-0: points must be (P, 3), got (3,)"),
         (seen(points=POINTS.tolist()), "van-0: points must be (P, 3), got a list"),
         (seen(points=holed([0, 1, 2, 3])), "van-0: points must be finite numbers, and none is"),
-        (Frame(views={"van-0": None}), "AttributeError: 'NoneType' object has no attribute 'pose'"),
         (FileNotFoundError(2, "No such file", "3.npz"), "FileNotFoundError: [Errno 2] No such file: '3.npz'"),
         (np.linalg.LinAlgError("Singular\n matrix"), "LinAlgError: Singular matrix"),
         (SceneError("there is no more"), "there is no more"),
@@ -128,6 +131,8 @@ def test_views_of_a_wrong_form_are_refused(shown, why):
         (BOX.tolist(), " must be (G, 5), got a list"),
         (BOX * np.nan, " must be finite numbers"),
         (BOX.astype(object), " must be finite numbers"),
+        (BOX * [1, 1, -1, 1, 1], " must have positive lengths and widths, got -4"),
+        (BOX + [0, 0, 0, 0, -90], " must have yaws in radians, got -89.9: is it in degrees?"),
         (KeyError("van-0"), ": KeyError: 'van-0'"),
     ],
 )
@@ -190,3 +195,25 @@ def test_what_a_scene_says_of_itself_is_checked(part, value, words):
 
 def test_a_scene_may_have_no_end():
     assert CheckedScene(type("Endless", (Scene,), {"length": None})(), "t7").length is None
+
+
+@pytest.mark.parametrize(
+    ("numbers", "why"),
+    [
+        ([1, 2, 1], "two scenes have the number 1"),
+        ([-1], "a scene's number must be an integer, not negative, got -1"),
+        (["2021_08_18"], "a scene's number must be an integer, not negative, got '2021_08_18'"),
+    ],
+)
+def test_scenes_have_numbers_of_their_own(numbers, why):
+    class Numbered(Source):
+        def scenes(self, split):
+            return [SimpleNamespace(number=number) for number in numbers]
+
+        training_scenes = partialmethod(scenes, "training")
+
+    source = CheckedSource(Numbered())
+    for asked in (partial(source.scenes, "test"), source.training_scenes):
+        with pytest.raises(SceneError) as refused:
+            asked()
+        assert str(refused.value) == f"t7: {why}"
