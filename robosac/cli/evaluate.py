@@ -88,9 +88,8 @@ def _print(console: Console, report: BoundsReport, attack: str, attackers: int) 
         title_justify="left",
     )
     for heading in ("perception", "AP50", "AP70", "steps", "success", "infiltrated"):
-        table.add_column(
-            heading, justify="left" if heading == "perception" else "right", no_wrap=heading == "perception"
-        )
+        names = heading == "perception"  # on a narrow terminal names are broken, and no figure is cut off
+        table.add_column(heading, justify="left" if names else "right", no_wrap=not names, overflow="fold")
     for row in report.rows:
         table.add_row(
             row.name,

@@ -27,6 +27,14 @@ def test_evaluate_prints_and_writes_the_table(tmp_path):
     assert {row["name"] for row in report["rows"]} >= {"all benign", "ego only", "no defence"}
 
 
+def test_figures_are_whole_on_a_narrow_terminal(monkeypatch):
+    monkeypatch.setenv("COLUMNS", "60")
+    result = runner.invoke(app, ["evaluate", "--scenes", "1", "--frames", "1", "--attack", "noise"])
+    assert result.exit_code == 0, result.output
+    assert "…" not in result.output
+    assert "infiltrated" in result.output
+
+
 def test_reproduce_runs_what_is_asked_for(tmp_path):
     result = runner.invoke(app, ["reproduce", "--only", "numerical", "--out", str(tmp_path)])
     assert result.exit_code == 0, result.output
