@@ -17,6 +17,7 @@ import numpy as np
 import torch
 from torch.nn import functional
 
+from robosac.arguments import check_rng
 from robosac.attacks.returned import check_aim, of_attackers
 from robosac.attacks.situation import Situation
 from robosac.detectors.base import AttackSurface
@@ -141,6 +142,7 @@ class IterativeAttack(Attack):
         situation: Situation | None = None,
     ) -> dict[str, torch.Tensor]:
         """Optimise the attackers' messages jointly."""
+        check_rng(rng)
         return self.optimise(surface, attackers, rng, situation or Situation(), warm=self.remembers)
 
     def optimise(

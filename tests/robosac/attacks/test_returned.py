@@ -103,6 +103,11 @@ def test_an_attacker_that_sends_nothing_is_named(attack):
         chosen.run(Linear(), "car-2", np.random.default_rng(0))
 
 
+def test_a_seed_is_no_generator():
+    with pytest.raises(TypeError, match=r"rng must be a numpy\.random\.Generator, got 0"):
+        PGD().run(Linear(), ["a"], 0)
+
+
 BOX = np.array([10.0, 5.0, 4.6, 1.9, 0.0])
 
 
