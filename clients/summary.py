@@ -60,6 +60,10 @@ class FleetSummary:
     sources: Counter[str] = field(default_factory=Counter)
     refused: Counter[str] = field(default_factory=Counter)
     """By problem: requests that the gateway could not serve at first, and that were sent again."""
+    degraded: Counter[str] = field(default_factory=Counter)
+    """By what cut the defence short: answers."""
+    fault: str | None = None
+    """What failed inside the gateway, the first time that it did."""
     with_attacker: int = 0
     in_time: int = 0
     participation: dict[str, Counter[str]] = field(default_factory=dict)
@@ -113,6 +117,10 @@ class FleetSummary:
         self.sources[answer.source.value] += 1
         self.with_attacker += not frame.attackers.isdisjoint(answer.accepted)
         self.in_time += answer.deadline_met
+        if answer.degraded_by is not None:
+            self.degraded[answer.degraded_by] += 1
+        evidence = (entry.model_extra or {} for entry in answer.rejected.values())
+        self.fault = self.fault or next((str(told["fault"]) for told in evidence if "fault" in told), None)
         for vehicle in frame.attackers:
             self.attacked_from.setdefault((frame.scene, frame.ego_id, vehicle), answer.frame)
         for vehicle in answer.named:
@@ -154,6 +162,8 @@ class FleetSummary:
             "latency_ms": trial.percentiles(self.latencies_ms),
             "deadline_met_share": self.in_time / self.frames,
             "refused_first": dict(self.refused),
+            "degraded": dict(self.degraded),
+            "fault": self.fault,
         }
 
     def print(self, console: Console) -> None:
@@ -190,6 +200,10 @@ class FleetSummary:
             f"99 % {latency['p99']:.1f} ms; "
             f"{values['deadline_met_share']:.1%} in time by the gateway's clock."
         )
+        if self.degraded:
+            cut = ", ".join(f"{count} by a {cause}" for cause, count in self.degraded.items())
+            why = f" The first fault: {self.fault}" if self.fault is not None else ""
+            console.print(f"Cut short: {cut}.{why}", markup=False)
         if count := self.refused.total():
             requests = "request was" if count == 1 else "requests were"
             console.print(f"{count} {requests} refused first ({', '.join(self.refused)}) and sent again.")

@@ -289,6 +289,25 @@ def test_the_summary_tells_what_was_refused_first(refused, said, detector):
     assert summary.as_dict()["refused_first"] == refused
 
 
+class Silent(Halving):
+    kind: Literal["silent"] = "silent"
+
+    def converse(self, team, state, rng):
+        yield [tuple(team)]
+
+
+def test_the_summary_tells_that_a_defence_fails_in_the_gateway(detector):
+    (frame,) = Fleet(IntersectionScene(3), detector, 1, 0, PGD(steps=1), seed=0).sense(0)
+    result = fuse(detector, Silent(), frame.message, frame.sent, rng=np.random.default_rng(0))
+    summary = FleetSummary(detector)
+    summary.add(frame, result.answer(0, {}, {"total": 1.0}, frame.ego_id), 10.0)
+    console = Console(file=io.StringIO(), width=200)
+    summary.print(console)
+    why = "TypeError: silent: converse must return a Decision, got a NoneType"
+    assert f"Cut short: 1 by a fault. The first fault: {why}" in console.file.getvalue()
+    assert (summary.as_dict()["degraded"], summary.as_dict()["fault"]) == ({"fault": 1}, why)
+
+
 def test_a_defence_that_names_without_suspicion_is_told_to_name(detector):
     (frame,) = Fleet(IntersectionScene(3), detector, 1, 1, PGD(steps=1), seed=0).sense(0)
     (attacker,) = frame.attackers
