@@ -201,7 +201,8 @@ class FleetSummary:
             f"{values['deadline_met_share']:.1%} in time by the gateway's clock."
         )
         if self.degraded:
-            cut = ", ".join(f"{count} by a {cause}" for cause, count in self.degraded.items())
+            causes = {"deadline": "the deadline", "fault": "a fault"}
+            cut = ", ".join(f"{count} by {causes[cause]}" for cause, count in self.degraded.items())
             why = f" The first fault: {self.fault}" if self.fault is not None else ""
             console.print(f"Cut short: {cut}.{why}", markup=False)
         if count := self.refused.total():
