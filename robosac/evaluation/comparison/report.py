@@ -3,8 +3,10 @@
 from __future__ import annotations
 
 from collections.abc import Sequence
+from importlib.metadata import version
 from pathlib import Path
 
+from robosac.calibrated import calibration_digest
 from robosac.evaluation.comparison.pictures import draw_passes, draw_precision
 from robosac.evaluation.comparison.playing import Plan
 from robosac.evaluation.comparison.rows import (
@@ -25,7 +27,7 @@ HEAD = """# Defences against attacks
 teammates{poses}. In each setting all defences meet the same frames. *Oracle* fuses everybody who is honest in the
 frame. Passes are fused ones; that of the ego alone comes on top. Standard errors (+-) are over sequences, by the
 jackknife; those of differences and ratios to the oracle take both on the same sequences. All figures are in
-`comparison.csv`.
+`comparison.csv`. {made_by}
 """
 REPORT = "comparison.md"
 PRECISION, PASSES = "precision.png", "passes.png"
@@ -56,9 +58,17 @@ def write_comparison(rows: Sequence[Row], plan: Plan, out: Path, command: str) -
         frames=plan.extent.frames,
         rate=1 / scenes[0].frame_period_s,
         ego=" or ".join(egos),
+        made_by=made_by(plan),
         poses=f", teammates wrong about their positions by {plan.pose_error_m:g} m" if plan.pose_error_m else "",
     )
     return write_report(out / REPORT, head, sections(rows, PRECISION, PASSES))
+
+
+def made_by(plan: Plan) -> str:
+    """What made the figures besides the command, for whoever cites them."""
+    info, calibration = plan.detector.info, calibration_digest(plan.detector.info)
+    digests = f"weights {info.weights_digest:.12}" + (f" and calibration {calibration:.12}" if calibration else "")
+    return f"Made by robosac {version('robosac')} with seed {plan.seed}; {info.name}: {digests}."
 
 
 def _flat(row: Row) -> dict[str, object]:

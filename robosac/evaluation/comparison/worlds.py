@@ -6,6 +6,7 @@ from collections.abc import Iterator, Mapping, Sequence
 from pathlib import Path
 
 from robosac.evaluation.comparison.playing import EGO_ONLY, ORACLE, Plan
+from robosac.evaluation.comparison.report import made_by
 from robosac.evaluation.comparison.rows import Estimate, Row
 from robosac.evaluation.comparison.settings import DEFENSES, Setting
 from robosac.evaluation.comparison.tables import true_boxes
@@ -17,7 +18,7 @@ HEAD = """# Defences in several worlds
 the oracle, the fusion of everybody who is honest in the frame, on the same frames. Standard errors (+-) are over
 sequences, by the jackknife. *Named* counts honest teammates that were ever named in their sequence, and the sequences
 in which this happened. Passes are fused ones, in the first frames and later. All figures are in `worlds.csv`; each
-world has its own report in the folder of its name.
+world has its own report in the folder of its name. {made_by}
 """
 WORLDS_REPORT = "worlds.md"
 UNDEFENDED = next(name for name, settings in DEFENSES.items() if settings.kind == "none")
@@ -49,7 +50,8 @@ def write_worlds(rows: Mapping[str, Sequence[Row]], plans: Mapping[str, Plan], o
         Section(setting.label, "", [Table.of([_shown(*line) for of, line in lines if of == setting])])
         for setting in extent.settings
     ]
-    head = HEAD.format(command=command, scenes=extent.scenes, frames=extent.frames)
+    made = made_by(next(iter(plans.values())))
+    head = HEAD.format(command=command, scenes=extent.scenes, frames=extent.frames, made_by=made)
     return write_report(out / WORLDS_REPORT, head, sections)
 
 

@@ -144,6 +144,9 @@ def test_the_report_holds_tables_and_pictures(rows, plan, tmp_path):
     path = write_comparison(rows, plan(TRIO, SMALL), tmp_path, "the command")
     text = path.read_text()
     assert "`the command`: 1 test sequences of 6 frames" in text
+    assert (
+        f"with seed 0; intersection-mean: weights {plan(TRIO, SMALL).detector.info.weights_digest[:12]} and cal" in text
+    )
     assert "| nobody attacks | " in text
     assert "| erase x 1 | " in text
     assert "## What it costs when nobody attacks" in text

@@ -1,4 +1,5 @@
 import csv
+from importlib.metadata import version
 
 import numpy as np
 import pytest
@@ -45,6 +46,7 @@ def test_each_world_has_its_report_and_all_have_one(out):
         assert "| noise x 1 |" in text
     page = (out / "worlds.md").read_text()
     assert "2 test sequences of 6 frames in each world" in page
+    assert f"Made by robosac {version('robosac')} with seed 0" in page
     for title in ("## nobody attacks", "## noise x 1"):
         assert title in page
     assert page.count("| highway | group_testing | ") == 2
