@@ -231,7 +231,7 @@ class Engine:
             if not self._working:
                 return []
             jobs = self._jobs.values()
-            return with_company(self._jobs[self._turns.next(now, waiting(jobs, now))], jobs)
+            return with_company(self._jobs[self._turns.next(now, waiting(jobs, now))], jobs, now)
 
     def _pass(self, jobs: Sequence[Job]) -> None:
         """Make the passes of several frames as one. Each goes on when it has its turn."""

@@ -71,9 +71,13 @@ class Job:
         late_s = now + LEAST * self.work.expected_s - self.work.due
         return self.work.had_s == 0 and 0 < late_s <= others_s - self._others_s
 
+    def may_share(self, now: float) -> bool:
+        """Whether its next step is a pass that may be made with those of others: together they take a little longer."""
+        return self.coming is not None and now < self.work.due - self.work.left_s - HOLD_S
+
     def waits(self, now: float) -> bool:
-        """Whether its pass may wait for those of others."""
-        return self.coming is not None and now < min(self.came + HOLD_S, self.work.due - self.work.left_s - HOLD_S)
+        """Whether its pass waits for those of others."""
+        return self.may_share(now) and now < self.came + HOLD_S
 
     def tell(self) -> None:
         """Tell whoever waits what came of it.
@@ -88,9 +92,9 @@ class Job:
             self.done.set_exception(self.outcome)
 
 
-def with_company(job: Job, jobs: Iterable[Job]) -> list[Job]:
-    """A job, and those whose passes can be made together with its own: whoever is due first comes first."""
-    if job.coming is None:
+def with_company(job: Job, jobs: Iterable[Job], now: float) -> list[Job]:
+    """A job, and those whose passes are made together with its own: whoever is due first comes first."""
+    if job.coming is None or not job.may_share(now):
         return [job]
     family = job.coming.frame.family
     others = (o for o in jobs if o is not job and o.coming is not None and o.coming.frame.family is family)

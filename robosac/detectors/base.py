@@ -214,7 +214,7 @@ class Joining(Batching, Protocol):
 
     @property
     def family(self) -> object:
-        """Frames of the same one, and no others, can be decoded together. It can be hashed."""
+        """Frames of the same one, and no others, can be decoded together."""
 
     def detect_together(self, wanted: Sequence[tuple[Any, Sequence[Collection[str]]]]) -> list[list[FloatArray]]:
         """What `Batching.detect_all` gives for each frame with its subsets. The frames are of this one's family."""

@@ -133,8 +133,9 @@ def job(due_s=1.0, coming=True, family="a", came_s=0.0):
 def test_company_is_of_one_family_and_who_is_due_first_comes_first():
     first, late, soon = job(3.0), job(2.0), job(1.0)
     jobs = [first, late, job(0.5, family="b"), job(0.5, coming=False), soon]
-    assert with_company(first, jobs) == [first, soon, late]
-    assert with_company(jobs[3], jobs) == [jobs[3]]
+    assert with_company(first, jobs, 0.0) == [first, soon, late]
+    assert with_company(jobs[3], jobs, 0.0) == [jobs[3]]
+    assert with_company(soon, jobs, 0.995) == [soon]  # it has no time for others
 
 
 def test_a_pass_waits_for_others_that_are_on_their_way():
