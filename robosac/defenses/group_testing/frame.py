@@ -17,8 +17,6 @@ from robosac.defenses.group_testing.knowledge import Knowledge, remember
 from robosac.defenses.group_testing.posterior import EXACT
 from robosac.defenses.protocol import Decision, Hypothesis, Outcome, Rejection, explain_rejections
 
-UNSTEADY_LEVELS = 2.0
-"""Where the ego itself is unsteady it takes so many times as many lies to be named."""
 TRUSTED_BELOW = 0.1
 """Largest suspicion of a teammate on the trust list."""
 CLEARED_BELOW = 0.5
@@ -71,8 +69,9 @@ class JudgedFrame:
             return None
         known, outcomes = self._known, self._evidence.outcomes
         decoded = known.rows([o.teammates for o in outcomes])
-        # somebody is tested even if all are out of place, or nobody would ever be seen to be back
-        tested = tuple(name for name in self._team if name not in self._out) or self._team
+        tested = tuple(name for name in self._team if name not in self._out)
+        if self._out and self._are_suspected(tested):  # they may be worth no test, and nobody would be seen to be back
+            tested = self._team
         options = candidates(known.posterior, known.rows([tested])[0], decoded)
         if not len(options):
             return None
@@ -97,6 +96,10 @@ class JudgedFrame:
         best = np.flatnonzero(value >= value.max() - _TIE)
         chosen = int(best[rng.integers(len(best))])
         return known.names(options[chosen], self._team) if value[chosen] > 0 else None
+
+    def _are_suspected(self, names: Hypothesis) -> bool:
+        suspicion = self._known.suspicion()
+        return all(suspicion[name] >= CLEARED_BELOW for name in names)
 
     def best_answer(self) -> Hypothesis:
         """The decoded subset that would be answered now."""
@@ -129,14 +132,15 @@ class JudgedFrame:
         return Decision(accepted, source, rejected, ratio, state, suspicion, objects, contradicted, differences)
 
     def _is_attacker(self, name: str, suspicion: float, naming_bound: float) -> bool:
-        """Whether a teammate is to be named: it is suspected, and lied about objects too often; or it is suspected for
-        certain by several tests, and its own fusions are too unsteady. Nobody is suspected here for straying.
+        """Whether a teammate is to be named. It is suspected, and lied about objects too often where the ego is steady;
+        or it is suspected for certain by several tests, and its own fusions are too unsteady. Nobody is suspected here
+        for straying.
         """
         memory = self._known.memory
         suspicion = memory.straying.without(name, suspicion)
         if suspicion < CLEARED_BELOW:
             return False
-        if memory.lies.guilt(name, memory.frame) >= (1.0 if memory.steadiness.calm >= CALM else UNSTEADY_LEVELS):
+        if memory.steadiness.calm >= CALM and memory.lies.guilt(name, memory.frame) >= 1.0:
             return True
         return (
             suspicion > naming_bound

@@ -26,6 +26,7 @@ from robosac.evaluation.frames import encode_all
 from robosac.scenes import IntersectionScene
 from robosac.session import Session, defense_for
 from tests.robosac.defenses.group_testing.conversing import TEAM, run_frame
+from tests.robosac.defenses.group_testing.conversing import outcome as shown
 from tests.robosac.defenses.group_testing.one_place import DEFENSE, HONEST, LIAR, SEEN, World, nothing
 from tests.robosac.testifying import saying
 
@@ -209,6 +210,26 @@ def test_whoever_is_alone_is_left_out_too_and_comes_back():
         state = json.loads(json.dumps(decision.state))
         accepted.append(decision.accepted)
     assert accepted[2:12] == [()] * 10
+    assert accepted[-1] == (LIAR,)
+
+
+@pytest.mark.parametrize("others", [("rsu",), ("car-2", "car-3", "rsu")])
+def test_whoever_is_out_of_place_beside_attackers_alone_comes_back(others):
+    """Nobody else is worth a test; it was never placed again."""
+
+    def judge(world):
+        def attacked(subset, attackers, frame):
+            return shown(subset, others, frame) if set(others) & set(subset) else world.judge(subset, attackers, frame)
+
+        return attacked
+
+    team, rng = tuple(sorted([LIAR, *others])), np.random.default_rng(0)
+    state, accepted = DEFENSE.initial_state(team), []
+    for frame in range(40):
+        decision, _ = run_frame(DEFENSE, state, team, [], rng, judge=judge(Displaced() if frame < 12 else HONEST))
+        state = json.loads(json.dumps(decision.state))
+        accepted.append(decision.accepted)
+    assert accepted[8:12] == [()] * 4
     assert accepted[-1] == (LIAR,)
 
 
