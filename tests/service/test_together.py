@@ -14,6 +14,7 @@ from robosac.detectors import EmbeddedDetector
 from robosac.detectors.map_fusion import PreparedMaps
 from robosac.passes import Pass
 from robosac.session import Session, defense_for
+from service import jobs
 from service.engine import Engine
 from service.jobs import HOLD_S, Job, waiting, with_company
 from service.turns import Turns, Work
@@ -74,7 +75,10 @@ def frames_of(detector, settings, messages):
 
 
 @pytest.mark.parametrize("settings", SETTINGS, ids=lambda s: s["kind"])
-async def test_frames_of_several_sessions_share_passes_and_are_decided_as_alone(settings, engine, messages, shared):
+async def test_frames_of_several_sessions_share_passes_and_are_decided_as_alone(
+    settings, engine, messages, shared, monkeypatch
+):
+    monkeypatch.setattr(jobs, "HOLD_S", 10.0)  # however busy this machine is
     detector = engine.detectors["intersection-mean"]
     alone = [
         s.decide(n, ego, team, np.random.default_rng(seed))
@@ -99,6 +103,7 @@ async def test_frames_of_several_sessions_share_passes_and_are_decided_as_alone(
 
 
 async def test_if_they_cannot_be_made_together_each_frame_makes_its_own(engine, messages, monkeypatch, caplog):
+    monkeypatch.setattr(jobs, "HOLD_S", 10.0)
     plain, tried = PreparedMaps.detect_together, []
 
     def fails(wanted):
@@ -132,10 +137,10 @@ def job(due_s=1.0, coming=True, family="a", came_s=0.0):
 
 def test_company_is_of_one_family_and_who_is_due_first_comes_first():
     first, late, soon = job(3.0), job(2.0), job(1.0)
-    jobs = [first, late, job(0.5, family="b"), job(0.5, coming=False), soon]
-    assert with_company(first, jobs, 0.0) == [first, soon, late]
-    assert with_company(jobs[3], jobs, 0.0) == [jobs[3]]
-    assert with_company(soon, jobs, 0.995) == [soon]  # it has no time for others
+    all_of_them = [first, late, job(0.5, family="b"), job(0.5, coming=False), soon]
+    assert with_company(first, all_of_them, 0.0) == [first, soon, late]
+    assert with_company(all_of_them[3], all_of_them, 0.0) == [all_of_them[3]]
+    assert with_company(soon, all_of_them, 0.995) == [soon]  # it has no time for others
 
 
 def test_a_pass_waits_for_others_that_are_on_their_way():
