@@ -114,7 +114,7 @@ async def test_a_slow_body_is_cut_off(messages, benign):
         problem(opening, 408, "slow-body")
 
 
-@pytest.mark.parametrize("length", [None, "0", "+5", "9" * 30])
+@pytest.mark.parametrize("length", [None, "0", "+5", "1e9"])
 async def test_a_body_is_bounded_whatever_its_headers_say(length):
     """Servers refuse such headers themselves; nothing here rests on it."""
 
