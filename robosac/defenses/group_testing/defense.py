@@ -22,7 +22,7 @@ from robosac.defenses.group_testing.knowledge import Knowledge, remember
 from robosac.defenses.group_testing.memory import Memory
 from robosac.defenses.group_testing.model import LIE, CalibrationError, EvidenceModel
 from robosac.defenses.group_testing.posterior import Hazards, Posterior
-from robosac.defenses.protocol import Conversation, Hypothesis, Reference, State, named_in, trusted_in
+from robosac.defenses.protocol import Asking, Conversation, Hypothesis, Reference, State, named_in, trusted_in
 from robosac.defenses.sampling import MAX_BUDGET
 from robosac.defenses.settings import LEAST, DefenseSettings
 
@@ -129,7 +129,8 @@ class GroupTesting:
        a teammate's level (`lies.RULES`) and its probability.
     5. The answer is the decoded subset of greatest utility that is in consensus with the ego, or all trusted. Each box
        of it is judged by testimony: left out, repaired, or kept with its status (`standing.judge`). Whoever is out of
-       place (`placing.misplaced`) has no part in it, nor in step 2.
+       place (`placing.misplaced`) has no part in it, nor in step 2. If one of the answer turns out to be so, the others
+       are decoded besides.
     6. A teammate is named (``distrusted``) once it lied about objects too often (`Lies.guilt`; where the ego is
        unsteady, twice as much) and its probability is at least a half;
        or once its probability passes ``naming_bound``, at least two different subsets speak against it, and its own
@@ -213,7 +214,15 @@ class GroupTesting:
         named = frozenset(named_in(state) or ())
         inspection = Inspection(Findings(known, memory.lies, tuple(team), named), settings.keep_contradicted)
         passes, inspections = settings.first_budget if first else settings.budget, settings.inspections
-        while True:
+
+        def decode(subset: Hypothesis) -> Asking[bool]:
+            tested = yield Batch([subset], partial(_likely, subset, tuple(team), judged, known))
+            if tested:
+                evidence.learn(tested[0], inspection.learn(tested[0]))
+            return bool(tested)
+
+        in_time = True
+        while in_time:
             subset = judged.next_test(rng, passes) if passes > 0 else None
             passes -= 1
             if subset is None:
@@ -221,11 +230,10 @@ class GroupTesting:
                 subset = inspection.next_test(judged.best_answer()) if inspections >= 0 else None
             if subset is None:
                 break
-            tested = yield Batch([subset], partial(_likely, subset, tuple(team), judged, known))
-            if not tested:
-                break
-            evidence.learn(tested[0], inspection.learn(tested[0]))
+            in_time = yield from decode(subset)
         inspection.conclude(judged.best_answer())
+        if in_time and (subset := judged.in_place()) is not None:
+            yield from decode(subset)
         evidence.compare_singles()
         return judged.decide(named, settings.naming_bound, inspection)
 

@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Mapping
+from collections.abc import Mapping, Sequence
 from typing import Any
 
 import numpy as np
@@ -105,6 +105,15 @@ class JudgedFrame:
         """The decoded subset that would be answered now."""
         return self._best_answer()[0]
 
+    def in_place(self) -> Hypothesis | None:
+        """The answer without those who turned out to be out of place in this frame; None if it was decoded already, or
+        nobody is left of it.
+        """
+        out = self._known.memory.placing.out
+        answer = self._most_useful(self._allowed())[0]
+        left = tuple(name for name in answer if name not in out)
+        return left if left and left not in {o.teammates for o in self._evidence.outcomes} else None
+
     def decide(self, named_before: frozenset[str], naming_bound: float, inspection: Inspection) -> Decision:
         """The answer, whom to trust, and whom to name; the frame is over."""
         memory, outcomes = self._known.memory, self._evidence.outcomes
@@ -158,15 +167,22 @@ class JudgedFrame:
         return self._best[1]
 
     def _choose_answer(self) -> tuple[Hypothesis, float, Source]:
-        allowed = [o for o in self._evidence.outcomes if self._verified(o) or self._trusted.issuperset(o.teammates)]
-        allowed = [o for o in allowed if self._out.isdisjoint(o.teammates)]
-        out = self._known.memory.placing.out
-        if allowed := [o for o in allowed if out.isdisjoint(o.teammates)] or allowed:
-            worth = choice.utility(self._known.posterior, self._known.rows([o.teammates for o in allowed]))
+        allowed, out = self._allowed(), self._known.memory.placing.out
+        best = self._most_useful([o for o in allowed if out.isdisjoint(o.teammates)])
+        return best if best[0] else self._most_useful(allowed)
+
+    def _allowed(self) -> list[Outcome]:
+        """What may be answered: in consensus or all trusted, and nobody in it was out of place before this frame."""
+        outcomes = [o for o in self._evidence.outcomes if self._out.isdisjoint(o.teammates)]
+        return [o for o in outcomes if self._verified(o) or self._trusted.issuperset(o.teammates)]
+
+    def _most_useful(self, outcomes: Sequence[Outcome]) -> tuple[Hypothesis, float, Source]:
+        if outcomes:
+            worth = choice.utility(self._known.posterior, self._known.rows([o.teammates for o in outcomes]))
             best = int(np.argmax(worth.round(_DIGITS)))
             if worth[best] > 0:
-                source = Source.CONSENSUS if self._verified(allowed[best]) else Source.TRUSTED
-                return allowed[best].teammates, float(worth[best]), source
+                source = Source.CONSENSUS if self._verified(outcomes[best]) else Source.TRUSTED
+                return outcomes[best].teammates, float(worth[best]), source
         return (), 0.0, Source.EGO_ONLY
 
     def _untested_answer(self) -> tuple[Hypothesis, Source]:

@@ -1,11 +1,12 @@
 """Whose messages lie in a wrong place as a whole."""
 
 import json
+from dataclasses import replace
 
 import numpy as np
 import pytest
 
-from robosac.answers import Reason
+from robosac.answers import Reason, Source, Verdict
 from robosac.attacks import load_campaign
 from robosac.boxes import pose_matrix
 from robosac.defenses import EGO
@@ -199,6 +200,43 @@ def test_who_is_out_of_place_is_left_out_while_it_is_and_not_suspected():
     after = HONEST.play(10, before=Displaced(), quiet=10)
     assert LIAR not in after[0][0].accepted
     assert LIAR in after[-1][0].accepted
+
+
+def test_who_turns_out_to_be_out_of_place_is_not_in_the_answer_of_that_frame():
+    """Everybody is cleared: all are fused at once, and nothing else is decoded, until one of them is elsewhere."""
+    (quiet, _), (decision, tested) = HONEST.play(1, quiet=30)[0], Displaced().play(1, quiet=30)[0]
+    assert set(quiet.accepted) == set(TEAM)
+    assert decision.accepted == tuple(name for name in TEAM if name != LIAR)
+    assert decision.accepted in tested
+    assert decision.source is Source.CONSENSUS
+
+
+def test_where_only_an_attacker_is_in_place_the_answer_holds_who_turns_out_not_to_be():
+    """For that one frame: it was the ego alone."""
+    team, rng = (LIAR, "rsu"), np.random.default_rng(0)
+
+    def judge(world):
+        def attacked(subset, attackers, frame):
+            if "rsu" not in subset:
+                return world.judge(subset, attackers, frame)
+            told = {"testimony": world.testimony, "alone": world.alone}
+            return replace(shown(subset, ["rsu"], frame), verdict=Verdict.CONSENSUS, **told)
+
+        return attacked
+
+    state = DEFENSE.initial_state(team)
+    for _ in range(1):
+        decision, _ = run_frame(DEFENSE, state, team, [], rng, judge=judge(HONEST))
+        state = json.loads(json.dumps(decision.state))
+    met = []
+    for _ in range(2):
+        decision, tested = run_frame(DEFENSE, state, team, [], rng, judge=judge(Displaced()))
+        state = json.loads(json.dumps(decision.state))
+        met.append((decision.accepted, {o.teammates for o in tested}, state["memory"]["placing"]["out"]))
+    assert met[0][0] == (LIAR,)
+    assert ("rsu",) in met[0][1]
+    assert met[0][2] == [LIAR]
+    assert met[1][0] == ()
 
 
 def test_whoever_is_alone_is_left_out_too_and_comes_back():
