@@ -30,7 +30,7 @@ def check_numbers(value: object) -> object:
         tuple or list is.
     """
     if isinstance(value, float) and 0 < abs(value) < LEAST:
-        raise ValueError(f"is too near to 0: give 0 or at least {LEAST:g}")
+        raise ValueError(f"is nearer to 0 than {LEAST:g}")
     if isinstance(value, int) and abs(value) > LARGEST_INTEGER:
         raise ValueError(f"must be at most {LARGEST_INTEGER}")
     if isinstance(value, tuple | list):

@@ -54,6 +54,12 @@ async def test_an_absurd_number_is_refused_by_its_name(served):
             assert name in told.get("field", "") or name in told["detail"] or "pose error" in told["detail"], told
 
 
+async def test_who_is_too_near_to_0_is_not_told_to_give_0(served):
+    fields = {"ego_id": EGO, "teammates": TEAM, "frame_period_ms": 1e-12}  # of which 0 is refused, too
+    told = (await served.http.post("/v1/sessions", json=fields)).json()
+    assert (told["field"], told["detail"]) == ("frame_period_ms", "is nearer to 0 than 1e-09")
+
+
 def truths(model):
     """The fields of a model that hold true or false."""
     described = model.model_json_schema()["properties"].items()
