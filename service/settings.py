@@ -186,6 +186,8 @@ class Settings(BaseSettings):
     def _check_public_url(cls, value: str | None) -> str | None:
         if value is not None:
             read_origin(value)
+            if "?" in value or "#" in value:
+                raise ValueError("must have neither query nor fragment: paths are put behind it")
         return value
 
     @property
