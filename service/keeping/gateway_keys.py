@@ -5,6 +5,7 @@ from __future__ import annotations
 import base64
 import binascii
 import contextlib
+import errno
 import os
 import stat
 import tempfile
@@ -45,7 +46,8 @@ class GatewayKeys:
         """
         text = await store.secret("gateway-signing", _new) if self._file is None else _read(self._file)
         where = "the database's gateway-signing" if self._file is None else f"ROBOSAC_GATEWAY_KEY_FILE: {self._file}"
-        self._keys = [_key(line, where) for line in text.splitlines() if line.strip()]
+        lines = enumerate(text.splitlines(), start=1)
+        self._keys = [_key(line, f"{where}: line {number}") for number, line in lines if line.strip()]
         if not self._keys:
             raise ValueError(f"{where} holds no key")
         self._id = key_id(self._keys[0].public_key())
@@ -75,6 +77,8 @@ def _read(file: Path) -> str:
     try:
         if not file.exists():
             _make(file)
+        if file.is_dir():
+            raise IsADirectoryError(errno.EISDIR, os.strerror(errno.EISDIR))
         if _is_open_to_others(file.stat()):
             raise ValueError(f"ROBOSAC_GATEWAY_KEY_FILE: others may read {file}; take that right away (chmod 600)")
         return file.read_text()
@@ -120,4 +124,4 @@ def _key(line: str, where: str) -> Ed25519PrivateKey:
     try:
         return Ed25519PrivateKey.from_private_bytes(base64.b64decode(line.strip(), validate=True))
     except (binascii.Error, ValueError) as error:
-        raise ValueError(f"{where}: a line is no Ed25519 key, 32 bytes in base64") from error
+        raise ValueError(f"{where} is no Ed25519 key, 32 bytes in base64") from error

@@ -188,7 +188,9 @@ async def test_a_gateway_that_knows_its_address_takes_no_proof_for_another():
         assert good.status_code == 201
 
 
-@pytest.mark.parametrize("url", ["gateway.example", "ftp://gateway.example", "https://", "https://a/?b", "https://a/#b"])
+@pytest.mark.parametrize(
+    "url", ["gateway.example", "ftp://gateway.example", "https://", "https://a/?b", "https://a/#b"]
+)
 def test_a_public_url_that_is_none_is_refused(url):
     with pytest.raises(ValueError, match="public_url"):
         Settings(public_url=url)

@@ -100,8 +100,14 @@ async def test_the_key_outlives_the_process(tmp_path):
     assert ids[0] == ids[1]
 
 
-@pytest.mark.parametrize(("text", "mode", "why"), [("", 0o600, "no key"), ("AAAA", 0o600, "no Ed25519"),
-                                                  (ANOTHER, 0o640, "others may read")])  # fmt: skip
+@pytest.mark.parametrize(
+    ("text", "mode", "why"),
+    [
+        ("", 0o600, "no key"),
+        (f"{ANOTHER}\n\nAAAA", 0o600, "line 3 is no Ed25519"),
+        (ANOTHER, 0o640, "others may read"),
+    ],
+)
 async def test_a_bad_key_file_is_refused(tmp_path, text, mode, why):
     file = tmp_path / "gateway.key"
     file.write_text(text)

@@ -39,6 +39,7 @@ async def started(app):
         ({"device": "nonesuch"}, "ROBOSAC_DEVICE: torch cannot compute on the device 'nonesuch' here: "),
         ({"detector": "nonesuch"}, "ROBOSAC_DETECTOR: unknown detector 'nonesuch'"),
         ({"database_url": "sqlite:////nowhere/x.db"}, "ROBOSAC_DATABASE_URL: /nowhere/x.db: OperationalError: "),
+        ({"gateway_key_file": "/"}, "ROBOSAC_GATEWAY_KEY_FILE: / cannot be read: Is a directory"),
         ({"gateway_key_file": "/nowhere/key"}, "ROBOSAC_GATEWAY_KEY_FILE: /nowhere/key cannot be read: No such file"),
     ],
 )
