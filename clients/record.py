@@ -12,6 +12,7 @@ from typing import Annotated
 
 import typer
 from rich.console import Console
+from rich.markup import escape
 from rich.table import Table
 
 from clients import trial
@@ -78,16 +79,17 @@ def info(file: File) -> None:
             "answers": ", ".join(f"{count} {source}" for source, count in sources.most_common()) or "-",
             "named": ", ".join(named) or "-",
         }
-        for part in session.files:
-            broken |= part.damage is not None
-            whole = "whole" if part.damage is None else f"[red]{part.damage}[/red]; what is before that is good"
-            rows[part.path.name] = f"{part.path.stat().st_size} bytes, {len(part.frames)} frames, {whole}"
         counts = sum((Counter(part.counts) for part in session.files), Counter[str]())
         rows["topics"] = ", ".join(f"{topic} {count}" for topic, count in counts.items())
         table = Table(box=None, show_header=False)
         for name, told in rows.items():
             table.add_row(name, told)
         console.print(table)
+        for part in session.files:
+            broken |= part.damage is not None
+            whole = "whole" if part.damage is None else f"[red]{part.damage}[/red]; what is before that is good"
+            told = f" {escape(part.path.name)}: {part.path.stat().st_size} bytes, {len(part.frames)} frames, {whole}"
+            console.print(told, highlight=False, soft_wrap=True)  # a name that is cut or folded is no file's name
     if broken:
         raise typer.Exit(1)
 

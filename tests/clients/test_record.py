@@ -68,6 +68,12 @@ def test_info_tells_what_is_in_it(path, tmp_path):
     assert "what is before that is good" in said
 
 
+def test_info_gives_the_name_of_a_file_whole_on_a_narrow_screen(path, tmp_path):
+    file = tmp_path / f"20261122T131204Z-{'0123456789abcdef' * 5}-0001.mcap"
+    file.write_bytes(path.read_bytes())
+    assert f"{file.name}: {file.stat().st_size} bytes, 3 frames, whole" in run("info", file)[1]
+
+
 def test_a_file_that_is_not_whole_is_told_by_replay_and_export(path, tmp_path):
     broken, empty = tmp_path / "broken.mcap", tmp_path / "empty.mcap"
     broken.write_bytes(path.read_bytes()[:-2000])
