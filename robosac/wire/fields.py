@@ -7,7 +7,16 @@ from typing import Any
 
 SHOWN = 40
 """Characters of a sender's own words that an error repeats."""
-_TYPES = {dict: "a map", list: "an array", str: "a string", bytes: "binary", type(None): "nil"}
+_TYPES = {
+    dict: "a map",
+    list: "an array",
+    str: "a string",
+    bytes: "binary",
+    type(None): "nil",
+    int: "an integer",
+    float: "a float",
+    bool: "a boolean",
+}
 
 
 class WireError(ValueError):
@@ -66,8 +75,7 @@ def named(parts: Mapping[Any, Any], path: str) -> Mapping[str, Any]:
 def of_type(value: Any, kind: type, path: str) -> Any:
     """A value that has to be of a type."""
     if type(value) is not kind:  # a bool is no integer
-        wanted = "an integer" if kind is int else _TYPES[kind]
-        raise WireError("wrong-type", path, f"must be {wanted}, got {type_of(value)}")
+        raise WireError("wrong-type", path, f"must be {_TYPES[kind]}, got {type_of(value)}")
     return value
 
 

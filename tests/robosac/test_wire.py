@@ -197,6 +197,12 @@ def test_a_body_that_is_no_map_is_refused(value):
             read(msgpack.packb(value))
 
 
+@pytest.mark.parametrize(("value", "told"), [(3, "an integer"), (0.5, "a float"), (True, "a boolean")])
+def test_what_came_instead_is_told_in_the_words_of_msgpack(value, told):
+    with pytest.raises(wire.WireError, match=f"^body: must be a map, got {told}$"):
+        wire.read_message(msgpack.packb(value))
+
+
 def frame_with(name: bytes, member: bytes, times: int = 1) -> bytes:
     """A frame with further members, so many of a name that takes one number."""
     more = b"".join(name.replace(b"%", msgpack.packb(number)) + member for number in range(times))
