@@ -4,6 +4,11 @@
 //
 // It opens a session and posts whole frames. Its maps are zeros: real ones come from the vehicle's own encoder.
 
+process.on('uncaughtException', (error) => {
+  console.error(error.message, error.cause?.message ?? '');
+  process.exit(1);
+});
+
 const [gateway = 'http://127.0.0.1:8000', frames = 3] = process.argv.slice(2);
 
 /** A value as msgpack: maps, arrays, strings, binary and numbers are all that a frame needs. */

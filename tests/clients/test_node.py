@@ -39,3 +39,11 @@ async def test_the_client_for_node_has_its_frames_answered(tmp_path, monkeypatch
     assert (status, out) == (1, "")
     assert "POST /v1/sessions: 401" in errors
     assert "urn:robosac:problem:" in errors
+    assert len(errors.splitlines()) == 1  # the stack is the example's own, and no help
+
+
+@pytest.mark.skipif(NODE is None, reason="needs node")
+async def test_the_client_for_node_says_in_a_line_that_no_gateway_is_there():
+    status, out, errors = await run("http://127.0.0.1:1")
+    assert (status, out) == (1, "")
+    assert re.fullmatch(r"fetch failed.*\n", errors)
