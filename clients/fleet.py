@@ -273,10 +273,12 @@ def _check_scenes(source: SceneSource, first: int, scenes: int, frames: int, ego
         there = source.scenes("test")
         if len(there) < first + scenes:
             option = "--first-scene" if first else "--scenes"
-            raise typer.BadParameter(f"{source.name} has {len(there)} test scenes", param_hint=option)
+            told = f"{source.name} has {len(there)} test scenes; {first + scenes} are wanted"
+            raise typer.BadParameter(told, param_hint=option)
         for scene in there[first : first + scenes]:
             if scene.length is not None and scene.length < frames:
-                raise typer.BadParameter(f"scene {scene.number} has {scene.length} frames", param_hint="--frames")
+                told = f"scene {scene.number} has {scene.length} frames; {frames} are wanted"
+                raise typer.BadParameter(told, param_hint="--frames")
             if fault := team_fault(scene, egos, attackers):
                 raise typer.BadParameter(fault[1], param_hint=f"--{fault[0]}")
 

@@ -53,7 +53,7 @@ def run(  # the options of a command line
     with failing(AttackError, DetectorError), blaming("--data", SceneError, NoFrames), progress(console) as bar:
         some = source.scenes("test")[: scenes or DEFAULT_SCENES]
         if len(some) < (scenes or 1):
-            raise SceneError(f"{source.name} has {len(some)} test scenes")
+            raise SceneError(f"{source.name} has {len(some)} test scenes; {scenes or 1} are wanted")
         team = max((len(scene.agents) - 1 for scene in some), default=0)
         if attackers > team:
             raise typer.BadParameter(f"a scene has at most {team} teammates, not {attackers}", param_hint="--attackers")

@@ -335,8 +335,8 @@ async def test_a_gateway_that_ends_in_the_block_is_told_of_with_its_log(tmp_path
     [
         ("--attackers", "9", "must be between 0 and the 5 vehicles that are no egos, got 9"),
         ("--egos", "9", "must be between 1 and the 5 that may be one, got 9"),
-        ("--first-scene", "5000", "synthetic has 1000 test scenes"),
-        ("--scenes", "1001", "synthetic has 1000 test scenes"),
+        ("--first-scene", "5000", "synthetic has 1000 test scenes; 5004 are wanted"),
+        ("--scenes", "1001", "synthetic has 1000 test scenes; 1001 are wanted"),
         ("--url", "127.0.0.1:8800", "must begin with http:// or https://, got 127.0.0.1:8800"),
         ("--budget-ms", "60001", "less than or equal to 60000"),
         ("--detector", "nosuch.safetensors", "there is no file nosuch.safetensors"),

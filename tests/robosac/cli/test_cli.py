@@ -59,7 +59,7 @@ def test_the_version_is_told():
         (["evaluate", "--weights", "/nowhere"], "there is no file /nowhere"),
         (["evaluate", "--weights", "."], "not a readable"),
         (["evaluate", "--detector", "nonesuch:build"], "No module named 'nonesuch'"),
-        (["evaluate", "--scenes", "1001"], "1000 test scenes"),
+        (["evaluate", "--scenes", "1001"], "1000 test scenes; 1001 are wanted"),
         (["evaluate", "--data", "."], "no scene source '.': give one of synthetic, world:NAME, "),
         (["reproduce", "--out", "x", "--only", "nonesuch"], "known: derivation"),
         (["train", "--out", "x", "--adversarial", "nonesuch"], "known: pgd"),
