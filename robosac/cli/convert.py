@@ -5,6 +5,7 @@ from __future__ import annotations
 import warnings
 from collections.abc import Mapping
 from pathlib import Path
+from pickle import UnpicklingError
 from typing import Annotated
 
 import torch
@@ -14,6 +15,7 @@ from robosac.cli.blame import blaming, check_known
 from robosac.cli.outputs import Force, check_file
 from robosac.detectors.v2xsim.detector import FUSIONS, write_weights
 from robosac.detectors.weights_file import WeightsError
+from robosac.faults import unreadable
 
 
 def run(
@@ -42,6 +44,10 @@ def read_state(path: Path) -> Mapping[str, object]:
         with warnings.catch_warnings():  # of pickled storages: true of every checkpoint that is old enough
             warnings.simplefilter("ignore")
             content = torch.load(path, map_location="cpu", weights_only=True)
+    except OSError as error:
+        raise WeightsError(f"{path} is not a checkpoint that can be read: {unreadable(error)}") from error
+    except UnpicklingError as error:  # torch's words advise to let the file run code
+        raise WeightsError(f"{path} is not a checkpoint of tensors and plain values") from error
     except Exception as error:  # torch raises many unrelated types
         reason = str(error).splitlines()[0] if str(error) else type(error).__name__
         raise WeightsError(f"{path} is not a checkpoint of tensors and plain values: {reason}") from error
