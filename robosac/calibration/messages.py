@@ -13,6 +13,7 @@ from robosac.boxes import FloatArray
 from robosac.defenses.group_testing import CalibrationError
 from robosac.detectors import Encoder
 from robosac.detectors.base import for_role
+from robosac.faults import unreadable
 from robosac.files import write_text
 from robosac.scenes import Scene, encoded
 from robosac.screening import Bounds
@@ -75,7 +76,9 @@ def held(path: Path, weights_digest: str) -> dict[str, Any]:
     try:
         content: dict[str, Any] = json.loads(path.read_text())
         belongs_to = content["weights_digest"]
-    except (OSError, KeyError, TypeError, ValueError) as error:
+    except OSError as error:
+        raise CalibrationError(f"{path} cannot be read: {unreadable(error)}") from error
+    except (KeyError, TypeError, ValueError) as error:
         raise CalibrationError(f"{path} is no calibration: {error}") from error
     if belongs_to != weights_digest:
         raise CalibrationError(f"{path} belongs to weights with the digest {belongs_to!s:.12}..., calibrate again")

@@ -87,7 +87,7 @@ def test_the_command_adds_worlds_to_a_calibration_and_keeps_the_rest(quick, tmp_
         (["--worlds-only"], "--world"),
         (["--worlds-only", "--messages-only", "--world", "highway"], "give one of them"),
         (["--worlds-only", "--world", "nowhere"], "nowhere"),
-        (["--worlds-only", "--world", "highway", "--out", "none.json"], "none.json is no calibration"),
+        (["--worlds-only", "--world", "highway", "--out", "none.json"], "none.json cannot be read: No such file"),
     ],
 )
 def test_what_cannot_be_is_said_in_a_line(quick, arguments, words):
