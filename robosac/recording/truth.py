@@ -62,6 +62,8 @@ def _boxes(sent: Any, where: str) -> FloatArray:
     boxes = np.frombuffer(data, dtype="<f8").reshape(-1, 5).astype(np.float64)
     if not np.isfinite(boxes).all():
         raise WireError("non-finite", f"{where}.data", "holds NaN or infinity")
+    if (boxes[:, 2:4] <= 0).any():
+        raise WireError("out-of-range", f"{where}.data", "lengths and widths must be positive")
     return boxes
 
 

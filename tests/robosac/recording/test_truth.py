@@ -40,6 +40,7 @@ def test_a_message_need_not_tell_it(messages):
         (boxes(shape=[MOST_BOXES + 1, 5]), "ego.truth.boxes.shape", "out-of-range"),
         (boxes(shape=[3, 5]), "ego.truth.boxes.data", "wrong-length"),
         (boxes(data="text"), "ego.truth.boxes.data", "wrong-length"),
+        (boxes(data=np.zeros(10).tobytes()), "ego.truth.boxes.data", "out-of-range"),
         (boxes(data=np.full(10, np.nan).tobytes()), "ego.truth.boxes.data", "non-finite"),
         (changed(attackers="car-2"), "ego.truth.attackers", "wrong-type"),
         (changed(attackers=[5]), "ego.truth.attackers", "wrong-type"),
