@@ -11,7 +11,7 @@ import numpy as np
 
 from robosac.defenses.group_testing.differences import SAME_LIE_M, blame
 from robosac.defenses.group_testing.findings import UNHEARD, Findings, one_out
-from robosac.defenses.group_testing.lies import AUDIT_FRAMES, Word
+from robosac.defenses.group_testing.lies import AUDIT_FRAMES, QUIET_FRAMES, Word
 from robosac.defenses.group_testing.model import CELLS, CLEAN
 from robosac.defenses.group_testing.objects import PLACED_SCORE, Lie
 from robosac.defenses.group_testing.placing import misplaced
@@ -61,7 +61,7 @@ def conclude(found: Findings, answer: Hypothesis) -> None:
         blamed[name].append(lie)
     conflicts = _conflicts(found, answer)
     having_a_part = _having_a_part(found, answer)
-    straying = _straying(found, asked)
+    straying = _straying(found, asked, answer)
     _place(found, answer)
     _leave_alone(found, answer)
     _clear(found, comparisons)
@@ -174,9 +174,12 @@ def _leave_alone(found: Findings, answer: Hypothesis) -> None:
             found.lies.leave_alone(found.placed(lie.place), frame)
 
 
-def _straying(found: Findings, asked: Mapping[str, tuple[Hypothesis, Hypothesis]]) -> dict[str, float]:
+def _straying(
+    found: Findings, asked: Mapping[str, tuple[Hypothesis, Hypothesis]], answer: Hypothesis
+) -> dict[str, float]:
     """What it adds to suspicion how much each of those strays who were left out of a fusion (`asked`), where it adds
-    anything.
+    anything. What is known of somebody who is not in the answer fades once it was not asked for some frames: else it
+    would never be back where too few are left to ask it beside.
     """
     memory, weights = found.known.memory, dict[str, float]()
     for name, (joined, without) in asked.items():
@@ -185,6 +188,9 @@ def _straying(found: Findings, asked: Mapping[str, tuple[Hypothesis, Hypothesis]
         if weight := memory.straying.learn(name, by, anew=anew):
             weights[name] = weight
         found.lies.audited[name] = memory.frame
+    for name in set(found.team) & memory.straying.levels.keys() - set(answer) - found.named:
+        if memory.frame - found.lies.audited.get(name, -QUIET_FRAMES) >= QUIET_FRAMES:
+            memory.straying.fade(name)
     return weights
 
 

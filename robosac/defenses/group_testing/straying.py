@@ -117,6 +117,14 @@ class Straying:
             self.weights.pop(teammate, None)
         return 0.0 if anew else weight
 
+    def fade(self, teammate: str) -> None:
+        """It was not looked at for some frames, so that what is known of it means less. It does not fall to 0: whoever
+        is in the answer again is looked at, and what straying has added to its suspicion is still known.
+        """
+        before, _ = self.levels[teammate]
+        level = min(before, round(max(RULE.drift, before - RULE.drift), 4))
+        self.levels[teammate] = level, level  # what it adds when it rises again counts anew
+
     def note(self, teammate: str, weight: float) -> None:
         """Note what has been added to a teammate's suspicion for straying alone."""
         if teammate in self.levels:

@@ -8,6 +8,7 @@ import pytest
 
 from robosac.answers import Verdict
 from robosac.defenses import EGO, Outcome
+from robosac.defenses.group_testing import GroupTestingSettings
 from robosac.defenses.group_testing.conclusions import conclude
 from robosac.defenses.group_testing.evidence import Evidence
 from robosac.defenses.group_testing.findings import Findings
@@ -15,7 +16,7 @@ from robosac.defenses.group_testing.frame import JudgedFrame
 from robosac.defenses.group_testing.hearing import Hearing
 from robosac.defenses.group_testing.inspection import Inspection
 from robosac.defenses.group_testing.knowledge import Knowledge
-from robosac.defenses.group_testing.lies import Lies
+from robosac.defenses.group_testing.lies import QUIET_FRAMES, Lies
 from robosac.defenses.group_testing.memory import Memory
 from robosac.defenses.group_testing.model import CELLS, CLEAN
 from robosac.defenses.group_testing.objects import SLACK_ACROSS_M, Shown
@@ -31,6 +32,10 @@ from robosac.defenses.group_testing.straying import (
     Straying,
     strays,
 )
+from robosac.detectors import Message, load
+from robosac.evaluation.frames import encode_all
+from robosac.scenes import IntersectionScene
+from robosac.session import Session, defense_for
 from tests.robosac.defenses.group_testing.conversing import TEAM
 from tests.robosac.defenses.group_testing.one_place import HONEST, LIAR, MODEL, SEEN, YES, World, nothing
 from tests.robosac.testifying import saying
@@ -129,6 +134,53 @@ def test_beside_few_others_one_message_changes_too_much_to_tell(beside, learned)
         found.learn(world.judge(subset, None, 0))
     conclude(found, large)
     assert (LIAR in memory.straying.levels) == learned
+
+
+def after_conclusions(frames, answer):
+    """Levels from frame to frame, of whoever strayed, and has not for long been asked beside enough others."""
+    memory, lies, world = Memory(straying=Straying({LIAR: (1.5, 1.5)}, {LIAR: 9.0})), Lies(audited={LIAR: 0}), HONEST
+    levels = []
+    for frame in range(frames):
+        memory.frame = frame
+        posterior = Posterior(len(MODEL.kinds), 0.5, 0.25, TEAM)
+        found = Findings(Knowledge(MODEL, posterior, memory), lies, TEAM, ())
+        for subset in {answer, tuple(name for name in TEAM if name in {*OTHERS[:2], LIAR})}:
+            found.learn(world.judge(subset, None, frame))
+        conclude(found, answer)
+        levels.append(memory.straying.levels[LIAR])
+    return levels, memory.straying
+
+
+def test_what_is_known_of_whoever_can_no_longer_be_asked_fades():
+    """Where too few others are left, it could never be cleared."""
+    levels, straying = after_conclusions(QUIET_FRAMES + 20, OTHERS[:2])
+    assert levels[:QUIET_FRAMES] == [(1.5, 1.5)] * QUIET_FRAMES
+    assert levels[QUIET_FRAMES + 1] == (pytest.approx(1.5 - 2 * RULE.drift),) * 2
+    assert not straying.rising(LIAR)
+    assert straying.to_be_asked(TEAM) == [LIAR]
+    assert straying.weights == {LIAR: 9.0}
+    assert straying.learn(LIAR, 1.0, anew=False) == sum(weight for step, weight in RULE.weights if step <= 1.0)
+    in_the_answer, _ = after_conclusions(QUIET_FRAMES + 20, TEAM)
+    assert in_the_answer[-1] == (1.5, 1.5)
+
+
+def test_three_that_were_out_of_place_together_come_back():
+    """They strayed, and only two were left to ask them beside."""
+    detector, scene = load(), IntersectionScene(1700)
+    ego, team = scene.egos[0], sorted(set(scene.agents) - {scene.egos[0]})
+    session = Session(detector, team, defense_for(GroupTestingSettings(), detector.info), rng=np.random.default_rng(0))
+    accepted = []
+    for index in range(56):
+        messages = encode_all(detector, scene.frame(index))
+        for name in team[2:] if 10 <= index < 20 else ():
+            pose = messages[name].pose.copy()
+            pose[0, 3] += 1.5
+            messages[name] = Message(pose, messages[name].tensors)
+        answer = session.answer(index, messages.pop(ego), messages)
+        accepted.append(set(answer.accepted))
+        assert not answer.named
+    assert any(of_frame == set(team[:2]) for of_frame in accepted)
+    assert all(of_frame == set(team) for of_frame in accepted[-2:])
 
 
 @pytest.mark.parametrize(("size", "level", "asked"), [(6, 0.3, True), (8, 0.3, False), (8, 0.8, True)])
