@@ -224,11 +224,8 @@ def test_where_only_an_attacker_is_in_place_the_answer_holds_who_turns_out_not_t
 
         return attacked
 
-    state = DEFENSE.initial_state(team)
-    for _ in range(1):
-        decision, _ = run_frame(DEFENSE, state, team, [], rng, judge=judge(HONEST))
-        state = json.loads(json.dumps(decision.state))
-    met = []
+    decision, _ = run_frame(DEFENSE, DEFENSE.initial_state(team), team, [], rng, judge=judge(HONEST))
+    state, met = json.loads(json.dumps(decision.state)), []
     for _ in range(2):
         decision, tested = run_frame(DEFENSE, state, team, [], rng, judge=judge(Displaced()))
         state = json.loads(json.dumps(decision.state))
