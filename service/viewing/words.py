@@ -60,6 +60,8 @@ def of_rejection(entry: RejectedTeammate) -> str:
         parts.append(f"{'test' if len(tests) == 1 else 'tests'} {which} of this frame: agreement down to {lowest:.2f}")
     if isinstance(off := more.get("misplaced_m"), float):
         parts.append(f"its message is out of place by {off:.1f} m")
+    if more.get("ego_astray") is True:
+        parts.append("the ego itself is not where it says")
     if detail := more.get("detail"):
         parts.append(str(detail))
     if (other := more.get("of")) is not None:

@@ -24,6 +24,10 @@ cars AP50 grows by .05 and AP70 by .12 from six messages to twenty.
 """
 INFORMATION_VALUE = 0.06
 """What a bit about who attacks is worth, in the unit of utility."""
+LASTING = 30.0
+"""So many times that where a frame has time for one pass alone. Nothing can be found out beside the answer there, and
+what is found out serves the frames to come.
+"""
 TEST_COST = 0.004
 """What a pass must bring, in the unit of utility."""
 DEPENDENCE = 0.85
@@ -87,7 +91,7 @@ def expected_information(known: Knowledge, subsets: BoolArray, decoded: BoolArra
         bits[again] += once * changed * dilution(sizes[again])
     best = np.zeros(count)
     np.maximum.at(best, pairs.subset, memory.weights(pairs.keys, PAIR_REPEAT) * told[count:])
-    return (bits + best) * memory.steadiness.trust
+    return (bits + best) * memory.trust
 
 
 def most_information(known: Knowledge, subsets: BoolArray) -> FloatArray:
@@ -98,7 +102,7 @@ def most_information(known: Knowledge, subsets: BoolArray) -> FloatArray:
     p = np.minimum(np.maximum(posterior.unattacked(posterior.masks(subsets)), _CERTAIN), 1.0 - _CERTAIN)
     doubt = -(p * np.log2(p) + (1.0 - p) * np.log2(1.0 - p))
     again = [key in memory.shown for key in known.keys(subsets).tolist()]
-    most: FloatArray = doubt * (DEPENDENCE + np.array(again)) * memory.steadiness.trust
+    most: FloatArray = doubt * (DEPENDENCE + np.array(again)) * memory.trust
     return most
 
 
@@ -107,7 +111,7 @@ def most_promised(known: Knowledge) -> float:
     what is attacked to what is not, times how likely an attack is.
     """
     of_pairs, of_changes = known.model.most_telling
-    return float(known.posterior.by_kind @ (DEPENDENCE * of_pairs + of_changes)) * known.memory.steadiness.trust
+    return float(known.posterior.by_kind @ (DEPENDENCE * of_pairs + of_changes)) * known.memory.trust
 
 
 @dataclass(frozen=True, eq=False)

@@ -14,7 +14,7 @@ from robosac.defenses.group_testing.findings import UNHEARD, Findings, one_out
 from robosac.defenses.group_testing.lies import AUDIT_FRAMES, QUIET_FRAMES, Word
 from robosac.defenses.group_testing.model import CELLS, CLEAN
 from robosac.defenses.group_testing.objects import PLACED_SCORE, Lie
-from robosac.defenses.group_testing.placing import misplaced
+from robosac.defenses.group_testing.placing import DOUBTED_M, misplaced
 from robosac.defenses.group_testing.straying import strays
 from robosac.defenses.protocol import Hypothesis
 
@@ -36,6 +36,7 @@ def conclude(found: Findings, answer: Hypothesis) -> None:
     """Who lied in this frame; the posterior learns it, and memory keeps it."""
     if found.hearing is None:
         return
+    _place(found, answer)
     blamed: dict[str, list[Lie]] = {name: [] for name in found.team}
     comparisons = _comparisons(found)
     heard = [name for name in found.team if name not in found.unheard]
@@ -62,7 +63,6 @@ def conclude(found: Findings, answer: Hypothesis) -> None:
     conflicts = _conflicts(found, answer)
     having_a_part = _having_a_part(found, answer)
     straying = _straying(found, asked, answer)
-    _place(found, answer)
     _leave_alone(found, answer)
     _clear(found, comparisons)
     blameful = {name for name, lies in blamed.items() if lies}
@@ -72,7 +72,7 @@ def conclude(found: Findings, answer: Hypothesis) -> None:
         counts, lies = dict(conflicts.get(name, {})), blamed[name]
         if lies or name in having_a_part:
             found.lies.effects[name] = frame
-        if lies and found.seems_late(name):
+        if lies and found.excused(name):
             lies = [replace(lie, along=True) for lie in lies]
         for kind in sorted({lie.counts_as for lie in lies}):
             of_kind = [lie for lie in lies if lie.counts_as == kind]
@@ -138,7 +138,7 @@ def _conflicts(found: Findings, answer: Hypothesis) -> dict[str, dict[str, int]]
         if unseen.any() and found.hearing.alone(name, found.unheard) >= FEWEST_SEEN:
             unseen[:] = False
         kinds = np.where(unseen, "unseen", "conflict")
-        if found.seems_late(name):
+        if found.excused(name):
             kinds[:] = "late"
         for kind in ("conflict", "unseen", "late"):
             places = [found.placed(box[:2]) for box in claims.boxes[(supported | denied) & (kinds == kind)]]
@@ -182,6 +182,8 @@ def _straying(
     would never be back where too few are left to ask it beside.
     """
     memory, weights = found.known.memory, dict[str, float]()
+    if memory.placing.ego_astray:
+        return weights
     for name, (joined, without) in asked.items():
         anew = memory.frame - found.lies.audited.get(name, -AUDIT_FRAMES) >= AUDIT_FRAMES
         by = strays(found.shown[joined], found.shown[without], name)
@@ -195,7 +197,9 @@ def _straying(
 
 
 def _place(found: Findings, answer: Hypothesis) -> None:
-    """Learn whose messages are out of place as a whole, by the answer, or else by the largest fusion."""
+    """Learn whose messages are out of place as a whole, by the answer, or else by the largest fusion. Where the ego is
+    not where it says, all are.
+    """
     if not found.shown:
         return
     everybody = found.heard().everybody
@@ -205,14 +209,27 @@ def _place(found: Findings, answer: Hypothesis) -> None:
     centres = everybody.sighting(shown.boxes[placed, :2], supporting).centre
     heard = np.array([name not in found.unheard for name in everybody.agents])
     far = misplaced(centres, supporting, everybody.origins, heard).tolist()
-    found.known.memory.placing.learn(
-        {name: by for name, by in zip(everybody.agents, far, strict=True) if not np.isnan(by)}
-    )
+    known = {name: by for name, by in zip(everybody.agents, far, strict=True) if not np.isnan(by)}
+    _place_ego(found, sorted(known.values()))
+    found.known.memory.placing.learn(known, found.team)
+
+
+def _place_ego(found: Findings, off: Sequence[float]) -> None:
+    """Learn whether the ego itself is not where it says, by how far ``off`` its teammates are, the least first. What
+    begins as if it were late is taken for that.
+    """
+    memory, doubted = found.known.memory, bool(off) and off[(len(off) - 1) // 2] >= DOUBTED_M
+    before = memory.placing.ego_astray
+    memory.placing.learn_ego(found.ego_off() if doubted else np.nan, differs=found.ego_differs)
+    if memory.placing.ego_astray and not before and (memory.ego_is_late or found.ego_late):
+        memory.placing.ego_astray = False
 
 
 def _doubt_ego(found: Findings, anything_wrong: bool) -> None:
     """Learn whether the ego's own message is late; where nothing seems wrong it does no harm."""
     memory = found.known.memory
+    if memory.placing.ego_astray:
+        return
     if (anything_wrong or memory.ego_is_late) and found.ego_late:
         memory.ego_late = memory.frame
 

@@ -118,7 +118,8 @@ class GroupTesting:
        ever impossible: what is remembered is rounded, and from 0 no evidence leads back.
     2. The next subset is the one with the greatest ``max(0, U(m) - best U so far) + .06 bits(m) - .004``: what it gains
        as an answer, and what it is expected to tell. Nothing above 0, the frame's budget, or the deadline ends the
-       search.
+       search. Where the frame before had time for one pass alone, what the first is expected to tell counts
+       `choice.LASTING` times.
     3. A decoded subset is evidence by what it keeps, moves and adds compared with the ego alone and with each part and
        superset decoded in this frame (`geometry.measure`), and by what comes and goes in it since the frame before, if
        it was decoded there too (`geometry.changes`). A repeated test weighs less. So does what speaks against somebody
@@ -214,6 +215,7 @@ class GroupTesting:
         named = frozenset(named_in(state) or ())
         inspection = Inspection(Findings(known, memory.lies, tuple(team), named), settings.keep_contradicted)
         passes, inspections = settings.first_budget if first else settings.budget, settings.inspections
+        most = passes + inspections
 
         def decode(subset: Hypothesis) -> Asking[bool]:
             tested = yield Batch([subset], partial(_likely, subset, tuple(team), judged, known))
@@ -232,8 +234,9 @@ class GroupTesting:
                 break
             in_time = yield from decode(subset)
         inspection.conclude(judged.best_answer())
-        if in_time and (subset := judged.in_place()) is not None:
+        if in_time and len(evidence.outcomes) < most and (subset := judged.in_place()) is not None:
             yield from decode(subset)
+        memory.hurried = len(evidence.outcomes) == 1 and (most == 1 or not in_time)
         evidence.compare_singles()
         return judged.decide(named, settings.naming_bound, inspection)
 

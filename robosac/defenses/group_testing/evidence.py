@@ -247,7 +247,7 @@ class Evidence:
         test = key(of_d, of_a) if finding.test == "change" else key(of_a, of_d)
         against = attacked > clean
         weight = finding.weight * min(1.0, UNDILUTED_SIZE / (len(finding.a) + len(finding.d)))
-        weight *= memory.steadiness.trust if against else 1.0
+        weight *= memory.trust if against else 1.0
         weight *= memory.weigh(test, _REPEATS[finding.test], 1 if against else -1)
         if against:
             counted = self._against[finding.test]

@@ -7,8 +7,8 @@ from functools import cached_property
 
 import numpy as np
 
-from robosac.boxes import FloatArray, IntArray
-from robosac.defenses.group_testing.claims import NOT_TOGETHER, SUPPORTS
+from robosac.boxes import BoolArray, FloatArray, IntArray
+from robosac.defenses.group_testing.claims import LEANS, NOT_TOGETHER, SUPPORTS
 from robosac.defenses.group_testing.differences import SAME_LIE_M, effects, gone
 from robosac.defenses.group_testing.geometry import WITNESS_SCORE, followed, gone_since
 from robosac.defenses.group_testing.hearing import REACH_M, Hearing
@@ -16,6 +16,7 @@ from robosac.defenses.group_testing.knowledge import Knowledge
 from robosac.defenses.group_testing.lateness import Place, late, motions, senders
 from robosac.defenses.group_testing.lies import Lies
 from robosac.defenses.group_testing.objects import Lie, Shown
+from robosac.defenses.group_testing.placing import ego_misplaced
 from robosac.defenses.group_testing.shapes import BLAMING, agreeing, reshaped, to_ask
 from robosac.defenses.protocol import EGO, Difference, Hypothesis, Outcome
 from robosac.testimony import Testimony
@@ -24,6 +25,8 @@ CALM = 0.5
 """From here on the ego counts as steady."""
 DONE = {"ghost": "invented", "gone": "removed", "moved": "displaced", "reshaped": "reshaped"}
 """What was done to an object, by the kind of a lie."""
+FEWEST_DENIED = 3
+"""The ego leans against so many vehicles that others see before it is in doubt itself."""
 NOTHING = np.zeros((0, 4))
 UNHEARD = 0.9
 """The testimony of those suspected more than this counts for nothing."""
@@ -172,16 +175,51 @@ class Findings:
         """
         if not self.shown:
             return False
+        shown, teammates, told = self._told_by_several()
+        centres, agreed = self.heard().everybody.agreed(shown.boxes[told, :2], teammates[:, told])
+        return self._fits_late(EGO, shown, told[agreed], centres[agreed])
+
+    @property
+    def ego_differs(self) -> bool:
+        """Whether the ego leans against vehicles that more teammates see in one place than would lie together: against
+        `FEWEST_DENIED`, and half as many as it supports.
+        """
+        shown, teammates, told = self._told_by_several()
+        said = shown.everybody.likelihood[0, told]
+        denied, enough = told[said <= LEANS], max(FEWEST_DENIED, np.count_nonzero(said >= SUPPORTS) / 2)
+        if len(denied) < enough:  # as nearly always
+            return False
+        _, agreed = self.heard().everybody.agreed(shown.boxes[denied, :2], teammates[:, denied])
+        return bool(np.count_nonzero(agreed) >= enough)
+
+    def ego_off(self) -> float:
+        """How far the ego shows vehicles from where more teammates agree that they are than would lie together, metres;
+        not a number where those are too few.
+        """
+        shown, teammates, told = self._told_by_several()
+        told = told[shown.everybody.supporting[0, told]]
+        everybody, places = self.heard().everybody, shown.boxes[told, :2]
+        centres, agreed = everybody.agreed(places, teammates[:, told])
+        ego = np.zeros_like(teammates[:, told])
+        ego[0] = True
+        return ego_misplaced(everybody.centres(places, ego)[agreed], centres[agreed])
+
+    def _told_by_several(self) -> tuple[Shown, BoolArray, IntArray]:
+        """The largest fusion, which teammates (witnesses, n) support its boxes, and the boxes that more of them do than
+        would lie together.
+        """
         shown = self.shown[max(self.shown, key=len)]
         teammates = shown.everybody.supporting.copy()
         teammates[0] = False
         told = np.flatnonzero((teammates.sum(axis=0) >= NOT_TOGETHER) & (shown.boxes[:, 5] >= WITNESS_SCORE))
-        centres, agreed = self.heard().everybody.agreed(shown.boxes[told, :2], teammates[:, told])
-        return self._fits_late(EGO, shown, told[agreed], centres[agreed])
+        return shown, teammates, told
 
-    def seems_late(self, sender: str) -> bool:
-        """Whether a teammate's message is late, or seems to be as the ego's own is, now or not long ago."""
-        return self.late(sender) or self.known.memory.ego_is_late or self.ego_late
+    def excused(self, sender: str) -> bool:
+        """Whether what is wrong about a teammate's message may be because it is late, or because the ego's own is, now
+        or not long ago, or because the ego is not where it says.
+        """
+        memory = self.known.memory
+        return self.late(sender) or memory.ego_is_late or self.ego_late or memory.placing.ego_astray
 
     def _without(self, sender: str) -> Hypothesis:
         without = [fused for fused in self.shown if sender not in fused]

@@ -77,18 +77,21 @@ class JudgedFrame:
             return None
         ego_sees = self._evidence.ego_witnesses
         gained = np.maximum(0.0, choice.utility(known.posterior, options) - max(0.0, self._best_answer()[1]))
-        most_promised = choice.INFORMATION_VALUE * choice.most_promised(known)
+        worth_of_a_bit = choice.INFORMATION_VALUE
+        if known.memory.hurried and not outcomes:
+            worth_of_a_bit *= choice.LASTING
+        most_promised = worth_of_a_bit * choice.most_promised(known)
         if outcomes and gained.max() + most_promised <= choice.TEST_COST:  # as in most frames of an honest team
             return None
         may_wait = len(self._team) > EXACT and not outcomes and passes > 1
         if not outcomes and not may_wait:  # what cannot be the best is not worth reckoning
-            most = choice.INFORMATION_VALUE * choice.most_information(known, options)
+            most = worth_of_a_bit * choice.most_information(known, options)
             likely = gained + most >= gained.max() - 2 * _TIE
             options, gained = options[likely], gained[likely]
             if len(options) == 1 and gained[0] > choice.TEST_COST:  # whatever it tells
                 return known.names(options[0], self._team)
         bits = choice.expected_information(known, options, decoded, ego_sees=ego_sees)
-        value = gained + choice.INFORMATION_VALUE * bits - choice.TEST_COST
+        value = gained + worth_of_a_bit * bits - choice.TEST_COST
         if may_wait:
             beside = (options & cleared(known.posterior.marginals())).sum(axis=1) >= WITNESSES
             if (beside & (bits >= WORTH_WAITING)).any():
@@ -201,7 +204,9 @@ class JudgedFrame:
         for name, rejection in explain_rejections(self._team, accepted, self._evidence.outcomes).items():
             evidence: dict[str, Any] = {**rejection.evidence, "suspicion": round(suspicion[name], 6)}
             reason = rejection.reason
-            if name in memory.placing.out:
+            if memory.placing.ego_astray:
+                evidence["ego_astray"] = True
+            elif name in memory.placing.out:
                 evidence["misplaced_m"] = round(memory.placing.off[name], 2)
             if name in named:
                 reason = Reason.DISTRUSTED

@@ -89,6 +89,8 @@ class Memory:
     """Where in the world each sender was in that frame: x, y, metres; see `lateness.senders`."""
     ego_late: int | None = None
     """The latest frame in which the ego's own message was late."""
+    hurried: bool = False
+    """Whether that frame had time for one pass alone, and another was worth it."""
     lies: Lies = field(default_factory=Lies)
     """About objects."""
     straying: Straying = field(default_factory=Straying)
@@ -101,6 +103,11 @@ class Memory:
     def ego_is_late(self) -> bool:
         """Whether the ego's own message was late not long ago."""
         return self.ego_late is not None and self.frame - self.ego_late <= LATE_FRAMES
+
+    @property
+    def trust(self) -> float:
+        """Weight of evidence from whole fusions that speaks against anybody."""
+        return 0.0 if self.placing.ego_astray else self.steadiness.trust
 
     def weights(self, tests: KeyArray, rho: float) -> FloatArray:
         """Expected weights of tests (n,): ``1 - rho ** k`` if a test was made k frames ago already, else 1."""
@@ -170,6 +177,7 @@ class Memory:
             "shown_in": self.shown_in,
             "senders": {name: list(place) for name, place in self.senders.items()},
             "ego_late": self.ego_late,
+            "hurried": self.hurried,
             "lies": self.lies.to_state(),
             "straying": self.straying.to_state(),
             "placing": self.placing.to_state(),
@@ -191,6 +199,7 @@ class Memory:
             shown_in=int(state.get("shown_in", 0)),
             senders={name: (float(x), float(y)) for name, (x, y) in state.get("senders", {}).items()},
             ego_late=state.get("ego_late"),
+            hurried=bool(state.get("hurried", False)),
             lies=Lies.from_state(state["lies"]) if "lies" in state else Lies(),
             straying=Straying.from_state(state.get("straying", {})),
             placing=Placing.from_state(state.get("placing", {})),

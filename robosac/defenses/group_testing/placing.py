@@ -6,7 +6,7 @@ by a shift and a turn about the sender that are known to some .1 m and .2 degree
 
 from __future__ import annotations
 
-from collections.abc import Mapping
+from collections.abc import Collection, Mapping
 from dataclasses import dataclass, field
 from typing import Any
 
@@ -32,6 +32,12 @@ frame.
 """
 MEAN_M, ONCE_M = 0.4, 0.6
 """Nobody is out of place who is off by less. Boxes suffer from about .4 m on, across the vehicles."""
+EGO_MEAN_M, EGO_ONCE_M = 0.5, 0.75
+"""The ego itself is not where it says if it is so far off from where others agree: in the running mean, in a single
+frame. Teams that err by .6 m each make it seem .3 m off, seldom .6 m.
+"""
+DOUBTED_M = 0.2
+"""Where the middle one of the team is so far off, the ego is placed, too."""
 
 
 def misplaced(centres: FloatArray, supporting: BoolArray, origins: FloatArray, heard: BoolArray) -> FloatArray:
@@ -66,10 +72,33 @@ def misplaced(centres: FloatArray, supporting: BoolArray, origins: FloatArray, h
     shared[0] = False
     seen = _by_others(np.where(witnesses[..., None], centres, np.nan), others)
     seen = np.where(witnesses[0, :, None], centres[0], seen)
-    apart = np.where(shared[..., None], centres - seen, 0.0).reshape(len(centres), -1, 1)
-    x, y = np.where(shared[..., None], seen - origins[:, None], 0.0).transpose(2, 0, 1)
+    return _off(centres - seen, seen - origins[:, None], shared)
+
+
+def ego_misplaced(seen: FloatArray, centres: FloatArray) -> float:
+    """How far the ego shows vehicles from where teammates agree that they are, as in `misplaced`.
+
+    Parameters
+    ----------
+    seen, centres : (n, 2) ndarray
+        Where the ego sees vehicles, and where they are by the others; ego frame, metres.
+
+    Returns
+    -------
+    float
+        Metres; not a number with fewer than four vehicles.
+    """
+    return float(_off((seen - centres)[None], centres[None], np.ones((1, len(seen)), dtype=bool))[0])
+
+
+def _off(apart: FloatArray, arms: FloatArray, shared: BoolArray) -> FloatArray:
+    """How far senders (k,) are off who see vehicles ``apart`` (k, n, 2) from where those are, at the ends of ``arms``
+    (k, n, 2) from the sender, so far as shared (k, n); not a number with fewer than four of them.
+    """
+    apart = np.where(shared[..., None], apart, 0.0).reshape(len(shared), -1, 1)
+    x, y = np.where(shared[..., None], arms, 0.0).transpose(2, 0, 1)
     one, none = np.ones_like(x), np.zeros_like(x)
-    design = np.stack([one, none, -y, none, one, x], axis=-1).reshape(len(centres), -1, 3)  # rows of x and y in turn
+    design = np.stack([one, none, -y, none, one, x], axis=-1).reshape(len(shared), -1, 3)  # rows of x and y in turn
     ridge = VEHICLE_M**2 / np.array([SHIFT_M, SHIFT_M, TURN]) ** 2 * np.eye(3)
     weights, moved = shared.astype(np.float64), apart
     for _ in range(ROUNDS):
@@ -106,18 +135,32 @@ class Placing:
     """By teammate: a running mean of how far it is `misplaced`, metres."""
     out: frozenset[str] = frozenset()
     """Who is out of place."""
+    ego_off: float = EXPECTED_M
+    """The running mean of the ego itself."""
+    ego_astray: bool = False
+    """Whether the ego itself is not where it says: then nobody fits its map, and nobody is to blame for that."""
 
-    def learn(self, placed: Mapping[str, float]) -> None:
+    def learn_ego(self, far: float, *, differs: bool) -> None:
+        """Take in how far the ego is off (`ego_misplaced`), or not a number, and whether it differs from all others."""
+        far = EXPECTED_M if np.isnan(far) else far
+        self.ego_off = round(self.ego_off + RATE * (far - self.ego_off), 4)
+        self.ego_astray = differs or far > EGO_ONCE_M or self.ego_off > EGO_MEAN_M
+
+    def learn(self, placed: Mapping[str, float], team: Collection[str] = ()) -> None:
         """Take in how far teammates are `misplaced` in a frame.
 
         With a how far a sender is off, m its running mean, and u the lower median of those of the team, it is out of
-        place if a is more than ``max(.6, 2.75 u)`` or m more than ``max(.4, 1.6 u)``.
+        place if a is more than ``max(.6, 2.75 u)`` or m more than ``max(.4, 1.6 u)``. Where the ego is not where it
+        says, the whole team is.
         """
         # whoever cannot be placed any longer is believed again, in time
         placed = {**dict.fromkeys(sorted(self.out), EXPECTED_M), **placed}
         for name, far in placed.items():
             before = self.off.get(name, EXPECTED_M)
             self.off[name] = round(before + RATE * (far - before), 4)
+        if self.ego_astray:
+            self.out = frozenset(team)
+            return
         usual = self._usual()
         mean, once = max(MEAN_M, MEAN * usual), max(ONCE_M, ONCE * usual)
         self.out = frozenset(name for name, far in placed.items() if self.off[name] > mean or far > once)
@@ -133,10 +176,12 @@ class Placing:
 
     def to_state(self) -> dict[str, Any]:
         """JSON values that `from_state` reads."""
-        return {"off": self.off, "out": sorted(self.out)}
+        ego = {"ego_off": self.ego_off, "ego_astray": self.ego_astray}
+        return {"off": self.off, "out": sorted(self.out), **ego}
 
     @classmethod
     def from_state(cls, state: Mapping[str, Any]) -> Placing:
         """What `to_state` wrote; of nothing, as in the states of older versions, nothing is learned yet."""
         off = {str(name): float(far) for name, far in state.get("off", {}).items()}
-        return cls(off, frozenset(str(name) for name in state.get("out", ())))
+        ego = float(state.get("ego_off", EXPECTED_M)), bool(state.get("ego_astray", False))
+        return cls(off, frozenset(str(name) for name in state.get("out", ())), *ego)

@@ -82,6 +82,34 @@ def test_the_same_subset_again_and_again_names_nobody():
     assert decision.accepted == ()
 
 
+def one_pass_by_budget(state, bad, rng):
+    return run_frame(with_settings(first_budget=1, budget=1, inspections=0), state, TEAM, bad, rng)
+
+
+def one_pass_by_time(state, bad, rng):
+    return run_frame(DEFENSE, state, TEAM, bad, rng, most=1)
+
+
+@pytest.mark.parametrize("bad", [(), ("car-3",)])
+@pytest.mark.parametrize("frame", [one_pass_by_budget, one_pass_by_time])
+def test_with_one_pass_a_frame_the_team_is_found_in_time(frame, bad, rng):
+    """The answer that is known is worth most in each frame by itself; so nobody would ever be tested besides."""
+    state, tests = DEFENSE.initial_state(TEAM), []
+    for _ in range(20):
+        decision, tested = frame(state, bad, rng)
+        state = json.loads(json.dumps(decision.state))
+        tests.append(len(tested))
+    assert tests == [1] * 20
+    assert set(decision.accepted) == set(TEAM) - set(bad)
+
+
+def test_a_frame_with_time_for_more_is_as_if_none_had_been_hurried(rng):
+    hurried, _ = run_frame(DEFENSE, DEFENSE.initial_state(TEAM), TEAM, [], rng, most=1)
+    assert hurried.state["memory"]["hurried"]
+    honest, _ = run(DEFENSE, [], 4, rng, hurried.state)
+    assert not honest.state["memory"]["hurried"]
+
+
 def test_a_hijacked_teammate_is_found_and_one_that_recovers_is_used_again(rng):
     honest, _ = run(DEFENSE, [], 6, rng)
     hijacked, _ = run(DEFENSE, ["car-4"], 4, rng, honest.state)

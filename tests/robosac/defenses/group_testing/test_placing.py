@@ -20,6 +20,7 @@ from robosac.defenses.group_testing.placing import (
     ONCE_M,
     RATE,
     Placing,
+    ego_misplaced,
     misplaced,
 )
 from robosac.detectors import load
@@ -129,6 +130,14 @@ def test_of_nobody_and_nothing_nothing_is_told(agents, count):
     assert np.isnan(off).all()
 
 
+def test_the_ego_is_placed_by_what_others_agree_on():
+    assert ego_misplaced(PLACES + [0.8, 0.0], PLACES) == pytest.approx(0.8, abs=0.05)
+    turn = turned(PLACES, np.zeros(2), 2.0)
+    assert ego_misplaced(turn, PLACES) == pytest.approx(np.sqrt(((turn - PLACES) ** 2).sum(axis=1).mean()), abs=0.1)
+    assert ego_misplaced(PLACES, PLACES) < 0.01
+    assert np.isnan(ego_misplaced(PLACES[: FEWEST - 1], PLACES[: FEWEST - 1]))
+
+
 def told(*frames):
     """A placing after frames of how far the liar is off, of a team that is off by .1 m else."""
     placing = Placing()
@@ -171,6 +180,7 @@ def test_whoever_is_in_place_again_or_can_no_longer_be_placed_is_back():
 
 def test_it_is_kept_and_forgotten():
     placing = told(*[1.0] * 10)
+    placing.learn_ego(2.0, differs=False)
     memory = Memory.from_state(json.loads(json.dumps(Memory(placing=placing).to_state())))
     assert memory.placing == placing
     memory.leave(LIAR, 0.5)
@@ -200,6 +210,41 @@ def test_who_is_out_of_place_is_left_out_while_it_is_and_not_suspected():
     after = HONEST.play(10, before=Displaced(), quiet=10)
     assert LIAR not in after[0][0].accepted
     assert LIAR in after[-1][0].accepted
+
+
+class EgoAstray(World):
+    """Some see all vehicles elsewhere than the ego, all in one place; what is fused shows them half-way."""
+
+    def __init__(self, off, who=TEAM, said=5.5):
+        super().__init__({}, nothing)
+        says = {EGO: said, **dict.fromkeys(TEAM, 5.5)}
+        places = {name: [(x, y, value) for x, y in SEEN[:, :2]] for name, value in says.items()}
+        self.testimony = saying(places, seen={name: SEEN[:, :2] + [0, off] for name in who})
+
+
+ASTRAY = [EgoAstray(1.0), EgoAstray(0.0, said=-2.0)]
+
+
+@pytest.mark.parametrize("world", ASTRAY, ids=["off", "differs"])
+def test_an_ego_that_differs_from_all_blames_nobody_and_answers_alone(world):
+    met = world.play(10, quiet=10)
+    assert not any(decision.named for decision, _ in met)
+    assert all(decision.accepted == () for decision, _ in met[1:])
+    last, _ = met[-1]
+    assert last.source is Source.EGO_ONLY
+    assert max(last.suspicion.values()) < 0.1
+    assert all(last.rejected[name].evidence["ego_astray"] for name in TEAM)
+    assert not any("misplaced_m" in rejection.evidence for rejection in last.rejected.values())
+    after = HONEST.play(12, before=world, quiet=10)
+    assert set(after[-1][0].accepted) == set(TEAM)
+
+
+@pytest.mark.parametrize("who", [("car-2", LIAR), ("car-2", "car-3", LIAR)])
+def test_some_who_differ_from_the_ego_and_others_do_not_put_it_in_doubt(who):
+    """Two do not outweigh it; nor do three that two others contradict."""
+    met = EgoAstray(1.0, who).play(10, quiet=10)
+    assert not any(decision.state["memory"]["placing"]["ego_astray"] for decision, _ in met)
+    assert set(met[0][0].accepted) == set(TEAM) - set(who)
 
 
 def test_who_turns_out_to_be_out_of_place_is_not_in_the_answer_of_that_frame():
