@@ -13,7 +13,7 @@ from robosac.defenses.group_testing.differences import SAME_LIE_M, effects, gone
 from robosac.defenses.group_testing.geometry import WITNESS_SCORE, followed, gone_since
 from robosac.defenses.group_testing.hearing import REACH_M, Hearing
 from robosac.defenses.group_testing.knowledge import Knowledge
-from robosac.defenses.group_testing.lateness import Place, late, motions, senders
+from robosac.defenses.group_testing.lateness import Place, late, motions, moved_since, senders, sent
 from robosac.defenses.group_testing.lies import Lies
 from robosac.defenses.group_testing.objects import Lie, Shown
 from robosac.defenses.group_testing.placing import ego_misplaced
@@ -55,6 +55,8 @@ class Findings:
         What all messages say; None before the first outcome.
     pose : (4, 4) ndarray
         world_from_sensor of the ego.
+    number : int
+        The frame's, as its outcomes give it.
     differences : list of Difference
         What somebody is to blame for.
     """
@@ -70,6 +72,7 @@ class Findings:
         self.decoded: set[Hypothesis] = set()
         self.hearing: Hearing | None = None
         self.pose: FloatArray = np.eye(4)
+        self.number = 0
         self.differences: list[Difference] = []
         self._testimony: Testimony | None = None
         self._alone: FloatArray | None = None
@@ -87,7 +90,7 @@ class Findings:
             self._testimony = outcome.testimony
             silent = self.known.memory.ego_is_late
             self.hearing = Hearing(outcome.testimony.silenced(EGO) if silent else outcome.testimony, self.unheard)
-            self._alone = outcome.alone
+            self._alone, self.number = outcome.alone, outcome.frame
         if outcome.pose is not None:
             self.pose = outcome.pose
         shown = self.shown[outcome.teammates] = Shown(outcome.teammates, outcome.boxes, self.hearing)
@@ -159,6 +162,14 @@ class Findings:
     def senders(self) -> dict[str, Place]:
         """Where in the world each sender is that is known to be somewhere."""
         return {} if self.hearing is None else senders(self.hearing.everybody, self.pose)
+
+    def remember_senders(self) -> None:
+        """Let the next frames know where senders were."""
+        if self.hearing is not None:
+            self.known.memory.senders = sent(self.known.memory.senders, self.senders, self.number)
+
+    def _moved(self, sender: str) -> FloatArray | None:
+        return moved_since(self.known.memory.senders.get(sender), self.senders.get(sender), self.number)
 
     def late(self, sender: str) -> bool:
         """Whether a teammate's message is late: by the vehicles that the largest fusion without it shows, where one is
@@ -235,18 +246,17 @@ class Findings:
 
     def _fits_late(self, sender: str, shown: Shown, told: IntArray, centres: FloatArray) -> bool:
         """Whether a sender's message is late by some boxes (n,) of a fusion, of vehicles centred there (n, 2)."""
-        memory, now = self.known.memory, self.senders
-        if self._testimony is None or not {sender, EGO} <= memory.senders.keys() & now.keys():
+        memory, own, ego = self.known.memory, self._moved(sender), self._moved(EGO)
+        if self._testimony is None or own is None or ego is None:
             return False
         largest = max(memory.shown.values(), key=len, default=NOTHING)
         before = memory.shown.get(self.known.key(shown.teammates), largest)
-        since = {name: np.subtract(now[name], memory.senders[name]) for name in (sender, EGO)}
         moved = motions(followed(shown.boxes[told], self.pose), before)
         known, turn = ~np.isnan(moved[:, 0]), self.pose[:2, :2]
         centres, moved = centres[known], moved[known] @ turn
         if sender != EGO:  # the ego is a vehicle, too
-            centres, moved = np.vstack([centres, np.zeros(2)]), np.vstack([moved, since[EGO] @ turn])
-        return late(self._testimony, sender, since[sender] @ turn, centres, moved)
+            centres, moved = np.vstack([centres, np.zeros(2)]), np.vstack([moved, ego @ turn])
+        return late(self._testimony, sender, own @ turn, centres, moved)
 
     def note(self, joined: Hypothesis, without: Hypothesis, lies: Sequence[Lie]) -> None:
         """Note for whoever looks on what is wrong in a fusion by the fault of those whom the other one does without."""

@@ -92,7 +92,7 @@ class Inspection:
         """
         found, memory = self._found, self._found.known.memory
         conclude(found, answer)
-        memory.senders = found.senders
+        found.remember_senders()
         if answer in found.shown and memory.vigilance.learn(found.shown[answer]):
             for name in set(answer) - memory.straying.levels.keys():  # those are being looked at
                 found.lies.audited.pop(name, None)

@@ -8,6 +8,8 @@ not where the vehicles are. An older message is a replay.
 
 from __future__ import annotations
 
+from collections.abc import Mapping
+
 import numpy as np
 
 from robosac.boxes import FloatArray
@@ -28,7 +30,11 @@ CLEAR, FEWEST = 1.0, 2
 """At least so many vehicles fit better, by so much L, and twice as many as fit worse: a lie about one or two does not
 excuse itself.
 """
+SENT_FRAMES = 5
+"""How fast a sender is may be told by where it was so many frames ago: not each sends in every frame."""
 Place = tuple[float, float]
+Sent = tuple[float, float, int]
+"""Where in the world a sender was when it last sent a message, x, y, metres; and the number of that frame."""
 
 
 def late(testimony: Testimony, sender: str, moved: FloatArray, centres: FloatArray, motions: FloatArray) -> bool:
@@ -66,6 +72,22 @@ def senders(testimony: Testimony, pose: FloatArray) -> dict[str, Place]:
     """Where in the world each sender is, metres, rounded to 1 cm; ``pose`` is the ego's."""
     placed = (testimony.origins @ pose[:2, :2].T + pose[:2, 3]).round(2)
     return {name: (x, y) for name, (x, y) in zip(testimony.agents, placed.tolist(), strict=True)}
+
+
+def sent(before: Mapping[str, Sent], now: Mapping[str, Place], number: int) -> dict[str, Sent]:
+    """Where senders were that sent a message in a frame of this number, or lately."""
+    lately = {name: last for name, last in before.items() if 0 < number - last[2] < SENT_FRAMES}
+    return {**lately, **{name: (x, y, number) for name, (x, y) in now.items()}}
+
+
+def moved_since(last: Sent | None, now: Place | None, number: int) -> FloatArray | None:
+    """How far (2,) a sender has moved in a frame, on average since it last sent a message; None if it did not lately,
+    or does not in this frame, which has that number.
+    """
+    if last is None or now is None or not 0 < number - last[2] <= SENT_FRAMES:
+        return None
+    moved: FloatArray = np.subtract(now, last[:2]) / (number - last[2])
+    return moved
 
 
 def motions(now: FloatArray, before: FloatArray) -> FloatArray:

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import hashlib
 import math
-from collections.abc import Collection, Mapping
+from collections.abc import Collection, Mapping, Sequence
 from dataclasses import dataclass, field
 from functools import lru_cache
 from typing import Any
@@ -13,6 +13,7 @@ import numpy as np
 
 from robosac import decimals
 from robosac.boxes import FloatArray
+from robosac.defenses.group_testing.lateness import Sent
 from robosac.defenses.group_testing.lies import Lies
 from robosac.defenses.group_testing.placing import Placing
 from robosac.defenses.group_testing.steadiness import Steadiness
@@ -63,6 +64,12 @@ def _boxes(kept: Any) -> FloatArray:
     return (decimals.from_text(kept) if isinstance(kept, str) else np.asarray(kept, dtype=np.float64)).reshape(-1, 4)
 
 
+def _sent(kept: Sequence[float], state: Mapping[str, Any]) -> Sent:
+    """Where a sender was as it is kept; older versions kept those of the latest frame alone, without its number."""
+    x, y, *number = kept
+    return float(x), float(y), int(number[0] if number else state.get("shown_in", 0))
+
+
 LATE_FRAMES = 5
 """An ego that was late is late for so many frames: a scanner's delay stays, and not every frame shows it."""
 
@@ -85,8 +92,8 @@ class Memory:
     """
     shown_in: int = 0
     """That frame's number, as its outcomes gave it."""
-    senders: dict[str, tuple[float, float]] = field(default_factory=dict)
-    """Where in the world each sender was in that frame: x, y, metres; see `lateness.senders`."""
+    senders: dict[str, Sent] = field(default_factory=dict)
+    """Of each that sent a message lately; see `lateness.sent`."""
     ego_late: int | None = None
     """The latest frame in which the ego's own message was late."""
     hurried: bool = False
@@ -197,7 +204,7 @@ class Memory:
             # none of them is in the states of older versions
             shown={int(key, 16): _boxes(kept) for key, kept in state.get("shown", {}).items()},
             shown_in=int(state.get("shown_in", 0)),
-            senders={name: (float(x), float(y)) for name, (x, y) in state.get("senders", {}).items()},
+            senders={name: _sent(kept, state) for name, kept in state.get("senders", {}).items()},
             ego_late=state.get("ego_late"),
             hurried=bool(state.get("hurried", False)),
             lies=Lies.from_state(state["lies"]) if "lies" in state else Lies(),

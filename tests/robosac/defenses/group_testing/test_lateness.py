@@ -11,7 +11,7 @@ from robosac.defenses import EGO, Outcome
 from robosac.defenses.group_testing.findings import Findings
 from robosac.defenses.group_testing.geometry import followed
 from robosac.defenses.group_testing.knowledge import Knowledge
-from robosac.defenses.group_testing.lateness import late, motions, senders
+from robosac.defenses.group_testing.lateness import SENT_FRAMES, late, motions, moved_since, senders
 from robosac.defenses.group_testing.lies import Lies
 from robosac.defenses.group_testing.memory import Memory
 from robosac.defenses.group_testing.posterior import Posterior
@@ -101,14 +101,18 @@ def cars(centres):
     return np.column_stack([centres, np.tile([4.5, 1.9, 0.0, 0.9], (len(centres), 1))])
 
 
-def drive(frames, delay, shown=False):
-    """Decisions in traffic, where one teammate's message is so many frames old, and shown or not where it is fused."""
+def drive(frames, delay, shown=False, every=1):
+    """Decisions in traffic, where one teammate's message is so many frames old, and shown or not where it is fused. It
+    sends one in every so many frames.
+    """
     state, rng, found = DEFENSE.initial_state(TEAM), np.random.default_rng(0), []
     for frame in range(frames):
         true = PLACES + frame * SPEED
         old = true - min(delay, frame) * SPEED
         honest = [(*place, NO) for place in old if delay] + [(*place, YES) for place in true]
-        heard = saying({**dict.fromkeys((EGO, *TEAM), honest), LIAR: shown_at(old, true)})
+        team = tuple(name for name in TEAM if name != LIAR or frame % every == 0)
+        said = {**dict.fromkeys((EGO, *TEAM), honest), LIAR: shown_at(old, true)}
+        heard = saying({name: said[name] for name in (EGO, *team)})
 
         def judge(subset, _, number, true=true, old=old, heard=heard):
             more = old if shown and number and LIAR in subset else old[:0]
@@ -117,16 +121,18 @@ def drive(frames, delay, shown=False):
                 subset, 0.93, Verdict.CONSENSUS, cars(np.vstack([true, more])), cars(true), np.eye(4), number, **told
             )
 
-        decision, _ = run_frame(DEFENSE, state, TEAM, [], rng, judge=judge)
+        decision, _ = run_frame(DEFENSE, state, team, [], rng, judge=judge)
         state = json.loads(json.dumps(decision.state))
         found.append(decision)
     return found
 
 
+@pytest.mark.parametrize("every", [1, 2])
 @pytest.mark.parametrize("shown", [False, True])
 @pytest.mark.parametrize(("delay", "names"), [(0, set()), (1, set()), (2, set()), (5, {LIAR})])
-def test_who_is_late_is_not_named_and_who_replays_is(delay, names, shown):
-    found = drive(10, delay, shown and delay > 0)
+def test_who_is_late_is_not_named_and_who_replays_is(delay, names, shown, every):
+    """Nor is who sends a late message in every other frame."""
+    found = drive(6 + 4 * every, delay, shown and delay > 0, every)
     assert {name for decision in found for name in decision.named} == names
     levels = found[-1].state["memory"]["lies"]["levels"].get(LIAR, {})
     assert ("late" in levels) == (0 < delay < 5)
@@ -134,9 +140,33 @@ def test_who_is_late_is_not_named_and_who_replays_is(delay, names, shown):
     assert ("ghost" in levels) == (delay == 5 and shown)
 
 
-def test_where_senders_were_is_known_for_one_frame():
+def test_where_senders_were_is_known_for_some_frames():
     state = drive(2, 0)[-1].state
-    assert state["memory"]["senders"] == {name: [0.0, 0.0] for name in (EGO, *TEAM)}
+    assert state["memory"]["senders"] == {name: [0.0, 0.0, 1] for name in (EGO, *TEAM)}
+    for frames, last in ((SENT_FRAMES, 0), (SENT_FRAMES + 1, None)):
+        kept = drive(frames, 0, every=100)[-1].state["memory"]["senders"]
+        assert kept.get(LIAR) == (None if last is None else [0.0, 0.0, last])
+        assert kept[EGO] == [0.0, 0.0, frames - 1]
+
+
+def test_how_fast_a_sender_is_shows_from_where_it_was_lately():
+    def moved(last, number):
+        found = moved_since(last, (16.0, -2.0), number)
+        return None if found is None else found.tolist()
+
+    assert moved((10.0, 4.0, 8), 9) == [6.0, -6.0]
+    assert moved((10.0, 4.0, 8), 11) == [2.0, -2.0]
+    assert moved((10.0, 4.0, 8), 8 + SENT_FRAMES) is not None
+    assert moved((10.0, 4.0, 8), 9 + SENT_FRAMES) is None
+    assert moved((10.0, 4.0, 8), 8) is None  # numbers that begin again
+    assert moved(None, 9) is None
+    assert moved_since((10.0, 4.0, 8), None, 9) is None
+
+
+def test_older_versions_kept_senders_of_the_latest_frame_without_its_number():
+    state = Memory(shown_in=7, senders={"a": (1.0, 2.0, 6)}).to_state()
+    assert Memory.from_state(state).senders == {"a": (1.0, 2.0, 6)}
+    assert Memory.from_state({**state, "senders": {"a": [1.0, 2.0]}}).senders == {"a": (1.0, 2.0, 7)}
 
 
 POSE = pose_matrix(100.0, -50.0, 1.8, 1.2)
@@ -149,7 +179,7 @@ def asked(true, late, fused, alone, ego_moved=STILL, forget=None, beside=()):
     Everybody stands where the ego does. Before that the ego was elsewhere by what it has moved.
     """
     turn, origin = POSE[:2, :2], POSE[:2, 3]
-    memory = Memory(senders=dict.fromkeys(TEAM, tuple(origin)) | {EGO: tuple(origin - turn @ ego_moved)})
+    memory = Memory(senders=dict.fromkeys(TEAM, (*origin, 0)) | {EGO: (*(origin - turn @ ego_moved), 0)})
     known = Knowledge(MODEL, Posterior(len(MODEL.kinds), 0.5, 0.25, TEAM), memory)
     before = followed(cars(true - SPEED), POSE)
     memory.shown = {} if forget == "shown" else {known.key(subset): before for subset in ((), REST, tuple(TEAM))}
@@ -203,7 +233,7 @@ def test_boxes_that_nobody_else_supports_or_that_are_faint_tell_nothing(said_by,
 
 def ego_found(ego_delay=1, seeing=("car-2", "car-3", "rsu"), aside=0.0, unheard=()):
     """Findings of a frame in which some see all vehicles, the last of them aside, and the ego where they were."""
-    memory = Memory(senders=dict.fromkeys((EGO, *TEAM), (0.0, 0.0)))
+    memory = Memory(senders=dict.fromkeys((EGO, *TEAM), (0.0, 0.0, 0)))
     known = Knowledge(MODEL, Posterior(len(MODEL.kinds), 0.5, 0.25, TEAM), memory)
     memory.shown = {known.key(tuple(TEAM)): followed(cars(PLACES - SPEED), np.eye(4))}
     says = {EGO: shown_at(PLACES - ego_delay * SPEED)}
