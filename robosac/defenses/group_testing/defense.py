@@ -17,7 +17,7 @@ from robosac.defenses.group_testing.candidates import unresolved
 from robosac.defenses.group_testing.evidence import Evidence
 from robosac.defenses.group_testing.findings import Findings
 from robosac.defenses.group_testing.frame import JudgedFrame
-from robosac.defenses.group_testing.inspection import Inspection
+from robosac.defenses.group_testing.inspection import FEWEST_TO_ASK, Inspection
 from robosac.defenses.group_testing.knowledge import Knowledge, remember
 from robosac.defenses.group_testing.memory import Memory
 from robosac.defenses.group_testing.model import LIE, CalibrationError, EvidenceModel
@@ -217,6 +217,8 @@ class GroupTesting:
         passes, inspections = settings.first_budget if first else settings.budget, settings.inspections
         most = passes + inspections
 
+        clearing = self.asks_witnesses and inspections < FEWEST_TO_ASK  # else nobody might ever be cleared of a lie
+
         def decode(subset: Hypothesis) -> Asking[bool]:
             tested = yield Batch([subset], partial(_likely, subset, tuple(team), judged, known))
             if tested:
@@ -226,6 +228,8 @@ class GroupTesting:
         in_time = True
         while in_time:
             subset = judged.next_test(rng, passes) if passes > 0 else None
+            if subset is None and passes > 0 and clearing:
+                subset = inspection.asked_again(judged.best_answer())
             passes -= 1
             if subset is None:
                 passes, inspections = 0, inspections - 1

@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Collection, Iterator, Sequence
+from collections.abc import Collection, Iterable, Iterator, Sequence
 from itertools import islice
 
 import numpy as np
@@ -21,6 +21,9 @@ from robosac.defenses.protocol import Difference, Hypothesis, Outcome
 
 SUSPECT = 0.5
 """Who is suspected more than this, and not named, is asked again each frame, so as to be cleared or named."""
+
+FEWEST_TO_ASK = 2
+"""It takes so many hypotheses to ask one suspect again: alone, and beside the answer."""
 
 
 class Inspection:
@@ -54,8 +57,14 @@ class Inspection:
 
     def next_test(self, answer: Hypothesis) -> Hypothesis | None:
         """The subset to decode next, to see who is behind what is wrong; None if nothing is, or all is explained."""
-        decoded = self._found.decoded
-        return next((subset for subset in self._questions(answer) if subset and subset not in decoded), None)
+        return self._first_not_decoded(self._questions(answer))
+
+    def asked_again(self, answer: Hypothesis) -> Hypothesis | None:
+        """The subset to decode next to ask those again beside the answer that are left out; None if nobody is."""
+        return self._first_not_decoded(subset for subset in self._again(answer) if set(answer) <= set(subset))
+
+    def _first_not_decoded(self, subsets: Iterable[Hypothesis]) -> Hypothesis | None:
+        return next((subset for subset in subsets if subset and subset not in self._found.decoded), None)
 
     def _questions(self, answer: Hypothesis) -> Iterator[Hypothesis]:
         """What is worth decoding, in this order: those to be asked again; each alone who knows a vehicle's shape;
