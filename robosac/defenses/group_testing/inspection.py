@@ -43,6 +43,7 @@ class Inspection:
         self._whole: Hypothesis | None = None
         self._agreeing: list[Hypothesis] = []
         self._lost: list[FloatArray] | None = None
+        self._suspects: list[str] | None = None
 
     @property
     def differences(self) -> list[Difference]:
@@ -141,7 +142,10 @@ class Inspection:
             rows = self._found.known.rows([(*answer, *group) for group in groups])
             honest = posterior.unattacked(posterior.masks(rows)) >= SUSPECT
             asked = [self._with(answer, groups[int(honest.argmax())])] if honest.any() else asked
-        for suspect in suspects[-2:][::-1]:
+        # whoever is asked alone is less suspected by it, and others would be asked in its place before it is done with
+        self._suspects = suspects[-2:][::-1] if self._suspects is None else self._suspects
+        begun = [name for name in self._suspects if name in suspects]
+        for suspect in (*begun, *(name for name in reversed(suspects) if name not in begun))[:2]:
             asked += [(suspect,), self._with(answer, [suspect])]
         return asked
 

@@ -1,5 +1,6 @@
 """Who is asked about the objects of a frame, how often, and what is told of it."""
 
+import json
 from dataclasses import replace
 
 import numpy as np
@@ -17,7 +18,7 @@ from robosac.defenses.group_testing.lies import Lies
 from robosac.defenses.group_testing.memory import Memory
 from robosac.defenses.group_testing.model import CELLS, CLEAN
 from robosac.defenses.group_testing.posterior import Posterior
-from tests.robosac.defenses.group_testing.conversing import TEAM, make_model
+from tests.robosac.defenses.group_testing.conversing import TEAM, make_model, run_frame
 from tests.robosac.defenses.group_testing.one_place import (
     CAR,
     DEFENSE,
@@ -109,6 +110,22 @@ def test_with_few_inspections_those_left_out_are_asked_again_by_what_the_budget_
     met = HONEST.play(9, defense, quiet=2, before=world)
     assert set(met[-1][0].accepted) == set(TEAM)
     assert all(len(tested) <= budget + inspections for _, tested in met)
+
+
+@pytest.mark.parametrize("frames", [10, 20, 40])
+def test_four_who_were_away_for_long_are_all_back_in_time(frames, rng):
+    """While they are away nothing is known of them, so that they may have been hijacked. All are suspected alike."""
+    away = GroupTesting(MODEL, GroupTestingSettings(hijack=0.1))
+    state = HONEST.play(6)[-1][0].state
+    for _ in range(frames):
+        state = run_frame(away, state, TEAM[:1], [], rng, judge=HONEST.judge)[0].state
+    assert min(state["suspicion"][name] for name in TEAM[1:]) > 0.6
+    for _ in range(20):
+        decision, tested = run_frame(DEFENSE, state, TEAM, [], rng, judge=HONEST.judge)
+        state = json.loads(json.dumps(decision.state))
+    assert set(decision.accepted) == set(TEAM)
+    assert decision.named == ()
+    assert len(tested) == 1
 
 
 def test_nobody_is_suspected_where_nothing_is_wrong():
