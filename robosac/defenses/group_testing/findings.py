@@ -193,15 +193,17 @@ class Findings:
     @property
     def ego_differs(self) -> bool:
         """Whether the ego leans against vehicles that more teammates see in one place than would lie together: against
-        `FEWEST_DENIED`, and half as many as it supports.
+        at least `FEWEST_DENIED`, and with half the sum of L with which it supports others.
         """
         shown, teammates, told = self._told_by_several()
         said = shown.everybody.likelihood[0, told]
-        denied, enough = told[said <= LEANS], max(FEWEST_DENIED, np.count_nonzero(said >= SUPPORTS) / 2)
-        if len(denied) < enough:  # as nearly always
+        leaning = np.flatnonzero(said <= LEANS)
+        if len(leaning) < FEWEST_DENIED:  # as nearly always
             return False
+        denied = told[leaning]
         _, agreed = self.heard().everybody.agreed(shown.boxes[denied, :2], teammates[:, denied])
-        return bool(np.count_nonzero(agreed) >= enough)
+        against, supporting = -said[leaning[agreed]], said[said >= SUPPORTS]
+        return len(against) >= FEWEST_DENIED and bool(2.0 * against.sum() >= supporting.sum())
 
     def ego_off(self) -> float:
         """How far the ego shows vehicles from where more teammates agree that they are than would lie together, metres;
