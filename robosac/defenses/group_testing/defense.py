@@ -216,7 +216,6 @@ class GroupTesting:
         inspection = Inspection(Findings(known, memory.lies, tuple(team), named), settings.keep_contradicted)
         passes, inspections = settings.first_budget if first else settings.budget, settings.inspections
         most = passes + inspections
-
         clearing = self.asks_witnesses and inspections < FEWEST_TO_ASK  # else nobody might ever be cleared of a lie
 
         def decode(subset: Hypothesis) -> Asking[bool]:
