@@ -10,11 +10,11 @@ from itertools import chain
 import numpy as np
 
 from robosac.defenses.group_testing.differences import SAME_LIE_M, blame
-from robosac.defenses.group_testing.findings import UNHEARD, Findings, one_out
+from robosac.defenses.group_testing.findings import Findings, one_out
+from robosac.defenses.group_testing.fusions import UNHEARD
 from robosac.defenses.group_testing.lies import AUDIT_FRAMES, QUIET_FRAMES, Word
 from robosac.defenses.group_testing.model import CELLS, CLEAN
-from robosac.defenses.group_testing.objects import PLACED_SCORE, Lie
-from robosac.defenses.group_testing.placing import DOUBTED_M, misplaced
+from robosac.defenses.group_testing.objects import Lie
 from robosac.defenses.group_testing.straying import strays
 from robosac.defenses.protocol import Hypothesis
 
@@ -36,7 +36,7 @@ def conclude(found: Findings, answer: Hypothesis) -> None:
     """Who lied in this frame; the posterior learns it, and memory keeps it."""
     if found.hearing is None:
         return
-    _place(found, answer)
+    found.place(answer)
     blamed: dict[str, list[Lie]] = {name: [] for name in found.team}
     comparisons = _comparisons(found)
     heard = [name for name in found.team if name not in found.unheard]
@@ -194,35 +194,6 @@ def _straying(
         if memory.frame - found.lies.audited.get(name, -QUIET_FRAMES) >= QUIET_FRAMES:
             memory.straying.fade(name)
     return weights
-
-
-def _place(found: Findings, answer: Hypothesis) -> None:
-    """Learn whose messages are out of place as a whole, by the answer, or else by the largest fusion. Where the ego is
-    not where it says, all are.
-    """
-    if not found.shown:
-        return
-    everybody = found.heard().everybody
-    shown = found.shown.get(answer) or found.shown[max(found.shown, key=len)]
-    placed = shown.boxes[:, 5] >= PLACED_SCORE
-    supporting = shown.everybody.supporting[:, placed]
-    centres = everybody.sighting(shown.boxes[placed, :2], supporting).centre
-    heard = np.array([name not in found.unheard for name in everybody.agents])
-    far = misplaced(centres, supporting, everybody.origins, heard).tolist()
-    known = {name: by for name, by in zip(everybody.agents, far, strict=True) if not np.isnan(by)}
-    _place_ego(found, sorted(known.values()))
-    found.known.memory.placing.learn(known, found.team)
-
-
-def _place_ego(found: Findings, off: Sequence[float]) -> None:
-    """Learn whether the ego itself is not where it says, by how far ``off`` its teammates are, the least first. What
-    begins as if it were late is taken for that.
-    """
-    memory, doubted = found.known.memory, bool(off) and off[(len(off) - 1) // 2] >= DOUBTED_M
-    before = memory.placing.ego_astray
-    memory.placing.learn_ego(found.ego_off() if doubted else np.nan, differs=found.ego_differs)
-    if memory.placing.ego_astray and not before and (memory.ego_is_late or found.ego_late):
-        memory.placing.ego_astray = False
 
 
 def _doubt_ego(found: Findings, anything_wrong: bool) -> None:
