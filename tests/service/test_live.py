@@ -10,6 +10,7 @@ from types import SimpleNamespace
 import numpy as np
 import pytest
 
+from robosac.answers import Reason, RejectedTeammate
 from robosac.boxes import pairwise_iou
 from service.arriving.hanging_up import HangingUp
 from service.errors import Refused, StoreUnavailable
@@ -21,6 +22,7 @@ from service.viewing import feed as feeding
 from service.viewing.feed import Feed
 from service.viewing.shown import Seen
 from service.viewing.viewers import WAITING, Viewer
+from service.viewing.words import of_rejection
 from tests.service.conftest import TEAM, problem, serve
 from tests.service.credentials import KEY, OTHER_KEY, bearer
 from tests.test_site import Loaded
@@ -96,6 +98,14 @@ async def test_what_is_watched_is_what_was_answered(served, ego_message, attacke
     (named,) = [entry for entry in told["frames"][-1]["rejected"] if entry["vehicle_id"] == "car-2"]
     assert named["why"].startswith("named as an attacker")
     assert re.search(r"vehicles? invented.* times more likely", " ".join(named["evidence"]))
+
+
+@pytest.mark.parametrize(
+    ("evidence", "said"),
+    [({"misplaced_m": 0.91}, "out of place by 0.9 m"), ({"ego_astray": True}, "the ego itself is not where it says")],
+)
+def test_a_message_out_of_place_and_an_ego_astray_are_told(evidence, said):
+    assert said in of_rejection(RejectedTeammate(vehicle_id="car-2", reason=Reason.NOT_SAMPLED, **evidence))
 
 
 async def test_a_rejected_fusion_shows_what_was_not_answered(served, ego_message, attacked):

@@ -182,8 +182,6 @@ def _straying(
     would never be back where too few are left to ask it beside.
     """
     memory, weights = found.known.memory, dict[str, float]()
-    if memory.placing.ego_astray:
-        return weights
     for name, (joined, without) in asked.items():
         anew = memory.frame - found.lies.audited.get(name, -AUDIT_FRAMES) >= AUDIT_FRAMES
         by = strays(found.shown[joined], found.shown[without], name)

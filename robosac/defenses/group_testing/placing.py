@@ -183,5 +183,5 @@ class Placing:
     def from_state(cls, state: Mapping[str, Any]) -> Placing:
         """What `to_state` wrote; of nothing, as in the states of older versions, nothing is learned yet."""
         off = {str(name): float(far) for name, far in state.get("off", {}).items()}
-        ego = float(state.get("ego_off", EXPECTED_M)), bool(state.get("ego_astray", False))
-        return cls(off, frozenset(str(name) for name in state.get("out", ())), *ego)
+        out = frozenset(str(name) for name in state.get("out", ()))
+        return cls(off, out, float(state.get("ego_off", EXPECTED_M)), bool(state.get("ego_astray", False)))

@@ -10,9 +10,13 @@ from robosac.answers import Reason, Source, Verdict
 from robosac.attacks import load_campaign
 from robosac.boxes import pose_matrix
 from robosac.defenses import EGO
-from robosac.defenses.group_testing import GroupTestingSettings
+from robosac.defenses.group_testing import GroupTesting, GroupTestingSettings
+from robosac.defenses.group_testing.fusions import Fusions
+from robosac.defenses.group_testing.knowledge import Knowledge
 from robosac.defenses.group_testing.memory import Memory
 from robosac.defenses.group_testing.placing import (
+    EGO_MEAN_M,
+    EGO_ONCE_M,
     EXPECTED_M,
     FEWEST,
     MEAN_M,
@@ -23,13 +27,14 @@ from robosac.defenses.group_testing.placing import (
     ego_misplaced,
     misplaced,
 )
-from robosac.detectors import load
+from robosac.defenses.group_testing.posterior import Posterior
+from robosac.detectors import Message, load
 from robosac.evaluation.frames import encode_all
 from robosac.scenes import IntersectionScene
 from robosac.session import Session, defense_for
 from tests.robosac.defenses.group_testing.conversing import TEAM, run_frame
 from tests.robosac.defenses.group_testing.conversing import outcome as shown
-from tests.robosac.defenses.group_testing.one_place import DEFENSE, HONEST, LIAR, SEEN, World, nothing
+from tests.robosac.defenses.group_testing.one_place import DEFENSE, HONEST, LIAR, MODEL, SEEN, World, nothing
 from tests.robosac.testifying import saying
 
 AGENTS, VEHICLES = 6, 20
@@ -166,6 +171,21 @@ def test_what_is_usual_in_the_team_is_no_reason():
     assert alone.out == {LIAR}
 
 
+def test_an_ego_far_off_is_told_at_once_and_one_a_little_off_in_time():
+    def astray(*frames, differs=False):
+        placing = Placing()
+        for far in frames:
+            placing.learn_ego(far, differs=differs)
+        return placing.ego_astray
+
+    assert astray(1.01 * EGO_ONCE_M)
+    assert not astray(0.99 * EGO_ONCE_M)
+    assert astray(*[0.9 * EGO_ONCE_M] * 10)
+    assert not astray(*[0.98 * EGO_MEAN_M] * 100)
+    assert astray(np.nan, differs=True)
+    assert not astray(2.0, *[np.nan] * 3)
+
+
 def test_whoever_is_in_place_again_or_can_no_longer_be_placed_is_back():
     others = dict.fromkeys([name for name in TEAM if name != LIAR], 0.1)
     for back in ({LIAR: 0.1}, {}):
@@ -212,17 +232,27 @@ def test_who_is_out_of_place_is_left_out_while_it_is_and_not_suspected():
     assert LIAR in after[-1][0].accepted
 
 
+def test_while_the_ego_is_astray_everybody_is_excused_and_whole_fusions_tell_nothing():
+    for astray in (False, True):
+        memory = Memory(placing=Placing(ego_astray=astray))
+        known = Knowledge(MODEL, Posterior(len(MODEL.kinds), 0.5, 0.25, TEAM), memory)
+        assert Fusions(known, TEAM, ()).excused(LIAR) == astray
+        assert (memory.trust == 0.0) == astray
+
+
 class EgoAstray(World):
     """Some see all vehicles elsewhere than the ego, all in one place; what is fused shows them half-way."""
 
-    def __init__(self, off, who=TEAM, said=5.5):
+    def __init__(self, off, who=TEAM, said=(5.5,) * len(SEEN)):
         super().__init__({}, nothing)
-        says = {EGO: said, **dict.fromkeys(TEAM, 5.5)}
-        places = {name: [(x, y, value) for x, y in SEEN[:, :2]] for name, value in says.items()}
-        self.testimony = saying(places, seen={name: SEEN[:, :2] + [0, off] for name in who})
+        says = {EGO: said, **dict.fromkeys(TEAM, (5.5,) * len(SEEN))}
+        places = {name: [(x, y, L) for (x, y), L in zip(SEEN[:, :2], of, strict=True)] for name, of in says.items()}
+        offs = dict(zip(who, off if isinstance(off, tuple) else (off,) * len(who), strict=True))
+        self.testimony = saying(places, seen={name: SEEN[:, :2] + [0, by] for name, by in offs.items()})
 
 
-ASTRAY = [EgoAstray(1.0), EgoAstray(0.0, said=-2.0)]
+LEANING = (-2.0,) * len(SEEN)
+ASTRAY = [EgoAstray(1.0), EgoAstray(0.0, said=LEANING)]
 
 
 @pytest.mark.parametrize("world", ASTRAY, ids=["off", "differs"])
@@ -245,6 +275,27 @@ def test_some_who_differ_from_the_ego_and_others_do_not_put_it_in_doubt(who):
     met = EgoAstray(1.0, who).play(10, quiet=10)
     assert not any(decision.state["memory"]["placing"]["ego_astray"] for decision, _ in met)
     assert set(met[0][0].accepted) == set(TEAM) - set(who)
+
+
+@pytest.mark.parametrize(
+    "world",
+    [
+        EgoAstray(0.0, said=(*LEANING[:3], *(5.5,) * 5)),
+        EgoAstray((1.0, -1.0, 0.0, 2.0, -2.0), said=LEANING),
+        EgoAstray(0.0, said=(*LEANING[:2], *(0.0,) * 6)),
+    ],
+    ids=["it supports more", "they disagree", "of two"],
+)
+def test_an_ego_that_leans_against_some_vehicles_is_where_it_says(world):
+    met = world.play(4, quiet=10)
+    assert not any(decision.state["memory"]["placing"]["ego_astray"] for decision, _ in met)
+
+
+def test_whoever_turns_out_to_be_out_of_place_costs_no_pass_beyond_the_budget():
+    one = GroupTesting(MODEL, GroupTestingSettings(first_budget=1, budget=1, inspections=0))
+    met = Displaced().play(6, one, quiet=30)
+    assert all(len(tested) <= 1 for _, tested in met)
+    assert LIAR not in met[-1][0].accepted
 
 
 def test_who_turns_out_to_be_out_of_place_is_not_in_the_answer_of_that_frame():
@@ -321,8 +372,10 @@ def test_without_time_for_a_test_the_answer_goes_without_who_is_out_of_place():
     assert set(decision.accepted) == set(TEAM) - {LIAR}
 
 
-def played(campaign, frames=14, number=1700):
-    """Who is accepted in each frame of a validation scene with one attacker, and who is named."""
+def played(campaign, frames=14, number=1700, *, turned_from=None):
+    """Who is accepted in each frame of a validation scene with one attacker, and who is named. From some frame on the
+    ego's heading is wrong by 15 degrees.
+    """
     detector, scene = load(), IntersectionScene(number)
     ego, team = scene.egos[0], sorted(set(scene.agents) - {scene.egos[0]})
     session = Session(detector, team, defense_for(GroupTestingSettings(), detector.info), rng=np.random.default_rng(0))
@@ -330,6 +383,8 @@ def played(campaign, frames=14, number=1700):
     for index in range(frames):
         messages = encode_all(detector, scene.frame(index))
         mine = messages.pop(ego)
+        if turned_from is not None and index >= turned_from:
+            mine = Message(mine.pose @ pose_matrix(0, 0, 0, np.radians(15)), mine.tensors)
         lies = load_campaign(campaign).messages(detector, mine, messages, team[:1], index, np.random.default_rng(index))
         answer = session.answer(index, mine, {**messages, **lies})
         accepted.append(set(answer.accepted))
@@ -344,3 +399,9 @@ def test_a_pose_that_moves_off_slowly_is_found(campaign):
     assert all(team[0] not in of_frame for of_frame in accepted[20:])
     assert all(set(team[1:]) <= of_frame for of_frame in accepted[20:])
     assert not named
+
+
+def test_nobody_is_named_where_the_ego_turns_out_not_to_be_where_it_says():
+    _, accepted, named = played("honest", 12, 1704, turned_from=5)
+    assert not named
+    assert all(not of_frame for of_frame in accepted[7:])
