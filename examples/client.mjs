@@ -9,7 +9,8 @@ process.on('uncaughtException', (error) => {
   process.exit(1);
 });
 
-const [gateway = 'http://127.0.0.1:8000', frames = 3] = process.argv.slice(2);
+const [gateway = 'http://127.0.0.1:8000', frames = '3'] = process.argv.slice(2);
+if (!/^\d+$/.test(frames)) throw new Error(`the number of frames must be whole, not ${frames}`);
 
 /** A value as msgpack: maps, arrays, strings, binary and numbers are all that a frame needs. */
 function pack(value) {

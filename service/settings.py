@@ -157,7 +157,7 @@ class Settings(BaseSettings):
     audit_max_bytes_per_key: int = Field(
         2**38,
         ge=2**20,
-        le=2**60,
+        le=2**53 - 1,
         description="Logs of all sessions of one API key, ended ones too; beyond, it opens none and nobody joins.",
     )
     audit_full_every: int = Field(

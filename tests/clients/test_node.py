@@ -15,8 +15,8 @@ NODE = shutil.which("node")
 PROGRAM = Path(__file__).parents[2] / "examples" / "client.mjs"
 
 
-async def run(url, **environment):
-    command = [NODE, PROGRAM, url, "2"]
+async def run(url, frames="2", **environment):
+    command = [NODE, PROGRAM, url, frames]
     piped = {"stdout": asyncio.subprocess.PIPE, "stderr": asyncio.subprocess.PIPE}
     process = await asyncio.create_subprocess_exec(*command, env=os.environ | environment, **piped)
     out, errors = await asyncio.wait_for(process.communicate(), 60)
@@ -47,3 +47,11 @@ async def test_the_client_for_node_says_in_a_line_that_no_gateway_is_there():
     status, out, errors = await run("http://127.0.0.1:1")
     assert (status, out) == (1, "")
     assert re.fullmatch(r"fetch failed.*\n", errors)
+
+
+@pytest.mark.skipif(NODE is None, reason="needs node")
+@pytest.mark.parametrize("frames", ["two", "-1", "1.5", ""])
+async def test_the_client_for_node_refuses_a_number_of_frames_that_is_none(frames):
+    status, out, errors = await run("http://127.0.0.1:1", frames)
+    assert (status, out) == (1, "")
+    assert errors.strip() == f"the number of frames must be whole, not {frames}".strip()
