@@ -2,23 +2,27 @@
 that frames of several sessions share.
 
 A frame of ROBOSAC's sampling is one in which nothing is in consensus, so that all seven hypotheses are tested. Its
-messages begin and its boxes end on the processor. Times are wall-clock, taken turn by turn.
+messages begin and its boxes end on the processor. Times are wall-clock, taken turn by turn. The detector ``v2x-sim`` is
+one of that layout with weights and messages that are made up; its fusions have 2 to 9 boxes, and the ego alone 40.
 """
 
 import time
 from collections.abc import Callable, Mapping
 from functools import partial
 from itertools import chain, combinations, cycle, islice
-from typing import Annotated
+from typing import Annotated, Any
 
 import numpy as np
 import torch
 import typer
 from rich.console import Console
 from rich.table import Table
+from speed import v2xsim
 
 from robosac import SampleConsensus, fuse
-from robosac.detectors import DEFAULT_DETECTOR, load
+from robosac.consensus import compare
+from robosac.detectors import DEFAULT_DETECTOR, Message, load
+from robosac.detectors.base import split_precision
 from robosac.detectors.device import as_device
 from robosac.detectors.loading import warm_up
 from robosac.scenes import IntersectionScene
@@ -27,6 +31,7 @@ SIZES = (1, 2, 4, 8, 16, 32)
 DEFENSE = SampleConsensus(sampling_budget=7, collaborators=3, consensus_threshold=1.0)
 AT_ONCE = 8
 """The ego alone, and seven hypotheses."""
+MADE_UP = "v2x-sim"
 
 
 def in_turns(work: Mapping[str, Callable[[], object]], turns: int) -> dict[str, float]:
@@ -40,6 +45,19 @@ def in_turns(work: Mapping[str, Callable[[], object]], turns: int) -> dict[str, 
     return {name: float(np.median(of[1:])) for name, of in times.items()}
 
 
+def shown(detector: str) -> tuple[Any, Message, dict[str, Message]]:
+    """A detector, the message of an ego, and those of its teammates."""
+    plain, precision = split_precision(detector)
+    if plain == MADE_UP:
+        made_up, ego, messages = v2xsim.frame(v2xsim.CROWDED)
+        return made_up.in_precision(precision), ego, messages
+    loaded: Any = load(detector)
+    if not hasattr(loaded, "encode") or not hasattr(loaded, "worth"):
+        raise typer.BadParameter(f"{detector} makes no messages, or its frames decode one subset at a time")
+    messages = {name: loaded.encode(v.points, v.pose) for name, v in IntersectionScene(3).frame(0).views.items()}
+    return loaded, messages.pop("car-1"), messages
+
+
 def main(
     device: Annotated[str, typer.Option(help="By torch's name: cpu, cuda, cuda:1.")] = "cpu",
     detector: str = DEFAULT_DETECTOR,
@@ -49,13 +67,9 @@ def main(
     torch.set_num_threads(threads)
     try:
         as_device(device)
-        loaded = load(detector)
+        loaded, ego, messages = shown(detector)
     except ValueError as error:
         raise typer.BadParameter(str(error)) from error
-    if not hasattr(loaded, "encode") or not hasattr(loaded, "worth"):
-        raise typer.BadParameter(f"{detector} makes no messages, or its frames decode one subset at a time")
-    messages = {name: loaded.encode(v.points, v.pose) for name, v in IntersectionScene(3).frame(0).views.items()}
-    ego = messages.pop("car-1")
     placed = {worth: loaded.on_device(device, worth) for worth in (1, AT_ONCE)}
     for each in placed.values():
         warm_up(each)
@@ -63,7 +77,7 @@ def main(
     def frame(worth: int) -> None:
         fuse(placed[worth], DEFENSE, ego, messages, rng=np.random.default_rng(0))
 
-    prepared = placed[1].prepare(ego, messages)
+    prepared = placed[AT_ONCE].prepare(ego, messages)
     every = list(chain.from_iterable(combinations(messages, size) for size in range(len(messages) + 1)))
     batches = {str(size): list(islice(cycle(every), size)) for size in SIZES}
     frames = in_turns({"one by one": lambda: frame(1), f"{AT_ONCE} at once": lambda: frame(AT_ONCE)}, turns)
@@ -76,11 +90,23 @@ def main(
     shared = in_turns(sessions, turns)
     decodes |= in_turns({"1, not as a batch": lambda: prepared.detect(every[-1])}, turns)
 
+    parts = {
+        "prepared": lambda: placed[AT_ONCE].prepare(ego, messages),
+        "decoded": lambda: prepared.detect_all(batches[str(AT_ONCE)]),
+        "compared": lambda: [compare(boxes, boxes) for boxes in found[1:]],
+    }
+    found = prepared.detect_all(batches[str(AT_ONCE)])
+    stages = in_turns(parts, turns)
+
     console, face = Console(), placed[1].info
     console.print(f"{face.name} on {face.device}, {len(messages)} teammates, torch threads: {threads}")
     table = Table("a frame with seven hypotheses", "ms", "frames a second")
     for name, ms in frames.items():
         table.add_row(name, f"{ms:.2f}", f"{1e3 / ms:.1f}")
+    console.print(table)
+    table = Table(f"parts of it, {AT_ONCE} at once", "ms")
+    for name, ms in stages.items():
+        table.add_row(name, f"{ms:.2f}")
     console.print(table)
     table = Table("subsets decoded at once", "ms", "ms a subset")
     for name, ms in decodes.items():

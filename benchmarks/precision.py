@@ -1,7 +1,7 @@
-"""What a narrower precision changes: verdicts, boxes, average precision and testimony, and the time that they take.
+"""What a narrower precision, or another device, changes: verdicts, boxes, average precision, testimony, and their time.
 
-Every subset of teammates is decoded in float32 and in the narrower precision, in frames of validation scenes with one
-attacker of five, and compared with the ego's own boxes in the same precision.
+Every subset of teammates is decoded in float32 on the processor and in the narrower precision, in frames of validation
+scenes with one attacker of five, and compared with the ego's own boxes in the same precision.
 """
 
 import time
@@ -36,12 +36,15 @@ def main(
     scenes: Annotated[int, typer.Option(min=1)] = 20,
     frames: Annotated[int, typer.Option(min=1)] = 3,
     narrow: Precision = "bfloat16",
+    device: Annotated[str, typer.Option(help="Of the narrower precision, by torch's name: cpu, cuda, cuda:1.")] = "cpu",
 ) -> None:
-    precisions = ("float32", narrow)
     torch.set_num_threads(1)
     console = Console()
-    rivals = {precision: load(f"{detector}@{precision}") for precision in precisions}
-    wide = rivals["float32"]
+    wide = load(f"{detector}@float32")
+    rivals = {"float32, cpu": wide, f"{narrow}, {device}": load(f"{detector}@{narrow}", device)}
+    precisions = tuple(rivals)
+    if len(precisions) < 2:
+        raise typer.BadParameter("nothing to compare: choose another --narrow, or another --device")
     score = wide.info.consensus_score
     chosen = SOURCES.make(data).scenes(split)[:scenes]
     played = evaluation_frames(wide, chosen, frames, load_campaign(attack), 1, np.random.default_rng(0))

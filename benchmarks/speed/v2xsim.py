@@ -23,6 +23,8 @@ from robosac.detectors.v2xsim.network import GRID, LAYERS, V2XSimNetwork, publis
 OCCUPIED = 0.02
 THRESHOLD = 0.7
 AGENTS = 6
+CROWDED = 0.7
+"""The background's bias at which fusions of six messages of noise have 2 to 9 boxes, and the ego alone has 40."""
 PLAIN, PUBLISHED = "a hypothesis by the plain decoder", "a step of the published procedure"
 TEXT = f"""One hypothesis of the V2X-Sim layout: the decoder and the boxes it finds. *{PUBLISHED.capitalize()}* is the
 work that the published code does for one: it encodes the scans of six agents, warps the maps of the five others for
@@ -77,8 +79,8 @@ def part(turns: int) -> Part:
     return Part("A hypothesis of the V2X-Sim layout", TEXT, rows(times, PLAIN))
 
 
-def made_up(rng: np.random.Generator) -> dict[str, torch.Tensor]:
-    """Random weights with activations of a usual size; anchors score low."""
+def made_up(rng: np.random.Generator, background: float = 20.0) -> dict[str, torch.Tensor]:
+    """Random weights with activations of a usual size. Anchors score the lower, the larger the background's bias is."""
     state = {}
     for name, shape in published_shapes().items():
         if name.endswith("running_var") or (name.endswith("weight") and len(shape) == 1):
@@ -89,16 +91,16 @@ def made_up(rng: np.random.Generator) -> dict[str, torch.Tensor]:
             values = rng.normal(0.0, np.sqrt(2.0 / np.prod(shape[1:])), shape)
         state[name] = torch.from_numpy(values).float()
     bias = state["classification.conv2.bias"]
-    bias[::2] = 20.0
+    bias[::2] = background
     return state
 
 
-def frame() -> tuple[V2XSimDetector, Message, dict[str, Message]]:
+def frame(background: float = 20.0) -> tuple[V2XSimDetector, Message, dict[str, Message]]:
     """A detector with made-up weights, an ego's message, and those of five teammates."""
     rng = np.random.default_rng(0)
     with tempfile.TemporaryDirectory() as folder:
         path = Path(folder, "made-up.safetensors")
-        write_weights(made_up(rng), "mean", path)
+        write_weights(made_up(rng, background), "mean", path)
         detector = V2XSimDetector(path)
     specs = detector.info.tensors
     occupied = rng.random((LAYERS, GRID, GRID)) < OCCUPIED

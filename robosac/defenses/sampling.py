@@ -154,4 +154,4 @@ def _next_draws(
 
 def draw(team: Sequence[str], s: int, rng: np.random.Generator) -> Hypothesis:
     """A random subset of size ``s``, in team order."""
-    return tuple(team[i] for i in np.sort(rng.choice(len(team), s, replace=False)))
+    return tuple(team[i] for i in sorted(rng.choice(len(team), s, replace=False).tolist()))

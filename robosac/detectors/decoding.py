@@ -10,8 +10,9 @@ import torch
 from torch.nn import functional
 
 from robosac.boxes import FloatArray, IntArray, nms
-from robosac.detectors.device import CPU
 from robosac.detectors.network import HEAD
+from robosac.detectors.recorded import Tensors
+from robosac.detectors.suppression import Picked, brought_back, suppressed
 from robosac.detectors.voxels import AREA_M
 
 HEAD_CELL_M = 2 * AREA_M / HEAD
@@ -20,8 +21,8 @@ OWN_BODY_M = 2.0
 MAX_PEAKS = 200
 """Candidates before suppression: bounds the work that a flooded frame can cause."""
 NMS_IOU = 0.1
-Picked = tuple[IntArray, IntArray, FloatArray, FloatArray]
-"""Candidates: rows (k,), columns (k,), logits (k,) and codes (6, k), these as float32."""
+LOG_SIZES = -2.0, 4.0
+"""Bounds on the codes of length and width."""
 
 
 @lru_cache(maxsize=1)
@@ -62,9 +63,32 @@ def decode_all(logits: torch.Tensor, codes: torch.Tensor, score_threshold: float
     list of (k, 6) float64 ndarray
         x, y, length, width, yaw, score; best first.
     """
-    floor = float(np.log(score_threshold / (1 - score_threshold)))
-    pick = picked if logits.device == CPU else picked_there
-    return [_boxes(*candidates) for candidates in pick(logits, codes, floor)]
+    return [_kept(*candidates) for candidates in picked(logits, codes, _floor(score_threshold))]
+
+
+def found_there(logits: torch.Tensor, codes: torch.Tensor, score_threshold: float) -> Tensors:
+    """As `decode_all`, on an accelerator; `boxes_there` makes boxes of it."""
+    value, index, code = best_peaks(logits, codes, _floor(score_threshold))
+    x, y = code[..., 0] + _axis(index % HEAD), code[..., 1] + _axis(index // HEAD)
+    within = (torch.hypot(x, y) >= OWN_BODY_M) & (x.abs() <= AREA_M) & (y.abs() <= AREA_M)
+    length, width = code[..., 2:4].clip(*LOG_SIZES).exp().unbind(-1)
+    boxes = torch.stack([x, y, length, width, torch.atan2(code[..., 5], code[..., 4]) / 2], -1)
+    return suppressed(torch.where(within, value, -torch.inf), index, code, boxes, NMS_IOU)
+
+
+def boxes_there(found: Tensors) -> list[FloatArray]:
+    """The boxes of each map, of what `found_there` returns; they are made on the processor."""
+    return [_boxes(*picked) if done else _kept(*picked) for picked, done in brought_back(*found)]
+
+
+def _axis(cells: torch.Tensor) -> torch.Tensor:
+    """Where the centres of rows or columns are, metres."""
+    return HEAD_CELL_M * (cells + 0.5) - AREA_M
+
+
+def _floor(score_threshold: float) -> float:
+    """The logit that has this score."""
+    return float(np.log(score_threshold / (1 - score_threshold)))
 
 
 def peaks(logits: torch.Tensor, floor: float) -> torch.Tensor:
@@ -75,20 +99,11 @@ def peaks(logits: torch.Tensor, floor: float) -> torch.Tensor:
 def picked(logits: torch.Tensor, codes: torch.Tensor, floor: float) -> Iterator[Picked]:
     """The candidates of each map, on the processor: `best_peaks` takes longer there."""
     for candidate, value, code in zip(peaks(logits, floor).numpy(), logits.numpy(), codes.numpy(), strict=True):
-        row, column = np.nonzero(candidate)
-        if len(row) > MAX_PEAKS:
-            best = np.argpartition(-value[row, column].astype(np.float64), MAX_PEAKS)[:MAX_PEAKS]
-            row, column = row[best], column[best]
-        yield row, column, value[row, column], code[:, row, column]
-
-
-def picked_there(logits: torch.Tensor, codes: torch.Tensor, floor: float) -> Iterator[Picked]:
-    """The candidates of each map, on an accelerator: no others leave it."""
-    for value, index, code in zip(*(each.cpu().numpy() for each in best_peaks(logits, codes, floor)), strict=True):
-        ascending = np.argsort(index)
-        chosen = ascending[value[ascending] >= floor]
-        row, column = np.divmod(index[chosen], HEAD)
-        yield row, column, value[chosen], code[:, chosen]
+        index = np.flatnonzero(candidate)
+        if len(index) > MAX_PEAKS:
+            index = index[np.argpartition(-value.flat[index].astype(np.float64), MAX_PEAKS)[:MAX_PEAKS]]
+        row, column = np.divmod(index, HEAD)
+        yield index, value[row, column], code[:, row, column].T
 
 
 def best_peaks(
@@ -103,17 +118,26 @@ def best_peaks(
     logits : (n, k) tensor
         Minus infinity where a cell is no candidate.
     index : (n, k) tensor
-    codes : (n, 6, k) tensor
+    codes : (n, k, 6) tensor
     """
     best, index = torch.where(peaks(logits, floor), logits, -torch.inf).flatten(1).topk(MAX_PEAKS)
-    return best, index, codes.flatten(2).gather(2, index[:, None].expand(-1, codes.shape[1], -1))
+    return best, index, codes.flatten(2).gather(2, index[:, None].expand(-1, codes.shape[1], -1)).mT
 
 
-def _boxes(row: IntArray, column: IntArray, values: FloatArray, code: FloatArray) -> FloatArray:
-    values, code = values.astype(np.float64), code.astype(np.float64)
+def _kept(index: IntArray, values: FloatArray, codes: FloatArray) -> FloatArray:
+    boxes = _boxes(index, values, codes)
+    inside = (np.hypot(boxes[:, 0], boxes[:, 1]) >= OWN_BODY_M) & (np.abs(boxes[:, :2]) <= AREA_M).all(axis=1)
+    boxes = boxes[inside]
+    kept: FloatArray = boxes[nms(boxes, boxes[:, 5], NMS_IOU)]
+    return kept
+
+
+def _boxes(index: IntArray, values: FloatArray, codes: FloatArray) -> FloatArray:
+    values, code = values.astype(np.float64), codes.T.astype(np.float64)
+    row, column = np.divmod(index, HEAD)
     xs, ys = cell_centres()
-    size = np.exp(np.clip(code[2:4], -2.0, 4.0))
-    boxes = np.column_stack(
+    size = np.exp(np.clip(code[2:4], *LOG_SIZES))
+    return np.column_stack(
         [
             xs[row, column] + code[0],
             ys[row, column] + code[1],
@@ -123,7 +147,3 @@ def _boxes(row: IntArray, column: IntArray, values: FloatArray, code: FloatArray
             1 / (1 + np.exp(-np.clip(values, -60.0, 60.0))),
         ]
     )
-    inside = (np.hypot(boxes[:, 0], boxes[:, 1]) >= OWN_BODY_M) & (np.abs(boxes[:, :2]) <= AREA_M).all(axis=1)
-    boxes = boxes[inside]
-    kept: FloatArray = boxes[nms(boxes, boxes[:, 5], NMS_IOU)]
-    return kept

@@ -42,12 +42,14 @@ def stacked(arrays: Sequence[np.ndarray[Any, np.dtype[Any]]], device: torch.devi
     They go up in their own type, at once, and are widened there. Torch widens half floats several times faster than
     numpy. To add maps of unlike layouts takes far longer, hence the C order.
     """
-    return _gone_up(arrays, device).float()
+    return gone_up(arrays, device).float()
 
 
 def by_cell(maps: Sequence[np.ndarray[Any, np.dtype[Any]]], device: torch.device = CPU) -> torch.Tensor:
     """Maps (C, H, W) as `stacked`, (n, C, H, W), but with the channels of a cell side by side in memory."""
-    sent = _gone_up(maps, device)
+    sent = gone_up(maps, device)
+    if device != CPU:
+        return sent.float().contiguous(memory_format=torch.channels_last)
     count, channels, *size = sent.shape
     cells = torch.empty((count, *size, channels), dtype=torch.float32, device=device)
     for each, of in zip(cells.flatten(1, 2), sent.flatten(2), strict=True):
@@ -55,7 +57,7 @@ def by_cell(maps: Sequence[np.ndarray[Any, np.dtype[Any]]], device: torch.device
     return cells.permute(0, 3, 1, 2)
 
 
-def _gone_up(arrays: Sequence[np.ndarray[Any, np.dtype[Any]]], device: torch.device) -> torch.Tensor:
+def gone_up(arrays: Sequence[np.ndarray[Any, np.dtype[Any]]], device: torch.device = CPU) -> torch.Tensor:
     """Arrays together on a device, in their own type and in C order."""
     pinned = device.type == "cuda"  # so that nothing waits for them to arrive
     dtype = torch.from_numpy(np.empty(0, arrays[0].dtype)).dtype

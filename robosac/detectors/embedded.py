@@ -21,9 +21,11 @@ from robosac.detectors.base import (
     in_precision,
     witness_beside,
 )
-from robosac.detectors.decoding import cell_centres, decode_all
+from robosac.detectors.decoding import boxes_there, cell_centres, decode_all, found_there
+from robosac.detectors.device import CPU
 from robosac.detectors.map_fusion import FEATURES, Decode, Heads, MapFusionDetector, Maps, combined
 from robosac.detectors.network import CHANNELS, MAP, FastDecoder, MeanFusionNetwork, fold_batchnorm
+from robosac.detectors.recorded import Recorded, Tensors
 from robosac.detectors.voxels import AREA_M, occupancy
 from robosac.detectors.weights_file import WeightsError, read_weights
 
@@ -109,6 +111,7 @@ class EmbeddedDetector(MapFusionDetector):
     def place(self) -> None:
         """As `MapFusionDetector.place`."""
         self._placed = FastDecoder(self._narrow).to(self.device)
+        self._found = Recorded(self._found_there)
 
     def encode(self, points: FloatArray, pose: FloatArray) -> Message:
         """As `robosac.detectors.base.Encoder.encode`; the z of the pose is the sensor's height above ground, metres."""
@@ -140,8 +143,16 @@ class EmbeddedDetector(MapFusionDetector):
 
     def find(self, fused: torch.Tensor, contexts: Sequence[None]) -> list[FloatArray]:  # noqa: ARG002
         """Boxes as `decode_all` makes them."""
+        if self.device == CPU:
+            return decode_all(*self._heads(fused), self._score_threshold)
+        return boxes_there((self._found if len(fused) <= self.worth else self._found_there)(fused))
+
+    def _heads(self, fused: torch.Tensor) -> tuple[torch.Tensor, torch.Tensor]:
         logits, codes = self._placed.decode(fused.to(self._dtype))
-        return decode_all(logits.float(), codes.float(), self._score_threshold)
+        return logits.float(), codes.float()
+
+    def _found_there(self, fused: torch.Tensor) -> Tensors:
+        return found_there(*self._heads(fused), self._score_threshold)
 
     def places(self, codes: torch.Tensor) -> torch.Tensor:
         """Boxes (64, 64, 6) of all cells."""

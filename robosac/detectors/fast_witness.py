@@ -17,7 +17,8 @@ import torch
 from torch.nn import functional
 
 from robosac.detectors.base import Message, Precision
-from robosac.detectors.device import stacked
+from robosac.detectors.device import gone_up
+from robosac.detectors.recorded import Recorded, Tensors
 from robosac.detectors.witness_network import DILATIONS, WIDTH, Layout, WitnessNetwork, told
 from robosac.testimony import LAYERS
 
@@ -37,6 +38,7 @@ class FastWitness:
         self._layout = layout
         self._dtype = dtype = getattr(torch, precision)
         self._device = network.read.weight.device
+        self._said = Recorded(self._say)
         with torch.no_grad():
             read = network.read.weight[:, :, 0, 0].T / layout.scale
             place: torch.Tensor = network.place(layout.geometry([0.0], self._device))
@@ -57,9 +59,12 @@ class FastWitness:
 
     def read(self, messages: Sequence[Message]) -> torch.Tensor:
         """Testimony (n, LAYERS, H, u, W, u): what `WitnessNetwork` gives, before the sides of a map are joined."""
+        sent = gone_up([message.tensors[self._layout.tensor] for message in messages], self._device)
+        return self._said(sent, told([float(message.pose[2, 3]) for message in messages], self._device))[0]
+
+    def _say(self, sent: torch.Tensor, heights: torch.Tensor) -> Tensors:
         layout, u = self._layout, self._layout.upsampling
-        sent = stacked([message.tensors[layout.tensor] for message in messages], self._device).flatten(2)
-        heights = told([float(message.pose[2, 3]) for message in messages], self._device)
+        sent = sent.float().flatten(2)
         hidden = torch.bmm(sent.mT, self._read.expand(len(sent), -1, -1)).flatten(1)
         hidden.add_(self._place).addmm_(heights[:, None], self._height).relu_()
         cells = hidden.view(-1, layout.height, layout.width, WIDTH)
@@ -68,4 +73,4 @@ class FastWitness:
             maps = functional.conv2d(maps, weight, bias, 1, dilation, dilation).relu_().add_(maps)
         # all places of a layer side by side, as they are wanted
         said = torch.addmm(self._head[0], self._head[1], maps.permute(0, 2, 3, 1).flatten(0, 2).float().T)
-        return said.view(LAYERS, u, u, -1, layout.height, layout.width).permute(3, 0, 4, 1, 5, 2)
+        return (said.view(LAYERS, u, u, -1, layout.height, layout.width).permute(3, 0, 4, 1, 5, 2),)

@@ -85,8 +85,9 @@ def warm_up(detector: Preparer) -> None:
                 raise DetectorError(f"prepare must return a frame to detect in, got a {type(prepared).__name__}")
             check_boxes(prepared.detect())
             check_boxes(prepared.detect(["a", "b"]))
-            if isinstance(prepared, Batching) and prepared.worth > 1:
-                prepared.detect_all([["a", "b"]] * prepared.worth)
+            if isinstance(prepared, Batching):
+                for size in range(2, prepared.worth + 1):
+                    prepared.detect_all([["a", "b"]] * size)
     except DetectorError as error:
         raise DetectorError(f"{detector.info.name}: {error}") from error
     except Exception as error:  # the user's code may raise anything

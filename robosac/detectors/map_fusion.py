@@ -119,12 +119,18 @@ class MapFusionDetector(ABC):
 
     def laid(self, ego: Message, teammates: Sequence[Message]) -> Iterator[torch.Tensor]:
         """Maps (C, H, W) of teammates as they lie in the ego's frame."""
+        if self.device != CPU:
+            maps = by_cell(_features(teammates), self.device)
+            return iter(warp(maps, self.matrices(ego, teammates).to(self.device)) / self.gain)
+        return self._laid_here(ego, teammates)
+
+    def _laid_here(self, ego: Message, teammates: Sequence[Message]) -> Iterator[torch.Tensor]:
         height, width = teammates[0].tensors[FEATURES].shape[1:]
-        cells, shares = (each.to(self.device) for each in corners(self._matrices(ego, teammates), height, width))
+        cells, shares = corners(self._matrices(ego, teammates), height, width)
         shares /= self.gain
         for first in range(0, len(teammates), AT_ONCE):
             some = slice(first, first + AT_ONCE)
-            yield from gathered(by_cell(_features(teammates[some]), self.device), cells[some], shares[some])
+            yield from gathered(by_cell(_features(teammates[some])), cells[some], shares[some])
 
     def attack_surface(self, ego: Message, teammates: Mapping[str, Message]) -> MapSurface:
         """Show a frame to an attacker."""

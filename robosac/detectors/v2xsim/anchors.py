@@ -19,7 +19,8 @@ import numpy as np
 import torch
 
 from robosac.boxes import FloatArray, IntArray, nms
-from robosac.detectors.device import CPU
+from robosac.detectors.recorded import Tensors
+from robosac.detectors.suppression import Picked, brought_back, suppressed
 from robosac.detectors.v2xsim.network import ANCHORS, GRID
 from robosac.detectors.v2xsim.voxels import AREA_M, CELL_M
 
@@ -30,9 +31,6 @@ MAX_CANDIDATES = 1000
 """Best anchors that are decoded: bounds the work that a flooded frame (393,216 candidates) can cause."""
 MAX_LOG_SIZE = 8.0
 """Bound on the codes of w and h, so that no message makes a box of infinite size."""
-
-Picked = tuple[IntArray, FloatArray, FloatArray]
-"""Candidates by ascending number: numbers (k,), logits (k,) and codes (k, 6), as float32."""
 
 _LEAST_SQUARE = 1e-12
 _SIZES_M = ((2.0, 4.0), (3.0, 12.0))
@@ -92,19 +90,21 @@ def to_lidar(boxes: FloatArray) -> FloatArray:
     return np.column_stack([-x, y, h * norm, w * norm, np.arctan2(cosine, -sine)])
 
 
-def geometry(codes: torch.Tensor) -> torch.Tensor:
-    """The box of every anchor as an attacker sees it, differentiable.
+def geometry(codes: torch.Tensor, anchors: torch.Tensor | None = None) -> torch.Tensor:
+    """The boxes of anchors as an attacker sees them, differentiable.
 
     Parameters
     ----------
-    codes : (393216, 6) tensor
+    codes : (n, 6) tensor
+    anchors : (n, 6) tensor, optional
+        By default all 393216.
 
     Returns
     -------
-    (393216, 6) tensor
+    (n, 6) tensor
         x, y, log length, log width, cos and sin of twice the yaw, of the box that `decode` and `to_lidar` make.
     """
-    anchors = _all_anchors()
+    anchors = _all_anchors(codes.device) if anchors is None else anchors
     log_size = anchors[:, 2:4].log() - codes[:, 2:4].clamp(-MAX_LOG_SIZE, MAX_LOG_SIZE)
     centre = anchors[:, :2] - log_size.exp() * codes[:, :2]
     sin_a, cos_a, sin_p, cos_p = anchors[:, 4], anchors[:, 5], codes[:, 4], codes[:, 5]
@@ -122,10 +122,11 @@ def geometry(codes: torch.Tensor) -> torch.Tensor:
     return torch.stack(columns, dim=1)
 
 
-@lru_cache(maxsize=1)
-def _all_anchors() -> torch.Tensor:
+@lru_cache(maxsize=4)
+def _all_anchors(device: torch.device) -> torch.Tensor:
     """Every anchor, (393216, 6), float32."""
-    return torch.from_numpy(anchor_boxes(np.arange(GRID * GRID * ANCHORS))).float()
+    with torch.inference_mode(False):  # whoever wants gradients may use them later
+        return torch.from_numpy(anchor_boxes(np.arange(GRID * GRID * ANCHORS))).float().to(device)
 
 
 class Indexed(Protocol):
@@ -167,18 +168,46 @@ def detections_of_each(
     anchor : (n,) int64 ndarray
         The anchor that each comes from.
     """
-    floor = math.log(score_threshold / (1 - score_threshold))
-    pick = picked if logits.device == CPU else picked_there
-    return [_kept(*candidates) for candidates in pick(logits, codes, floor)]
+    return [_kept(*candidates) for candidates in picked(logits, codes, _floor(score_threshold))]
+
+
+def found_there(logits: torch.Tensor, codes: Indexed, score_threshold: float = SCORE_THRESHOLD) -> Tensors:
+    """As `detections_of_each`, on an accelerator; `detections_there` makes boxes of it."""
+    margin, index, code = best_anchors(logits, codes, _floor(score_threshold))
+    margin = torch.where(code.isfinite().all(2), margin, -torch.inf)
+    anchors = _all_anchors(index.device)[index.flatten()]
+    x, y, log_length, log_width, cosine, sine = geometry(code.flatten(0, 1), anchors).unbind(1)
+    boxes = torch.stack([x, y, log_length.exp(), log_width.exp(), torch.atan2(sine, cosine) / 2], 1)
+    return suppressed(margin, index, code, boxes.view(*index.shape, -1), NMS_IOU)
+
+
+def detections_there(found: Tensors) -> list[FloatArray]:
+    """The boxes of each map, of what `found_there` returns; they are made on the processor."""
+    parts = list(brought_back(*found))
+    done = [picked for picked, is_done in parts if is_done]
+    boxes: Iterator[FloatArray] = iter(())
+    if done:
+        ends = np.cumsum([len(index) for index, _, _ in done])[:-1]
+        boxes = iter(np.split(_boxes(*map(np.concatenate, zip(*done, strict=True))), ends))
+    return [next(boxes) if is_done else _kept(*picked)[0] for picked, is_done in parts]
+
+
+def _floor(score_threshold: float) -> float:
+    """The logit that has this score."""
+    return math.log(score_threshold / (1 - score_threshold))
 
 
 def _kept(index: IntArray, margin: FloatArray, code: FloatArray) -> tuple[FloatArray, IntArray]:
     sound = np.isfinite(code).all(axis=1)  # a message of enormous numbers may overflow single precision
     index, margin, code = index[sound], margin[sound], code[sound]
-    boxes = to_lidar(decode(anchor_boxes(index), code))
-    score = 1 / (1 + np.exp(-margin.astype(np.float64)))
+    boxes = _boxes(index, margin, code)
     kept = nms(boxes, margin, NMS_IOU)
-    return np.column_stack([boxes, score])[kept], index[kept]
+    return boxes[kept], index[kept]
+
+
+def _boxes(index: IntArray, margin: FloatArray, code: FloatArray) -> FloatArray:
+    score = 1 / (1 + np.exp(-margin.astype(np.float64)))
+    return np.column_stack([to_lidar(decode(anchor_boxes(index), code)), score])
 
 
 def picked(logits: torch.Tensor, codes: Indexed, floor: float) -> Iterator[Picked]:
@@ -188,14 +217,6 @@ def picked(logits: torch.Tensor, codes: Indexed, floor: float) -> Iterator[Picke
         if len(index) > MAX_CANDIDATES:
             index = np.sort(index[np.argpartition(-margin[index], MAX_CANDIDATES)[:MAX_CANDIDATES]])
         yield index, margin[index], codes[torch.from_numpy(index + i * len(margin))].numpy()
-
-
-def picked_there(logits: torch.Tensor, codes: Indexed, floor: float) -> Iterator[Picked]:
-    """The candidates of each map, on an accelerator: no others leave it."""
-    for margin, index, code in zip(*(each.cpu().numpy() for each in best_anchors(logits, codes, floor)), strict=True):
-        ascending = np.argsort(index)
-        chosen = ascending[margin[ascending] > floor]
-        yield index[chosen], margin[chosen], code[chosen]
 
 
 def best_anchors(logits: torch.Tensor, codes: Indexed, floor: float) -> tuple[torch.Tensor, torch.Tensor, torch.Tensor]:

@@ -25,9 +25,16 @@ from robosac.detectors.base import (
     in_precision,
     witness_beside,
 )
-from robosac.detectors.device import CPU, stacked
+from robosac.detectors.device import CPU, gone_up, stacked
 from robosac.detectors.map_fusion import FEATURES, Decode, Heads, MapFusionDetector, Maps, combined
-from robosac.detectors.v2xsim.anchors import SCORE_THRESHOLD, detections_of_each, geometry
+from robosac.detectors.recorded import Recorded, Tensors
+from robosac.detectors.v2xsim.anchors import (
+    SCORE_THRESHOLD,
+    detections_of_each,
+    detections_there,
+    found_there,
+    geometry,
+)
 from robosac.detectors.v2xsim.fast import Context, FastDecoder, of_all
 from robosac.detectors.v2xsim.network import CHANNELS, MAP, V2XSimNetwork, select_published
 from robosac.detectors.v2xsim.voxels import AREA_M, PACKED_SHAPE, occupancy, pack, unpack
@@ -135,6 +142,7 @@ class V2XSimDetector(MapFusionDetector):
     def place(self) -> None:
         """As `MapFusionDetector.place`."""
         self._fast = FastDecoder(self._network, self.info.precision, self.device)
+        self._begun, self._found = Recorded(self._begun_there), Recorded(self._found_there)
 
     def encode(self, points: FloatArray, pose: FloatArray) -> Message:
         """As `robosac.detectors.base.Encoder.encode`; returns from 3 m below to 2 m above the sensor count."""
@@ -161,7 +169,7 @@ class V2XSimDetector(MapFusionDetector):
 
     def decoder(self, ego: Message, own: torch.Tensor) -> Decode:
         """Logits (393216,) and codes (393216, 6) of all anchors; the decoder's part that is the ego's own, once."""
-        context = self._network.context(_grid(ego), own[None])
+        context = self._network.context(_unpacked(gone_up([ego.tensors[_GRID]])), own[None])
 
         def decode(maps: Maps) -> Heads:
             logits, codes = self._network.decode(self.fused(maps)[None], context)
@@ -171,23 +179,36 @@ class V2XSimDetector(MapFusionDetector):
 
     def context(self, ego: Message, own: torch.Tensor) -> Context:
         """The decoder's part that is the ego's own."""
-        return self._fast.context(_grid(ego, self.device), own[None])
+        packed = gone_up([ego.tensors[_GRID]], self.device)
+        if self.device == CPU:
+            return self._begun_there(packed, own[None])
+        return tuple(each.clone() for each in self._begun(packed, own[None]))
+
+    def _begun_there(self, packed: torch.Tensor, own: torch.Tensor) -> Context:
+        return self._fast.context(_unpacked(packed), own)
 
     def find(self, fused: torch.Tensor, contexts: Sequence[Context]) -> list[FloatArray]:
         """Boxes by the fast decoder, in this detector's precision."""
-        logits, codes = self._fast.decode(fused, of_all(contexts))
-        return [boxes for boxes, _ in detections_of_each(logits, codes, self._score_threshold)]
+        context = of_all(contexts)
+        if self.device == CPU:
+            found = detections_of_each(*self._fast.decode(fused, context), self._score_threshold)
+            return [boxes for boxes, _ in found]
+        few_of_one = len(fused) <= self.worth and len(context[0]) == 1
+        return detections_there((self._found if few_of_one else self._found_there)(fused, *context))
+
+    def _found_there(self, fused: torch.Tensor, *context: torch.Tensor) -> Tensors:
+        return found_there(*self._fast.decode(fused, context), self._score_threshold)
 
     def places(self, codes: torch.Tensor) -> torch.Tensor:
         """Boxes (393216, 6) of all anchors."""
         return geometry(codes)
 
 
-def _grid(ego: Message, device: torch.device = CPU) -> torch.Tensor:
-    """The ego's occupancy, as the network takes it."""
-    return _as_maps(unpack(ego.tensors[_GRID]), device)
+def _unpacked(packed: torch.Tensor) -> torch.Tensor:
+    """Grids packed as bits (n, 256, 416), as the network takes them (n, 13, 256, 256)."""
+    return unpack(packed).permute(0, 3, 1, 2).float()
 
 
-def _as_maps(grid: BoolArray, device: torch.device = CPU) -> torch.Tensor:
+def _as_maps(grid: BoolArray) -> torch.Tensor:
     """A grid (256, 256, 13) as the network takes it (1, 13, 256, 256)."""
-    return stacked([grid], device).permute(0, 3, 1, 2)
+    return stacked([grid]).permute(0, 3, 1, 2)

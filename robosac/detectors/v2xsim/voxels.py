@@ -10,6 +10,7 @@ from __future__ import annotations
 from typing import Any
 
 import numpy as np
+import torch
 
 from robosac.boxes import BoolArray, FloatArray
 from robosac.detectors.v2xsim.network import GRID, LAYERS
@@ -91,6 +92,7 @@ def pack(grid: BoolArray) -> ByteArray:
     return np.packbits(grid.reshape(GRID, -1), axis=1)
 
 
-def unpack(packed: ByteArray) -> BoolArray:
-    """The grid of packed bits (256, 416)."""
-    return np.unpackbits(packed, axis=1).reshape(GRID, GRID, LAYERS).astype(np.bool_)
+def unpack(packed: torch.Tensor) -> torch.Tensor:
+    """The grids (n, 256, 256, 13), 0 or 1 as uint8, of packed bits (n, 256, 416), uint8."""
+    bits = packed[..., None] >> torch.arange(7, -1, -1, dtype=torch.uint8, device=packed.device) & 1
+    return bits.reshape(-1, GRID, GRID, LAYERS)

@@ -29,7 +29,7 @@ def test_a_frame_is_prepared_and_decoded_there(fusion, published_state, tmp_path
     # how many rows one multiplies, and in which order one sums, changes how it is rounded
     for one, another, and_here, right in zip(found, at_once, here.detect_all(SUBSETS), expected, strict=True):
         for boxes in (one, another, and_here):
-            np.testing.assert_allclose(boxes, right, atol=2e-4)
+            np.testing.assert_allclose(boxes, right, rtol=1e-5, atol=1e-3)
 
 
 @pytest.mark.parametrize("fusion", ["mean", "max"])
@@ -47,7 +47,7 @@ def test_frames_of_several_egos_are_decoded_at_once(fusion, published_state, tmp
     assert [len(of_frame) for of_frame in found] == [3, 1, 1]
     for frame, asked, boxes in zip(here, subsets, found, strict=True):
         for subset, of_subset in zip(asked, boxes, strict=True):
-            np.testing.assert_allclose(of_subset, frame.detect(subset), atol=2e-4)
+            np.testing.assert_allclose(of_subset, frame.detect(subset), rtol=1e-5, atol=1e-3)
 
 
 @pytest.mark.parametrize("fusion", ["mean", "sum"])
@@ -57,18 +57,19 @@ def test_what_overflows_in_one_message_spoils_no_fusion_without_it(fusion, publi
     prepared = load(path).prepare(team[0], {f"car-{k}": message for k, message in enumerate(team[1:3])})
     prepared.warped["car-0"] = torch.full_like(prepared.warped["car-0"], torch.inf)
     spoilt, sound = prepared.detect_all([("car-0", "car-1"), ("car-1",)])
-    np.testing.assert_allclose(sound, prepared.detect(("car-1",)), atol=2e-4)
+    np.testing.assert_allclose(sound, prepared.detect(("car-1",)), rtol=1e-5, atol=1e-3)
     assert np.isfinite(spoilt).all()
 
 
-@pytest.mark.parametrize("candidates", [0, 40, 5000])
-def test_the_same_anchors_are_found_there(candidates, rng):
+@pytest.mark.parametrize("candidates", [0, 40, 256, 5000])
+def test_the_same_boxes_are_made_of_what_is_found_there(candidates, rng):
     logits = torch.from_numpy(rng.normal(-5, 0.5, (2, ANCHORS)).astype(np.float32))
     logits[1, torch.from_numpy(rng.choice(ANCHORS, candidates, replace=False))] = torch.linspace(1, 9, candidates)
     logits[0, 7:5000] = torch.nan
     codes = torch.from_numpy(rng.normal(0, 1, (2 * ANCHORS, 6)).astype(np.float32))
-    found = list(anchors.picked_there(logits, codes, 0.5))
-    for there, here in zip(found, anchors.picked(logits, codes, 0.5), strict=True):
-        for one, other in zip(there, here, strict=True):
-            np.testing.assert_array_equal(one, other)
-    assert len(found[1][0]) == min(candidates, anchors.MAX_CANDIDATES)
+    codes[ANCHORS + int(logits[1].argmax())] = torch.inf
+    found = anchors.detections_there(anchors.found_there(logits, codes, 0.7))
+    expected = anchors.detections_of_each(logits, codes, 0.7)
+    for there, (here, _) in zip(found, expected, strict=True):
+        np.testing.assert_array_equal(there, here)
+    assert (len(found[1]) > 0) == (candidates > 0)

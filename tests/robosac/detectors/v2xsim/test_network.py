@@ -105,7 +105,7 @@ def test_logits_and_codes_are_the_published_ones(case, teammates, attacked, v2xs
             bound = float(parity["eps"])
             maps[attacker] = maps[attacker] + perturbation[attacker].clamp(-bound, bound).flip(1)
     own = torch.from_numpy(team[EGO].tensors["features"])
-    grid = unpack(team[EGO].tensors["grid"]).transpose(2, 0, 1).astype(np.float32)
+    grid = unpack(torch.from_numpy(team[EGO].tensors["grid"]))[0].permute(2, 0, 1).numpy().astype(np.float32)
     with torch.inference_mode():
         context = network.context(torch.from_numpy(grid)[None], own[None])
         fused = v2xsim._fusion(torch.stack([own, *(maps[k] for k in teammates)]), dim=0)
