@@ -145,7 +145,7 @@ class EmbeddedDetector(MapFusionDetector):
         """Boxes as `decode_all` makes them."""
         if self.device == CPU:
             return decode_all(*self._heads(fused), self._score_threshold)
-        return boxes_there((self._found if len(fused) <= self.worth else self._found_there)(fused))
+        return boxes_there(self._found(fused))
 
     def _heads(self, fused: torch.Tensor) -> tuple[torch.Tensor, torch.Tensor]:
         logits, codes = self._placed.decode(fused.to(self._dtype))

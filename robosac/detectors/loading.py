@@ -14,8 +14,10 @@ from robosac.detectors.base import (
     Batching,
     Detector,
     DetectorError,
+    Joining,
     Placeable,
     Precise,
+    PreparedFrame,
     Preparer,
     blank,
     check_boxes,
@@ -24,6 +26,7 @@ from robosac.detectors.base import (
 from robosac.detectors.declared import check_info
 from robosac.detectors.device import CPU, as_device
 from robosac.detectors.embedded import EmbeddedDetector
+from robosac.detectors.recorded import MOST
 from robosac.detectors.weights_file import WeightsError, read_weights
 from robosac.faults import describe
 from robosac.plugins import Kind, classes
@@ -85,9 +88,8 @@ def warm_up(detector: Preparer) -> None:
                 raise DetectorError(f"prepare must return a frame to detect in, got a {type(prepared).__name__}")
             check_boxes(prepared.detect())
             check_boxes(prepared.detect(["a", "b"]))
-            if isinstance(prepared, Batching):
-                for size in range(2, prepared.worth + 1):
-                    prepared.detect_all([["a", "b"]] * size)
+            if isinstance(prepared, Batching) and prepared.worth > 1:
+                _warm_up_batches(prepared, detector.prepare(ego, {"a": teammate, "b": teammate}))
     except DetectorError as error:
         raise DetectorError(f"{detector.info.name}: {error}") from error
     except Exception as error:  # the user's code may raise anything
@@ -96,6 +98,16 @@ def warm_up(detector: Preparer) -> None:
         at = extract_tb(error.__traceback__)[-1]
         said = f"{describe(error)} ({Path(at.filename).name}, line {at.lineno})"
         raise DetectorError(f"{detector.info.name} cannot answer a frame of zeros: {said}") from error
+
+
+def _warm_up_batches(prepared: Batching, another: PreparedFrame) -> None:
+    """Decode as many subsets at once as one frame may want, or several."""
+    sizes, subset = range(2, prepared.worth + 1), ["a", "b"]
+    for size in sizes:
+        prepared.detect_all([subset] * size)
+    if isinstance(prepared, Joining):
+        for size in (*sizes, *(2**power for power in range(prepared.worth.bit_length(), MOST.bit_length()))):
+            prepared.detect_together([(prepared, [subset] * (size - 1)), (another, [subset])])
 
 
 def _load(detector: str) -> Detector:

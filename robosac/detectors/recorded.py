@@ -9,10 +9,14 @@ import torch
 
 Tensors = tuple[torch.Tensor, ...]
 Function = Callable[..., Tensors]
+EACH = 8
+"""Up to so many rows there is a recording for each number of them; beyond, for each power of two."""
+MOST = 64
+"""Rows of the largest recording; more are computed without one."""
 
 
 class Recorded:
-    """A function of tensors, recorded as a CUDA graph for each shape of its arguments; elsewhere it is just called.
+    """A function of tensors, recorded as CUDA graphs; elsewhere it is just called.
 
     Which kernels it starts may depend on shapes only, and nothing in it may wait for the device or come from the
     processor. What it returns is overwritten by the next call.
@@ -20,7 +24,8 @@ class Recorded:
     Parameters
     ----------
     function : callable
-        From tensors on one device to a tuple of tensors.
+        From tensors on one device to tensors. Rows of the first are independent of each other; the others have as many
+        rows, or one for all. So many rows have the results.
     """
 
     def __init__(self, function: Function) -> None:
@@ -30,32 +35,40 @@ class Recorded:
 
     def __call__(self, *given: torch.Tensor) -> Tensors:
         """What the function returns."""
-        if given[0].device.type != "cuda":
+        count = len(given[0])
+        if not _can_record(given[0].device) or count > MOST:
             return self._function(*given)
-        key = tuple((each.shape, each.stride(), each.dtype) for each in given)
+        size = count if count <= EACH else 1 << (count - 1).bit_length()
+        rows = [1 if len(each) < count else size for each in given]
+        key = tuple((n, each.shape[1:], each.dtype) for n, each in zip(rows, given, strict=True))
         if key not in self._recordings:
-            self._recordings[key] = self._record(given)
+            padded = (torch.cat([each, *[each[-1:]] * (n - len(each))]) for n, each in zip(rows, given, strict=True))
+            self._recordings[key] = self._record(tuple(padded))
         graph, taken, returned = self._recordings[key]
         for mine, each in zip(taken, given, strict=True):
-            mine.copy_(each)
+            mine[: len(each)].copy_(each)  # what is in the rows beyond changes nothing
         graph.replay()
-        return returned
+        return tuple(each[:count] for each in returned)
 
     def __deepcopy__(self, memo: dict[int, Any]) -> Recorded:
         """The same function, not recorded yet: a recording works on the tensors that it was made with."""
         return Recorded(self._function)
 
-    def _record(self, given: Tensors) -> tuple[torch.cuda.CUDAGraph, Tensors, Tensors]:
-        taken = tuple(each.clone() for each in given)
-        aside = torch.cuda.Stream(given[0].device)  # type: ignore[no-untyped-call]
-        aside.wait_stream(torch.cuda.current_stream(given[0].device))
+    def _record(self, taken: Tensors) -> tuple[torch.cuda.CUDAGraph, Tensors, Tensors]:
+        device = taken[0].device
+        aside = torch.cuda.Stream(device)  # type: ignore[no-untyped-call]
+        aside.wait_stream(torch.cuda.current_stream(device))
         with torch.cuda.stream(aside):
             for _ in range(2):  # libraries choose their algorithms in the first calls, which cannot be recorded
                 self._function(*taken)
-        torch.cuda.current_stream(given[0].device).wait_stream(aside)
+        torch.cuda.current_stream(device).wait_stream(aside)
         graph = torch.cuda.CUDAGraph()
         if self._pool is None:
             self._pool = torch.cuda.graph_pool_handle()  # recordings are played one at a time, and can share memory
         with torch.cuda.graph(graph, pool=self._pool, capture_error_mode="thread_local"):
             returned = self._function(*taken)
         return graph, taken, returned
+
+
+def _can_record(device: torch.device) -> bool:
+    return device.type == "cuda"

@@ -193,8 +193,7 @@ class V2XSimDetector(MapFusionDetector):
         if self.device == CPU:
             found = detections_of_each(*self._fast.decode(fused, context), self._score_threshold)
             return [boxes for boxes, _ in found]
-        few_of_one = len(fused) <= self.worth and len(context[0]) == 1
-        return detections_there((self._found if few_of_one else self._found_there)(fused, *context))
+        return detections_there(self._found(fused, *context))
 
     def _found_there(self, fused: torch.Tensor, *context: torch.Tensor) -> Tensors:
         return found_there(*self._fast.decode(fused, context), self._score_threshold)

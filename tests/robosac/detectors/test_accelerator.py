@@ -9,6 +9,7 @@ import torch
 from robosac import Session
 from robosac.calibrated import witness_of
 from robosac.detectors import load
+from robosac.detectors.decoding import boxes_there
 from robosac.detectors.loading import warm_up
 from robosac.detectors.recorded import Recorded
 from tests.robosac.detectors.alike import check_alike, subsets_of
@@ -49,11 +50,10 @@ def test_played_back_or_not_the_same_boxes_are_found(far, ego_message, benign):
     prepared, subsets = far.prepare(ego_message, benign), subsets_of(benign)[: far.worth]
     first = prepared.detect_all(subsets)
     with torch.inference_mode():
-        fused = prepared._fused_for(subsets)
-        many = far.find(torch.cat([fused, fused]), [None] * 2 * len(subsets))
-    for boxes, again, unrecorded in zip(first, prepared.detect_all(subsets), many, strict=False):
+        unrecorded = boxes_there(far._found_there(prepared._fused_for(subsets)))
+    for boxes, again, computed in zip(first, prepared.detect_all(subsets), unrecorded, strict=True):
         np.testing.assert_array_equal(boxes, again)
-        check_alike(unrecorded, boxes)
+        check_alike(computed, boxes)
 
 
 def test_a_placed_detector_can_be_placed_again(far, detector, ego_message, benign):
