@@ -197,6 +197,7 @@ async def test_frames_far_apart_are_compared_only_if_asked_for(served, ego_messa
     await run(served, session, ego_message, benign, 2)
     state = await served.ego(session).state()
     assert state["defense"]["compare_frames"] is compared
+    assert state["defense"]["frame_period_ms"] == period_ms
     assert bool(state["state"]["memory"]["shown"]) is compared
 
 

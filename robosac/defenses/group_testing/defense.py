@@ -28,8 +28,10 @@ from robosac.defenses.settings import LEAST, DefenseSettings
 
 DEFAULT_POSE_ERROR_M = 0.2
 """To expect more error than there is costs some sharpness; to expect less names honest teammates."""
+CALIBRATED_PERIOD_MS = 200.0
 COMPARABLE_PERIOD_MS = 250.0
-"""Longest period of frames of which one is like the next, as calibrated at 200 ms."""
+"""Longest period of frames of which one is like the next, as calibrated at `CALIBRATED_PERIOD_MS`."""
+LONGEST_PERIOD_MS = 60_000.0
 HIJACKED_OF = 10
 """In larger teams as many teammates are hijacked from frame to frame as in a team of so many."""
 
@@ -71,6 +73,13 @@ class GroupTestingSettings(DefenseSettings):
         f"{COMPARABLE_PERIOD_MS:g}.",
     )
 
+    frame_period_ms: float | None = Field(
+        None,
+        gt=0,
+        le=LONGEST_PERIOD_MS,
+        description="Time between two frames, to tell by how much a message is late; by default the session's "
+        f"frame_period_ms, or {CALIBRATED_PERIOD_MS:g}.",
+    )
     judge_objects: bool = Field(
         True, description="Whether single objects are judged by testimony, if the detector has a witness."
     )
@@ -82,10 +91,9 @@ class GroupTestingSettings(DefenseSettings):
     )
 
     def at_period(self, frame_period_ms: float) -> Self:
-        """With ``compare_frames`` decided."""
-        if self.compare_frames is not None:
-            return self
-        return self.model_copy(update={"compare_frames": frame_period_ms <= COMPARABLE_PERIOD_MS})
+        """With ``compare_frames`` and ``frame_period_ms`` decided."""
+        decided = {"compare_frames": frame_period_ms <= COMPARABLE_PERIOD_MS, "frame_period_ms": frame_period_ms}
+        return self.model_copy(update={name: value for name, value in decided.items() if getattr(self, name) is None})
 
     def at_calibration(self, calibration: Calibration) -> Self:
         """With ``pose_error_m`` decided."""
@@ -209,7 +217,8 @@ class GroupTesting:
             posterior.step(Hazards(hijack, recovery, change))
             memory.strangeness.step()
         posterior.regroup(unresolved(posterior.marginals()))
-        known = Knowledge(self.model, posterior, memory)
+        period_s = (settings.frame_period_ms or CALIBRATED_PERIOD_MS) / 1e3
+        known = Knowledge(self.model, posterior, memory, period_s)
         evidence = self.evidence(known, compare_frames=settings.compare_frames is not False)
         judged = JudgedFrame(known, evidence, tuple(team), frozenset(trusted_in(state)))
         named = frozenset(named_in(state) or ())

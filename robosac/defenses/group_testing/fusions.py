@@ -12,7 +12,7 @@ from robosac.defenses.group_testing.claims import LEANS, NOT_TOGETHER, SUPPORTS
 from robosac.defenses.group_testing.geometry import WITNESS_SCORE, followed
 from robosac.defenses.group_testing.hearing import Hearing
 from robosac.defenses.group_testing.knowledge import Knowledge
-from robosac.defenses.group_testing.lateness import Place, late, motions, moved_since, senders, sent
+from robosac.defenses.group_testing.lateness import WHILE_S, Place, late, motions, moved_since, senders, sent
 from robosac.defenses.group_testing.objects import PLACED_SCORE, Shown
 from robosac.defenses.group_testing.placing import DOUBTED_M, ego_misplaced, misplaced
 from robosac.defenses.protocol import EGO, Hypothesis, Outcome
@@ -220,4 +220,5 @@ class Fusions:
         centres, moved = centres[known], moved[known] @ turn
         if sender != EGO:  # the ego is a vehicle, too
             centres, moved = np.vstack([centres, np.zeros(2)]), np.vstack([moved, ego @ turn])
-        return late(self._testimony, sender, own @ turn, centres, moved)
+        frames = WHILE_S / self.known.period_s
+        return late(self._testimony, sender, frames * (own @ turn), centres, frames * moved)

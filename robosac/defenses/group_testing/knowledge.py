@@ -21,6 +21,8 @@ class Knowledge:
     model: EvidenceModel
     posterior: Posterior
     memory: Memory
+    period_s: float = 0.2
+    """Time between two frames."""
     members: list[str] = field(init=False)
     """The team, in the order of every array over teammates; some may be missing in the frame."""
     shown: dict[int, FloatArray] = field(default_factory=dict, init=False)

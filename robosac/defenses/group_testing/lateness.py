@@ -1,8 +1,8 @@
 """Messages that are late: they show every vehicle where it was, moved along with a sender that has moved since.
 
-Nobody is to blame for that. If a message is k frames late, and comes with the pose of now, it shows a vehicle
-``k (c - m)`` from where it is: c is how far the sender has moved since the frame before, m how far the vehicle has.
-With the pose of then that is ``-k m``. So its own testimony L tells how late a message is: it is greatest there, and
+Nobody is to blame for that. If a message is k times `WHILE_S` late, and comes with the pose of now, it shows a vehicle
+``k (c - m)`` from where it is: c is how far the sender moves in that time, m how far the vehicle does. With the pose of
+then that is ``-k m``. So its own testimony L tells how late a message is: it is greatest there, and
 not where the vehicles are. An older message is a replay.
 """
 
@@ -16,12 +16,14 @@ from robosac.boxes import FloatArray
 from robosac.defenses.group_testing.geometry import same_vehicles
 from robosac.testimony import Testimony
 
+WHILE_S = 0.2
+"""Delays are counted in this, however far apart frames are."""
 DELAYS = np.array([0.0, 0.5, 1.0, 1.5, 2.0, 2.5, 3.0, 4.0, 5.0, 6.0])
-"""How late a message may be, frames."""
+"""How late a message may be."""
 LATEST = 2.5
-"""What is later is no late message, but a replay: half a second at 5 Hz."""
+"""What is later than half a second is no late message, but a replay."""
 MOVED_M = 1.0
-"""Vehicles tell how late a message is that it would show so far off in a frame."""
+"""Vehicles tell how late a message is that it would show so far off if it were `WHILE_S` late."""
 FITS = 6.0
 """L of a late message, summed over vehicles, is at least so much where it shows them, and greater by as much than where
 they are.
@@ -45,16 +47,16 @@ def late(testimony: Testimony, sender: str, moved: FloatArray, centres: FloatArr
     testimony : Testimony
     sender : str
     moved : (2,) ndarray
-        How far it has moved since the frame before; ego frame, metres.
+        How far it moves in `WHILE_S`; ego frame, metres.
     centres, motions : (n, 2) ndarray
-        Where vehicles are that others see, and how far each has moved since the frame before.
+        Where vehicles are that others see, and how far each moves in that time.
     """
     said_by = testimony.of({sender})
     return any(_fits(said_by, centres, off) for off in (moved - motions, -motions))
 
 
 def _fits(testimony: Testimony, centres: FloatArray, off: FloatArray) -> bool:
-    """Whether one sender's testimony fits a late message best. One frame late it would show each vehicle so far ``off``
+    """Whether one sender's testimony fits a late message best. `WHILE_S` late it would show each vehicle so far ``off``
     (n, 2) from where it is.
     """
     telling = np.hypot(*off.T) >= MOVED_M

@@ -8,6 +8,8 @@ import pytest
 from robosac.answers import Source, Verdict
 from robosac.boxes import from_world, pose_matrix
 from robosac.defenses import Outcome
+from robosac.defenses.group_testing import GroupTestingSettings
+from robosac.defenses.group_testing.evidence import Evidence
 from tests.robosac.defenses.group_testing.conversing import SEEN, TEAM, outcome, run_frame, shifted
 from tests.robosac.defenses.group_testing.sessions import DEFENSE, named, run, with_settings
 
@@ -214,6 +216,26 @@ def test_frames_that_do_not_follow_on_one_another_are_not_compared(defense, fram
     assert max(decision.suspicion.values()) < 0.5
     assert set(decision.accepted) == set(TEAM)
     assert bool(decision.state["memory"]["shown"]) == (defense is DEFENSE)
+
+
+@pytest.mark.parametrize(("settings", "expected"), [({}, 0.2), ({"frame_period_ms": 50.0}, 0.05)])
+def test_what_is_known_of_a_frame_tells_how_long_it_lasts(settings, expected, rng):
+    periods = []
+
+    class Noting(Evidence):
+        def __init__(self, known, **options):
+            periods.append(known.period_s)
+            super().__init__(known, **options)
+
+    run(replace(with_settings(**settings), evidence=Noting), [], 2, rng)
+    assert periods == pytest.approx([expected] * 2)
+
+
+def test_what_is_left_open_is_decided_by_the_period_of_a_session():
+    decided = GroupTestingSettings().at_period(50.0)
+    assert (decided.frame_period_ms, decided.compare_frames) == (50.0, True)
+    asked = GroupTestingSettings(frame_period_ms=100.0).at_period(500.0)
+    assert (asked.frame_period_ms, asked.compare_frames) == (100.0, False)
 
 
 def test_an_empty_fusion_has_nothing_that_could_change():

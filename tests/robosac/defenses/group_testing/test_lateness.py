@@ -173,15 +173,15 @@ POSE = pose_matrix(100.0, -50.0, 1.8, 1.2)
 REST = tuple(name for name in TEAM if name != LIAR)
 
 
-def asked(true, late, fused, alone, ego_moved=STILL, forget=None, beside=()):
+def asked(true, late, fused, alone, ego_moved=STILL, forget=None, beside=(), speed=SPEED, period_s=0.2):
     """Findings of a frame: what is true, and what the liar's message shows; boxes of the team's rest, and of the ego.
 
     Everybody stands where the ego does. Before that the ego was elsewhere by what it has moved.
     """
     turn, origin = POSE[:2, :2], POSE[:2, 3]
     memory = Memory(senders=dict.fromkeys(TEAM, (*origin, 0)) | {EGO: (*(origin - turn @ ego_moved), 0)})
-    known = Knowledge(MODEL, Posterior(len(MODEL.kinds), 0.5, 0.25, TEAM), memory)
-    before = followed(cars(true - SPEED), POSE)
+    known = Knowledge(MODEL, Posterior(len(MODEL.kinds), 0.5, 0.25, TEAM), memory, period_s)
+    before = followed(cars(true - speed), POSE)
     memory.shown = {} if forget == "shown" else {known.key(subset): before for subset in ((), REST, tuple(TEAM))}
     memory.senders.pop(forget, None)
     own = [(*-ego_moved, YES)] if np.any(ego_moved) else []
@@ -201,6 +201,17 @@ def test_who_is_late_is_told_by_what_others_see_or_by_what_the_ego_sees_alone(by
     found = asked(PLACES, PLACES - SPEED, **boxes, forget=forget)
     assert found.late(LIAR) == (by != "nobody" and forget is None)
     assert not found.late("car-2")
+
+
+@pytest.mark.parametrize(
+    ("period_s", "frames", "is_late"),
+    [(0.2, 1, True), (0.05, 4, True), (0.05, 10, True), (0.05, 20, False), (0.25, 0.8, True), (0.25, 4, False)],
+)
+def test_delays_count_in_seconds_however_far_apart_frames_are(period_s, frames, is_late):
+    """Up to half a second; vehicles drive at 15 m/s."""
+    speed = SPEED * period_s / 0.2
+    found = asked(PLACES, PLACES - frames * speed, *[cars(PLACES)] * 2, speed=speed, period_s=period_s)
+    assert found.late(LIAR) == is_late
 
 
 def test_the_ego_is_a_vehicle_that_a_late_message_shows():
