@@ -12,7 +12,17 @@ from robosac.defenses.group_testing.claims import LEANS, NOT_TOGETHER, SUPPORTS
 from robosac.defenses.group_testing.geometry import WITNESS_SCORE, followed
 from robosac.defenses.group_testing.hearing import Hearing
 from robosac.defenses.group_testing.knowledge import Knowledge
-from robosac.defenses.group_testing.lateness import WHILE_S, Place, late, motions, moved_since, senders, sent
+from robosac.defenses.group_testing.lateness import (
+    TURNING,
+    WHILE_S,
+    Place,
+    late,
+    motions,
+    moved_since,
+    senders,
+    sent,
+    turned_since,
+)
 from robosac.defenses.group_testing.objects import PLACED_SCORE, Shown
 from robosac.defenses.group_testing.placing import DOUBTED_M, ego_misplaced, misplaced
 from robosac.defenses.protocol import EGO, Hypothesis, Outcome
@@ -133,6 +143,12 @@ class Fusions:
     def _moved(self, sender: str) -> FloatArray | None:
         return moved_since(self.known.memory.senders.get(sender), self.senders.get(sender), self.number)
 
+    def _turned(self, sender: str) -> float:
+        """How far a sender has turned in a frame, radians. An ego that had not been turning is not where it says."""
+        last = self.known.memory.senders.get(sender)
+        turned = turned_since(last, self.senders.get(sender), self.number)
+        return turned if last is None or sender != EGO or last[4] * turned > TURNING**2 else 0.0
+
     def late(self, sender: str) -> bool:
         """Whether a teammate's message is late: by the vehicles that the largest fusion without it shows, where one is
         decoded, or by those that the ego sees alone, as all others may be late, too.
@@ -221,4 +237,5 @@ class Fusions:
         if sender != EGO:  # the ego is a vehicle, too
             centres, moved = np.vstack([centres, np.zeros(2)]), np.vstack([moved, ego @ turn])
         frames = WHILE_S / self.known.period_s
-        return late(self._testimony, sender, frames * (own @ turn), centres, frames * moved)
+        turned = frames * self._turned(sender)
+        return late(self._testimony, sender, frames * (own @ turn), centres, frames * moved, turned)

@@ -1,9 +1,10 @@
 """Messages that are late: they show every vehicle where it was, moved along with a sender that has moved since.
 
 Nobody is to blame for that. If a message is k times `WHILE_S` late, and comes with the pose of now, it shows a vehicle
-``k (c - m)`` from where it is: c is how far the sender moves in that time, m how far the vehicle does. With the pose of
-then that is ``-k m``. So its own testimony L tells how late a message is: it is greatest there, and
-not where the vehicles are. An older message is a replay.
+``k (c - m)`` from where it is: c is how far the sender moves in that time, m how far the vehicle does. If the sender
+turns, all that it shows is turned about it besides. With the pose of then a vehicle is ``-k m`` off. So its own
+testimony L tells how late a message is: it is greatest there, and not where the vehicles are. An older message is a
+replay.
 """
 
 from __future__ import annotations
@@ -20,6 +21,7 @@ WHILE_S = 0.2
 """Delays are counted in this, however far apart frames are."""
 DELAYS = np.array([0.0, 0.5, 1.0, 1.5, 2.0, 2.5, 3.0, 4.0, 5.0, 6.0])
 """How late a message may be."""
+_A_WHILE = DELAYS.tolist().index(1.0)
 LATEST = 2.5
 """What is later than half a second is no late message, but a replay."""
 MOVED_M = 1.0
@@ -32,14 +34,26 @@ CLEAR, FEWEST = 1.0, 2
 """At least so many vehicles fit better, by so much L, and twice as many as fit worse: a lie about one or two does not
 excuse itself.
 """
+TURNING = 0.02
+"""A sender that turns by less in `WHILE_S`, radians, goes straight on, as far as poses tell."""
 SENT_FRAMES = 5
 """How fast a sender is may be told by where it was so many frames ago: not each sends in every frame."""
-Place = tuple[float, float]
-Sent = tuple[float, float, int]
-"""Where in the world a sender was when it last sent a message, x, y, metres; and the number of that frame."""
+Place = tuple[float, float, float]
+"""Where in the world a sender is: x, y, metres, and yaw."""
+Sent = tuple[float, float, int, float | None, float]
+"""Where in the world a sender was when it last sent a message, x, y, metres; the number of that frame; its yaw, if that
+was kept; and how far it had turned in a frame before, radians.
+"""
 
 
-def late(testimony: Testimony, sender: str, moved: FloatArray, centres: FloatArray, motions: FloatArray) -> bool:
+def late(
+    testimony: Testimony,
+    sender: str,
+    moved: FloatArray,
+    centres: FloatArray,
+    motions: FloatArray,
+    turned: float = 0.0,
+) -> bool:
     """Whether a sender's message is late.
 
     Parameters
@@ -50,17 +64,25 @@ def late(testimony: Testimony, sender: str, moved: FloatArray, centres: FloatArr
         How far it moves in `WHILE_S`; ego frame, metres.
     centres, motions : (n, 2) ndarray
         Where vehicles are that others see, and how far each moves in that time.
+    turned : float
+        How far the sender turns in it, radians.
     """
-    said_by = testimony.of({sender})
-    return any(_fits(said_by, centres, off) for off in (moved - motions, -motions))
+    said_by, delays = testimony.of({sender}), DELAYS[:, None, None]
+    if any(_fits(said_by, centres, centres + delays * off) for off in (moved - motions, -motions)):
+        return True
+    if abs(turned) < TURNING:
+        return False
+    origin = testimony.origins[testimony.agents.index(sender)]
+    about = centres - origin + delays * (moved - motions)
+    c, s = np.cos(delays * turned), np.sin(delays * turned)
+    x, y = about[..., :1], about[..., 1:]
+    return _fits(said_by, centres, origin + np.concatenate([c * x - s * y, s * x + c * y], axis=2))
 
 
-def _fits(testimony: Testimony, centres: FloatArray, off: FloatArray) -> bool:
-    """Whether one sender's testimony fits a late message best. `WHILE_S` late it would show each vehicle so far ``off``
-    (n, 2) from where it is.
-    """
-    telling = np.hypot(*off.T) >= MOVED_M
-    places = centres[telling] + DELAYS[:, None, None] * off[telling]
+def _fits(testimony: Testimony, centres: FloatArray, places: FloatArray) -> bool:
+    """Whether one sender's testimony fits a late message best, which shows vehicles in ``places`` (delays, n, 2)."""
+    telling = np.hypot(*(places[_A_WHILE] - centres).T) >= MOVED_M
+    places = places[:, telling]
     said = testimony.likelihood(places.reshape(-1, 2)).reshape(places.shape[:2])
     sums = said.sum(axis=1)
     best = int(sums.argmax())
@@ -71,15 +93,18 @@ def _fits(testimony: Testimony, centres: FloatArray, off: FloatArray) -> bool:
 
 
 def senders(testimony: Testimony, pose: FloatArray) -> dict[str, Place]:
-    """Where in the world each sender is, metres, rounded to 1 cm; ``pose`` is the ego's."""
-    placed = (testimony.origins @ pose[:2, :2].T + pose[:2, 3]).round(2)
-    return {name: (x, y) for name, (x, y) in zip(testimony.agents, placed.tolist(), strict=True)}
+    """Where in the world each sender is, rounded to 1 cm and 0.1 mrad; ``pose`` is the ego's."""
+    placed = (testimony.origins @ pose[:2, :2].T + pose[:2, 3]).round(2).tolist()
+    from_ego = testimony.from_ego
+    yaws = (np.arctan2(pose[1, 0], pose[0, 0]) - np.arctan2(from_ego[:, 1, 0], from_ego[:, 0, 0])).round(4).tolist()
+    return {name: (x, y, yaw) for name, (x, y), yaw in zip(testimony.agents, placed, yaws, strict=True)}
 
 
 def sent(before: Mapping[str, Sent], now: Mapping[str, Place], number: int) -> dict[str, Sent]:
     """Where senders were that sent a message in a frame of this number, or lately."""
     lately = {name: last for name, last in before.items() if 0 < number - last[2] < SENT_FRAMES}
-    return {**lately, **{name: (x, y, number) for name, (x, y) in now.items()}}
+    turned = {name: round(turned_since(before.get(name), place, number), 4) for name, place in now.items()}
+    return {**lately, **{name: (x, y, number, yaw, turned[name]) for name, (x, y, yaw) in now.items()}}
 
 
 def moved_since(last: Sent | None, now: Place | None, number: int) -> FloatArray | None:
@@ -88,8 +113,15 @@ def moved_since(last: Sent | None, now: Place | None, number: int) -> FloatArray
     """
     if last is None or now is None or not 0 < number - last[2] <= SENT_FRAMES:
         return None
-    moved: FloatArray = np.subtract(now, last[:2]) / (number - last[2])
+    moved: FloatArray = np.subtract(now[:2], last[:2]) / (number - last[2])
     return moved
+
+
+def turned_since(last: Sent | None, now: Place | None, number: int) -> float:
+    """As `moved_since`, how far it has turned, radians; 0 where nothing is known of that."""
+    if last is None or now is None or last[3] is None or not 0 < number - last[2] <= SENT_FRAMES:
+        return 0.0
+    return float((now[2] - last[3] + np.pi) % (2 * np.pi) - np.pi) / (number - last[2])
 
 
 def motions(now: FloatArray, before: FloatArray) -> FloatArray:

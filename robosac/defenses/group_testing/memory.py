@@ -65,9 +65,14 @@ def _boxes(kept: Any) -> FloatArray:
 
 
 def _sent(kept: Sequence[float], state: Mapping[str, Any]) -> Sent:
-    """Where a sender was as it is kept; older versions kept those of the latest frame alone, without its number."""
-    x, y, *number = kept
-    return float(x), float(y), int(number[0] if number else state.get("shown_in", 0))
+    """Where a sender was as it is kept. Older versions kept nothing of how it turns, or those of the latest frame alone
+    and without its number.
+    """
+    x, y, *others = kept
+    if len(others) < 3:
+        return float(x), float(y), int(others[0] if others else state.get("shown_in", 0)), None, 0.0
+    number, yaw, turned = others
+    return float(x), float(y), int(number), float(yaw), float(turned)
 
 
 LATE_FRAMES = 5

@@ -11,7 +11,7 @@ from robosac.defenses import EGO, Outcome
 from robosac.defenses.group_testing.findings import Findings
 from robosac.defenses.group_testing.geometry import followed
 from robosac.defenses.group_testing.knowledge import Knowledge
-from robosac.defenses.group_testing.lateness import SENT_FRAMES, late, motions, moved_since, senders
+from robosac.defenses.group_testing.lateness import SENT_FRAMES, late, motions, moved_since, senders, sent, turned_since
 from robosac.defenses.group_testing.lies import Lies
 from robosac.defenses.group_testing.memory import Memory
 from robosac.defenses.group_testing.posterior import Posterior
@@ -83,7 +83,7 @@ def test_senders_are_where_their_poses_say():
     ego = pose_matrix(5.0, -3.0, 1.8, 0.7)
     poses = {EGO: ego, "a": pose_matrix(12.004, 8.0, 1.8, -2.0), "b": pose_matrix(-4.0, 1.0, 5.0, 3.0)}
     found = senders(saying(dict.fromkeys(poses, ()), poses), ego)
-    assert found == {EGO: (5.0, -3.0), "a": (12.0, 8.0), "b": (-4.0, 1.0)}
+    assert found == {EGO: (5.0, -3.0, 0.7), "a": (12.0, 8.0, -2.0), "b": (-4.0, 1.0, 3.0)}
     json.dumps(found)
 
 
@@ -142,16 +142,16 @@ def test_who_is_late_is_not_named_and_who_replays_is(delay, names, shown, every)
 
 def test_where_senders_were_is_known_for_some_frames():
     state = drive(2, 0)[-1].state
-    assert state["memory"]["senders"] == {name: [0.0, 0.0, 1] for name in (EGO, *TEAM)}
+    assert state["memory"]["senders"] == {name: [0.0, 0.0, 1, 0.0, 0.0] for name in (EGO, *TEAM)}
     for frames, last in ((SENT_FRAMES, 0), (SENT_FRAMES + 1, None)):
         kept = drive(frames, 0, every=100)[-1].state["memory"]["senders"]
-        assert kept.get(LIAR) == (None if last is None else [0.0, 0.0, last])
-        assert kept[EGO] == [0.0, 0.0, frames - 1]
+        assert kept.get(LIAR) == (None if last is None else [0.0, 0.0, last, 0.0, 0.0])
+        assert kept[EGO] == [0.0, 0.0, frames - 1, 0.0, 0.0]
 
 
 def test_how_fast_a_sender_is_shows_from_where_it_was_lately():
     def moved(last, number):
-        found = moved_since(last, (16.0, -2.0), number)
+        found = moved_since(last and (*last, None, 0.0), (16.0, -2.0, 0.0), number)
         return None if found is None else found.tolist()
 
     assert moved((10.0, 4.0, 8), 9) == [6.0, -6.0]
@@ -160,13 +160,48 @@ def test_how_fast_a_sender_is_shows_from_where_it_was_lately():
     assert moved((10.0, 4.0, 8), 9 + SENT_FRAMES) is None
     assert moved((10.0, 4.0, 8), 8) is None  # numbers that begin again
     assert moved(None, 9) is None
-    assert moved_since((10.0, 4.0, 8), None, 9) is None
+    assert moved_since((10.0, 4.0, 8, None, 0.0), None, 9) is None
+
+
+@pytest.mark.parametrize(("sender", "before", "counts"), [("a", 0.0, True), (EGO, 0.0, False), (EGO, 0.1, True)])
+@pytest.mark.parametrize("sign", [1, -1])
+def test_an_ego_that_begins_to_turn_so_fast_is_not_where_it_says(sender, before, counts, sign):
+    memory = Memory(senders={sender: (0.0, 0.0, 0, 0.0, sign * before)})
+    found = Findings(Knowledge(MODEL, Posterior(len(MODEL.kinds), 0.5, 0.25, TEAM), memory), Lies(), TEAM, ())
+    found.number, found.senders = 1, {sender: (0.0, 0.0, sign * 0.2)}
+    assert found._turned(sender) == pytest.approx(sign * 0.2 if counts else 0.0)
+    assert sent(memory.senders, found.senders, 1)[sender][4] == pytest.approx(sign * 0.2)
+
+
+def test_how_fast_a_sender_turns_shows_so_too():
+    def turned(yaw, number, now=(0.0, 0.0, -3.0)):
+        return turned_since((0.0, 0.0, 8, yaw, 0.0), now, number)
+
+    assert turned(3.0, 9) == pytest.approx(2 * np.pi - 6)
+    assert turned(-2.6, 10) == pytest.approx(-0.2)
+    assert [turned(None, 9), turned(3.0, 8), turned(3.0, 9 + SENT_FRAMES), turned(3.0, 9, None)] == [0.0] * 4
+    assert turned_since(None, (0.0, 0.0, -3.0), 9) == 0.0
+
+
+@pytest.mark.parametrize("yaw_rate", [0.4, -0.4])
+@pytest.mark.parametrize("delay", [1, 2, 5])
+def test_a_sender_that_turns_shows_all_turned_about_itself(yaw_rate, delay):
+    """It drives on while vehicles do, and sends what it saw then with its pose of now."""
+    moved, origin = np.array([0.0, 2.0]), np.array([-4.0, 1.0])
+    c, s = np.cos(delay * yaw_rate), np.sin(delay * yaw_rate)
+    places = origin + (PLACES - delay * SPEED - origin + delay * moved) @ np.array([[c, s], [-s, c]])
+    said = {EGO: [], "a": [], "d": shown_at(places)}
+    heard = saying(said, {name: pose_matrix(*(origin if name == "d" else STILL), 0.0, 0.0) for name in said})
+    still = np.broadcast_to(SPEED, PLACES.shape)
+    assert late(heard, "d", moved, PLACES, still, yaw_rate) == (delay < 5)
+    assert delay == 1 or not late(heard, "d", moved, PLACES, still)  # so little may fit a longer way straight on
 
 
 def test_older_versions_kept_senders_of_the_latest_frame_without_its_number():
-    state = Memory(shown_in=7, senders={"a": (1.0, 2.0, 6)}).to_state()
-    assert Memory.from_state(state).senders == {"a": (1.0, 2.0, 6)}
-    assert Memory.from_state({**state, "senders": {"a": [1.0, 2.0]}}).senders == {"a": (1.0, 2.0, 7)}
+    state = Memory(shown_in=7, senders={"a": (1.0, 2.0, 6, 0.5, 0.1)}).to_state()
+    assert Memory.from_state(state).senders == {"a": (1.0, 2.0, 6, 0.5, 0.1)}
+    assert Memory.from_state({**state, "senders": {"a": [1.0, 2.0, 6]}}).senders == {"a": (1.0, 2.0, 6, None, 0.0)}
+    assert Memory.from_state({**state, "senders": {"a": [1.0, 2.0]}}).senders == {"a": (1.0, 2.0, 7, None, 0.0)}
 
 
 POSE = pose_matrix(100.0, -50.0, 1.8, 1.2)
@@ -179,7 +214,9 @@ def asked(true, late, fused, alone, ego_moved=STILL, forget=None, beside=(), spe
     Everybody stands where the ego does. Before that the ego was elsewhere by what it has moved.
     """
     turn, origin = POSE[:2, :2], POSE[:2, 3]
-    memory = Memory(senders=dict.fromkeys(TEAM, (*origin, 0)) | {EGO: (*(origin - turn @ ego_moved), 0)})
+    memory = Memory(
+        senders=dict.fromkeys(TEAM, (*origin, 0, None, 0.0)) | {EGO: (*(origin - turn @ ego_moved), 0, None, 0.0)}
+    )
     known = Knowledge(MODEL, Posterior(len(MODEL.kinds), 0.5, 0.25, TEAM), memory, period_s)
     before = followed(cars(true - speed), POSE)
     memory.shown = {} if forget == "shown" else {known.key(subset): before for subset in ((), REST, tuple(TEAM))}
@@ -244,7 +281,7 @@ def test_boxes_that_nobody_else_supports_or_that_are_faint_tell_nothing(said_by,
 
 def ego_found(ego_delay=1, seeing=("car-2", "car-3", "rsu"), aside=0.0, unheard=()):
     """Findings of a frame in which some see all vehicles, the last of them aside, and the ego where they were."""
-    memory = Memory(senders=dict.fromkeys((EGO, *TEAM), (0.0, 0.0, 0)))
+    memory = Memory(senders=dict.fromkeys((EGO, *TEAM), (0.0, 0.0, 0, None, 0.0)))
     known = Knowledge(MODEL, Posterior(len(MODEL.kinds), 0.5, 0.25, TEAM), memory)
     memory.shown = {known.key(tuple(TEAM)): followed(cars(PLACES - SPEED), np.eye(4))}
     says = {EGO: shown_at(PLACES - ego_delay * SPEED)}
