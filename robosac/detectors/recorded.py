@@ -11,8 +11,8 @@ Tensors = tuple[torch.Tensor, ...]
 Function = Callable[..., Tensors]
 EACH = 8
 """Up to so many rows there is a recording for each number of them; beyond, for each power of two."""
-MOST = 64
-"""Rows of the largest recording; more are computed without one."""
+MOST = 16
+"""Rows of the largest recording, as each keeps its arguments on the device; more are computed without one."""
 
 
 class Recorded:
