@@ -46,7 +46,8 @@ def test_a_device_is_measured_and_one_that_is_not_there_is_refused():
     assert "intersection-mean on cpu, 5 teammates" in done.stdout
     cells = [[cell.strip() for cell in line.split("│")[1:-1]] for line in done.stdout.splitlines() if "│" in line]
     assert [row[0] for row in cells[:2]] == ["one by one", "8 at once"]
-    assert [row[0] for row in cells[2:8]] == ["1", "2", "4", "8", "16", "32"]
+    assert [row[0] for row in cells[2:5]] == ["prepared", "decoded", "compared"]
+    assert [row[0] for row in cells[5:11]] == ["1", "2", "4", "8", "16", "32"]
     assert all(float(cell) > 0 for row in cells for cell in row[1:])
     assert refused.returncode == 2
     assert "torch cannot compute on the device 'nonsense' here" in refused.stderr
