@@ -146,10 +146,8 @@ class Fusions:
     def _turned(self, sender: str) -> float:
         """How far a sender has turned in a frame, radians. An ego that had not been turning is not where it says."""
         last = self.known.memory.senders.get(sender)
-        turned, least = (
-            turned_since(last, self.senders.get(sender), self.number),
-            TURNING * self.known.period_s / WHILE_S,
-        )
+        turned = turned_since(last, self.senders.get(sender), self.number)
+        least = TURNING * self.known.period_s / WHILE_S
         return turned if last is None or sender != EGO or last[4] * turned > least**2 else 0.0
 
     def late(self, sender: str) -> bool:

@@ -91,3 +91,16 @@ def test_a_warm_detector_has_decoded_as_many_at_once_as_it_will(worth, detector)
     frame = SimpleNamespace(worth=worth, detect=lambda subset=(): np.zeros((0, 6)), detect_all=decoded.append)
     warm_up(SimpleNamespace(info=detector.info, prepare=lambda ego, others: frame))
     assert {len(subsets) for subsets in decoded} == set(range(2, worth + 1))
+
+
+def test_a_warm_detector_has_decoded_passes_of_several_frames(detector):
+    joined, alone = [], {"detect": lambda subset=(): np.zeros((0, 6)), "detect_all": list, "family": detector}
+    frames = []
+
+    def prepare(ego, others):
+        frames.append(SimpleNamespace(worth=3, detect_together=joined.append, **alone))
+        return frames[-1]
+
+    warm_up(SimpleNamespace(info=detector.info, prepare=prepare))
+    assert {sum(len(subsets) for _, subsets in wanted) for wanted in joined} == {2, 3, 4, 8, 16}
+    assert all(one is not other for ((one, _), (other, _)) in joined)

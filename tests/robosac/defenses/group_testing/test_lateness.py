@@ -208,7 +208,7 @@ POSE = pose_matrix(100.0, -50.0, 1.8, 1.2)
 REST = tuple(name for name in TEAM if name != LIAR)
 
 
-def asked(true, late, fused, alone, ego_moved=STILL, forget=None, beside=(), speed=SPEED, period_s=0.2):
+def asked(true, late, fused, alone, ego_moved=STILL, forget=None, beside=(), speed=SPEED, period_s=0.2, turned=0.0):
     """Findings of a frame: what is true, and what the liar's message shows; boxes of the team's rest, and of the ego.
 
     Everybody stands where the ego does. Before that the ego was elsewhere by what it has moved.
@@ -220,6 +220,7 @@ def asked(true, late, fused, alone, ego_moved=STILL, forget=None, beside=(), spe
     known = Knowledge(MODEL, Posterior(len(MODEL.kinds), 0.5, 0.25, TEAM), memory, period_s)
     before = followed(cars(true - speed), POSE)
     memory.shown = {} if forget == "shown" else {known.key(subset): before for subset in ((), REST, tuple(TEAM))}
+    memory.senders[LIAR] = (*origin, 0, 1.2 - turned, 0.0)
     memory.senders.pop(forget, None)
     own = [(*-ego_moved, YES)] if np.any(ego_moved) else []
     said = {EGO: shown_at(true, true), "car-2": shown_at(true, true), LIAR: [*shown_at(late, true), *own]}
@@ -249,6 +250,13 @@ def test_delays_count_in_seconds_however_far_apart_frames_are(period_s, frames, 
     speed = SPEED * period_s / 0.2
     found = asked(PLACES, PLACES - frames * speed, *[cars(PLACES)] * 2, speed=speed, period_s=period_s)
     assert found.late(LIAR) == is_late
+
+
+@pytest.mark.parametrize("turned", [0.4, -0.4, 0.0])
+def test_who_turns_is_late_if_all_that_it_shows_is_turned(turned):
+    c, s = np.cos(0.8), np.sin(0.8)
+    two_frames_ago = (PLACES - 2 * SPEED) @ np.array([[c, s], [-s, c]])
+    assert asked(PLACES, two_frames_ago, *[cars(PLACES)] * 2, turned=turned).late(LIAR) == (turned > 0)
 
 
 def test_the_ego_is_a_vehicle_that_a_late_message_shows():
