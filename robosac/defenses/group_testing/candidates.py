@@ -7,7 +7,7 @@ from functools import lru_cache
 import numpy as np
 
 from robosac.boxes import BoolArray, FloatArray, IntArray
-from robosac.defenses.group_testing.choice import HARM, gain
+from robosac.defenses.group_testing.choice import HARM, LIKELY_HONEST, gain
 from robosac.defenses.group_testing.posterior import EXACT, Posterior
 
 SUSPECTS_AT_ONCE = 4
@@ -78,7 +78,7 @@ def _some_of(posterior: Posterior, here: IntArray, decoded: BoolArray) -> BoolAr
     """Answers, and groups of unresolved teammates beside each subset of cleared ones decoded before: so a test is
     evidence twice, by the pairs with the ego and with that subset. Where there is none yet, groups beside nobody and
     beside the least suspected. While somebody is in doubt, an answer holds no more than can be witnesses afterwards, or
-    all who are cleared.
+    all who are cleared, or more likely honest than not.
     """
     suspicion = posterior.marginals()
     good = cleared(suspicion)
@@ -87,9 +87,8 @@ def _some_of(posterior: Posterior, here: IntArray, decoded: BoolArray) -> BoolAr
     doubtful[here] = unresolved(suspicion)[here]
     groups, doubt = _groups(posterior, doubtful)
     counts = _answer_sizes(suspicion[ranked[:WITNESSES] if doubt >= WORTH_WITNESSES else ranked])
-    everybody_cleared = int(good[here].sum())
-    if everybody_cleared:
-        counts = np.union1d(counts, [everybody_cleared])
+    large = {int(good[here].sum()), int((suspicion[here] < LIKELY_HONEST).sum())} - {0}
+    counts = np.union1d(counts, sorted(large)).astype(np.int64)
     answers = np.zeros((len(counts), len(suspicion)), dtype=bool)
     for row, count in zip(answers, counts, strict=True):
         row[ranked[:count]] = True

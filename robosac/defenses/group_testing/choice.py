@@ -11,7 +11,7 @@ from robosac.boxes import BoolArray, FloatArray, IntArray
 from robosac.defenses.group_testing.geometry import crowd
 from robosac.defenses.group_testing.knowledge import Knowledge
 from robosac.defenses.group_testing.memory import CHANGE_REPEAT, EGO_REPEAT, PAIR_REPEAT, KeyArray, keys
-from robosac.defenses.group_testing.posterior import EXACT, Posterior
+from robosac.defenses.group_testing.posterior import EXACT
 
 GAIN = 0.26
 GAIN_SCALE = 2.0
@@ -32,6 +32,8 @@ TEST_COST = 0.004
 """What a pass must bring, in the unit of utility."""
 DEPENDENCE = 0.85
 """Weight of a comparison within a frame: what makes one outcome odd, a crossing or a crowd, makes others odd too."""
+LIKELY_HONEST = 0.5
+"""Whoever is less suspected is more likely honest than not."""
 UNDILUTED_SIZE = 8
 """Largest subset whose evidence counts in full."""
 _CERTAIN = 1e-12
@@ -51,10 +53,21 @@ def _gains(most: int) -> FloatArray:
     return gains
 
 
-def utility(posterior: Posterior, subsets: BoolArray) -> FloatArray:
-    """``U(m) = P(m clean) G(|m|) - (1 - P(m clean)) HARM`` of each subset (n,); the ego's own answer has 0."""
-    clean = posterior.unattacked(posterior.masks(subsets))
-    worth: FloatArray = clean * _gains(subsets.shape[1])[subsets.sum(axis=1)] - (1.0 - clean) * HARM
+def utility(known: Knowledge, subsets: BoolArray) -> FloatArray:
+    """What each subset (n,) is worth as an answer; the ego's own has 0.
+
+    ``U(m) = P(m clean) G(h) + P(m lying) (G(h) - HARM min(1, EXACT / |m|)) - P(m attacked) HARM``, with h those of m
+    who are more likely honest than not. Nobody of m attacks; or whoever does lies about single objects, and takes
+    nothing from what the others add, as each box is judged by testimony, and less where it is one voice among more; or
+    somebody attacks in another way.
+    """
+    posterior, lie = known.posterior, known.model.lie
+    by_kind = posterior.unattacked_by_kind(posterior.masks(subsets))
+    clean, voices = by_kind.sum(axis=1), np.maximum(subsets.sum(axis=1), 1)
+    lying = np.zeros(len(subsets)) if lie is None else np.maximum(posterior.by_kind[lie] - by_kind[:, 1 + lie], 0.0)
+    gains = _gains(subsets.shape[1])[(subsets & (posterior.marginals() < LIKELY_HONEST)).sum(axis=1)]
+    harm = HARM * (1.0 - clean - lying * np.maximum(0.0, 1.0 - EXACT / voices))
+    worth: FloatArray = (clean + lying) * gains - harm
     return worth
 
 

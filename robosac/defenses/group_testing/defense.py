@@ -20,7 +20,7 @@ from robosac.defenses.group_testing.frame import JudgedFrame
 from robosac.defenses.group_testing.inspection import FEWEST_TO_ASK, Inspection
 from robosac.defenses.group_testing.knowledge import Knowledge, remember
 from robosac.defenses.group_testing.memory import Memory
-from robosac.defenses.group_testing.model import LIE, CalibrationError, EvidenceModel
+from robosac.defenses.group_testing.model import CalibrationError, EvidenceModel
 from robosac.defenses.group_testing.posterior import Hazards, Posterior
 from robosac.defenses.protocol import Asking, Conversation, Hypothesis, Reference, State, named_in, trusted_in
 from robosac.defenses.sampling import MAX_BUDGET
@@ -170,7 +170,7 @@ class GroupTesting:
     @property
     def asks_witnesses(self) -> bool:
         """Whether objects are judged by testimony."""
-        return LIE in self.model.kinds
+        return self.model.lie is not None
 
     @property
     def consensus_threshold(self) -> float:
@@ -237,7 +237,10 @@ class GroupTesting:
         while in_time:
             subset = judged.next_test(rng, passes) if passes > 0 else None
             if subset is None and passes > 0 and clearing:
-                subset = inspection.asked_again(judged.best_answer())
+                best = judged.best_answer()
+                subset = inspection.asked_again(best)
+                if subset is None and not settings.inspections:
+                    subset = inspection.next_test(best)
             passes -= 1
             if subset is None:
                 passes, inspections = 0, inspections - 1

@@ -104,9 +104,14 @@ class Distribution:
 
     def unattacked(self, masks: IntArray) -> FloatArray:
         """Probability (n,) that nobody of each subset attacks."""
-        clean = self._clean[np.arange(len(masks))[:, None], :, masks]  # (B, n, 1 + K)
-        unattacked: FloatArray = clean.prod(axis=0) @ self._weights
+        unattacked: FloatArray = self.unattacked_by_kind(masks).sum(axis=1)
         return unattacked
+
+    def unattacked_by_kind(self, masks: IntArray) -> FloatArray:
+        """Probability (n, 1 + K) that nobody attacks, or somebody in each way, and nobody of each subset does."""
+        clean = self._clean[np.arange(len(masks))[:, None], :, masks]  # (B, n, 1 + K)
+        by_kind: FloatArray = clean.prod(axis=0) * self._weights
+        return by_kind
 
     def cells(self, a: IntArray, d: IntArray) -> FloatArray:
         """Joint probabilities (n, CLEAN + 3 K) of what pairs of disjoint subsets hold, by rows of an `EvidenceModel`.

@@ -17,7 +17,7 @@ from robosac.defenses.group_testing.differences import misplaced
 from robosac.defenses.group_testing.geometry import MIN_WITNESSES, PairMeasure, Said, crowd
 from robosac.defenses.group_testing.knowledge import Knowledge
 from robosac.defenses.group_testing.memory import CHANGE_REPEAT, EGO_REPEAT, PAIR_REPEAT, WORTH_KEEPING, key
-from robosac.defenses.group_testing.model import CELLS, CLEAN, LIE
+from robosac.defenses.group_testing.model import CELLS, CLEAN
 from robosac.defenses.group_testing.objects import Shown
 from robosac.defenses.group_testing.strangeness import TESTS
 from robosac.defenses.protocol import Difference, Hypothesis, Outcome
@@ -230,9 +230,9 @@ class Evidence:
         """The likelihoods, with those of liars as they are on average for the honest: what tells honest messages from
         each other tells nothing about liars.
         """
-        kinds = self._known.model.kinds
-        if LIE in kinds and (clean := float(cells[:CLEAN].sum())) > _TINY:
-            first = CLEAN + CELLS * kinds.index(LIE)
+        lie = self._known.model.lie
+        if lie is not None and (clean := float(cells[:CLEAN].sum())) > _TINY:
+            first = CLEAN + CELLS * lie
             likelihood[first : first + CELLS] = float(cells[:CLEAN] @ likelihood[:CLEAN]) / clean
         return likelihood
 

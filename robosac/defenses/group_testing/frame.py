@@ -76,7 +76,7 @@ class JudgedFrame:
         if not len(options):
             return None
         ego_sees = self._evidence.ego_witnesses
-        gained = np.maximum(0.0, choice.utility(known.posterior, options) - max(0.0, self._best_answer()[1]))
+        gained = np.maximum(0.0, choice.utility(known, options) - max(0.0, self._best_answer()[1]))
         worth_of_a_bit = choice.INFORMATION_VALUE
         if known.memory.hurried and not outcomes:
             worth_of_a_bit *= choice.LASTING
@@ -181,7 +181,7 @@ class JudgedFrame:
 
     def _most_useful(self, outcomes: Sequence[Outcome]) -> tuple[Hypothesis, float, Source]:
         if outcomes:
-            worth = choice.utility(self._known.posterior, self._known.rows([o.teammates for o in outcomes]))
+            worth = choice.utility(self._known, self._known.rows([o.teammates for o in outcomes]))
             best = int(np.argmax(worth.round(_DIGITS)))
             if worth[best] > 0:
                 source = Source.CONSENSUS if self._verified(outcomes[best]) else Source.TRUSTED
@@ -191,7 +191,7 @@ class JudgedFrame:
     def _untested_answer(self) -> tuple[Hypothesis, Source]:
         """Without time for any test: all that are trusted, and in place."""
         present = tuple(name for name in self._team if name in self._trusted - self._out)
-        if present and choice.utility(self._known.posterior, self._known.rows([present]))[0] > 0:
+        if present and choice.utility(self._known, self._known.rows([present]))[0] > 0:
             return present, Source.TRUSTED
         return (), Source.EGO_ONLY
 

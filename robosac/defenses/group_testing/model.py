@@ -114,6 +114,11 @@ class EvidenceModel:
         return EvidenceModel(self.pose_error_m, (*self.kinds, LIE), pairs, changes, self.coarse)
 
     @cached_property
+    def lie(self) -> int | None:
+        """Which of the kinds is `LIE`; None if none is."""
+        return self.kinds.index(LIE) if LIE in self.kinds else None
+
+    @cached_property
     def _by_size(self) -> FloatArray:
         """The table (len(SIZES), CLEAN + 3 K, BINS)."""
         return np.ascontiguousarray(self.pairs.swapaxes(0, 1))

@@ -31,15 +31,18 @@ class World:
         A subset -> the boxes (n, 6) that its fusion shows there.
     speed : float
         At which all of them drive, metres a frame.
+    team : sequence of str
+        With the five that other tests are about among them.
     """
 
-    def __init__(self, said, shows, speed=0.0):
-        known = {name: [(x, y, YES) for x, y in SEEN[:, :2]] for name in (EGO, *TEAM)}
+    def __init__(self, said, shows, speed=0.0, team=TEAM):
+        known = {name: [(x, y, YES) for x, y in SEEN[:, :2]] for name in (EGO, *team)}
         for name, value in said.items():
             known[name].append((*PLACE, value))
         self.testimony = saying(known)
         self.shows = shows
         self.speed = speed
+        self.team = team
         self.alone = SEEN
         """What the ego sees alone."""
 
@@ -54,10 +57,10 @@ class World:
         """Decisions, and the boxes of each subset decoded, of frames after some quiet ones in another world, by default
         one in which nobody lies.
         """
-        state = (before or HONEST).play(quiet, defense)[-1][0].state if quiet else defense.initial_state(TEAM)
+        state = (before or HONEST).play(quiet, defense)[-1][0].state if quiet else defense.initial_state(self.team)
         rng, met = np.random.default_rng(0), []
         for _ in range(frames):
-            decision, tested = run_frame(defense, state, TEAM, [], rng, judge=self.judge)
+            decision, tested = run_frame(defense, state, self.team, [], rng, judge=self.judge)
             state = json.loads(json.dumps(decision.state))
             met.append((decision, {o.teammates: o.boxes for o in tested}))
         return met

@@ -9,6 +9,7 @@ from robosac.defenses.group_testing.candidates import (
     candidates,
     least_first,
 )
+from robosac.defenses.group_testing.choice import LIKELY_HONEST
 from robosac.defenses.group_testing.model import CELLS, CLEAN
 from robosac.defenses.group_testing.posterior import BLOCK, Posterior
 
@@ -45,6 +46,10 @@ def test_groups_of_a_larger_team_are_small_and_within_a_block(halfway):
     present = np.ones(20, dtype=bool)
     present[19] = False
     found = candidates(halfway, present, NOTHING)
+    likely_honest = present & (halfway.marginals() < LIKELY_HONEST)
+    as_answer = (found == likely_honest).all(axis=1)
+    assert (as_answer.sum(), likely_honest.sum()) == (1, 18)
+    found = found[~as_answer]
     doubtful = halfway.marginals() >= UNRESOLVED[0]
     block = np.repeat(np.arange(4), [len(block) for block in halfway.blocks()])
     groups = found[(found & doubtful).any(axis=1)] & doubtful

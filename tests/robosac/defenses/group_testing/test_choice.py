@@ -9,14 +9,17 @@ from robosac.defenses.group_testing.choice import (
     DEPENDENCE,
     GAIN,
     GAIN_SCALE,
+    HARM,
     expected_information,
     gain,
     most_promised,
+    utility,
 )
 from robosac.defenses.group_testing.evidence import Evidence
 from robosac.defenses.group_testing.geometry import followed
 from robosac.defenses.group_testing.knowledge import Knowledge
 from robosac.defenses.group_testing.memory import CHANGE_REPEAT, Memory, identity, keys
+from robosac.defenses.group_testing.model import CELLS, CLEAN, LIE, OPEN
 from robosac.defenses.group_testing.posterior import EXACT, Posterior
 from tests.robosac.defenses.group_testing.conversing import SEEN, TEAM, make_model
 
@@ -39,6 +42,27 @@ def test_larger_answers_are_worth_more_also_beyond_the_calibrated_teams():
     few = sizes <= EXACT
     np.testing.assert_allclose(worth[few], GAIN * (1 - np.exp(-sizes[few] / GAIN_SCALE)))
     assert worth[20] - worth[EXACT] == pytest.approx(0.09, abs=0.02)
+
+
+@pytest.mark.parametrize("kind", [LIE, OPEN])
+def test_who_lies_about_objects_takes_nothing_from_what_the_others_add(kind):
+    """Once one is known to lie, somebody else may, too: by that alone the answer of a large team does not shrink."""
+    model, size = MODEL.with_lies, 14
+    posterior = Posterior(len(model.kinds), 0.5, 0.15, [f"v{i:02d}" for i in range(size)])
+    told = np.full(CLEAN + CELLS * len(model.kinds), -30.0)
+    first = CLEAN + CELLS * model.kinds.index(kind)
+    told[first : first + CELLS] = 0.0
+    liar = np.arange(size) == 13
+    posterior.update(np.zeros(size, dtype=bool), liar, told)
+    known = Knowledge(model, posterior, Memory())
+    few, others, everybody = np.arange(size) < 4, ~liar, liar | True
+    clean = posterior.unattacked(posterior.masks(np.stack([few, others, everybody])))
+    assert (clean[0] > 0.4, clean[1] < 0.1, clean[2]) == (True, True, pytest.approx(0.0, abs=1e-6))
+    sizes = np.array([4, 13, 14])
+    stays, harm = (1.0, HARM * np.minimum(1.0, EXACT / sizes)) if kind == LIE else (clean, HARM)
+    worth = utility(known, np.stack([few, others, everybody]))
+    assert worth == pytest.approx(stays * gain(np.array([4, 13, 13])) - (1 - clean) * harm)
+    assert np.argmax(worth) == (1 if kind == LIE else 0)
 
 
 def test_what_was_decoded_in_the_frame_before_promises_more():

@@ -107,7 +107,7 @@ def test_those_cleared_of_a_large_team_are_asked_again_together_only(size, one_b
 def test_with_few_inspections_those_left_out_are_asked_again_by_what_the_budget_has_left(world, inspections, budget):
     """No fusion tells of a lie that is told no longer: only who is decoded where nothing is wrong is cleared."""
     defense = GroupTesting(MODEL, GroupTestingSettings(inspections=inspections, budget=budget))
-    met = HONEST.play(9, defense, quiet=2, before=world)
+    met = HONEST.play(12, defense, quiet=2, before=world)
     assert set(met[-1][0].accepted) == set(TEAM)
     assert all(len(tested) <= budget + inspections for _, tested in met)
 

@@ -76,7 +76,7 @@ def test_the_ego_is_believed_without_asking_anybody(ego, by):
 
 
 def test_where_nobody_else_is_asked_the_shape_stays_as_it_is_fused():
-    settings = GroupTestingSettings(inspections=0)
+    settings = GroupTestingSettings(inspections=0, budget=1)
     for decision, tested in World(SEE_IT, with_liar(TURNED, CAR)).play(3, GroupTesting(MODEL, settings), quiet=6):
         ((judged, row),) = there(decision, tested, decision.objects)
         np.testing.assert_array_equal(row, TURNED[0])

@@ -39,7 +39,7 @@ def test_a_ghost_is_in_no_answer():
 
 
 def test_with_the_liar_in_the_answer_a_ghost_is_contradicted():
-    decision, tested = GHOST.play(1, GroupTesting(MODEL, GroupTestingSettings(inspections=0)), quiet=6)[0]
+    decision, tested = GHOST.play(1, GroupTesting(MODEL, GroupTestingSettings(inspections=0, budget=1)), quiet=6)[0]
     assert LIAR in decision.accepted
     ((ghost, _),) = there(decision, tested, decision.contradicted)
     assert ghost.support.status is Standing.CONTRADICTED
