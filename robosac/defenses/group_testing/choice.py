@@ -56,18 +56,22 @@ def _gains(most: int) -> FloatArray:
 def utility(known: Knowledge, subsets: BoolArray) -> FloatArray:
     """What each subset (n,) is worth as an answer; the ego's own has 0.
 
+    ``U(m) = P(m clean) G(|m|) - (1 - P(m clean)) HARM``. In a team of more than `EXACT`
     ``U(m) = P(m clean) G(h) + P(m lying) (G(h) - HARM min(1, EXACT / |m|)) - P(m attacked) HARM``, with h those of m
     who are more likely honest than not. Nobody of m attacks; or whoever does lies about single objects, and takes
-    nothing from what the others add, as each box is judged by testimony, and less where it is one voice among more; or
-    somebody attacks in another way.
+    nothing from what the others add, as each box is judged by the testimony of many, and less where it is one voice
+    among more; or somebody attacks in another way.
     """
     posterior, lie = known.posterior, known.model.lie
     by_kind = posterior.unattacked_by_kind(posterior.masks(subsets))
-    clean, voices = by_kind.sum(axis=1), np.maximum(subsets.sum(axis=1), 1)
-    lying = np.zeros(len(subsets)) if lie is None else np.maximum(posterior.by_kind[lie] - by_kind[:, 1 + lie], 0.0)
-    gains = _gains(subsets.shape[1])[(subsets & (posterior.marginals() < LIKELY_HONEST)).sum(axis=1)]
-    harm = HARM * (1.0 - clean - lying * np.maximum(0.0, 1.0 - EXACT / voices))
-    worth: FloatArray = (clean + lying) * gains - harm
+    clean, gains, sizes = by_kind.sum(axis=1), _gains(subsets.shape[1]), subsets.sum(axis=1)
+    if lie is None or subsets.shape[1] <= EXACT:
+        worth: FloatArray = clean * gains[sizes] - (1.0 - clean) * HARM
+    else:
+        lying = np.maximum(posterior.by_kind[lie] - by_kind[:, 1 + lie], 0.0)
+        honest = (subsets & (posterior.marginals() < LIKELY_HONEST)).sum(axis=1)
+        harm = HARM * (1.0 - clean - lying * np.maximum(0.0, 1.0 - EXACT / np.maximum(sizes, 1)))
+        worth = (clean + lying) * gains[honest] - harm
     return worth
 
 

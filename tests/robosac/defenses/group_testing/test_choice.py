@@ -35,6 +35,14 @@ def bits(memory, subsets=SINGLES, decoded=NONE, *, ego_sees=True):
     return expected_information(known, subsets, decoded, ego_sees=ego_sees)
 
 
+def told_of(model, kind):
+    """Evidence that somebody attacks, and in which way."""
+    told = np.full(CLEAN + CELLS * len(model.kinds), -30.0)
+    first = CLEAN + CELLS * model.kinds.index(kind)
+    told[first : first + CELLS] = 0.0
+    return told
+
+
 def test_larger_answers_are_worth_more_also_beyond_the_calibrated_teams():
     sizes = np.arange(64)
     worth = gain(sizes)
@@ -45,15 +53,22 @@ def test_larger_answers_are_worth_more_also_beyond_the_calibrated_teams():
 
 
 @pytest.mark.parametrize("kind", [LIE, OPEN])
+def test_in_a_small_team_a_liar_takes_as_much_as_anybody_who_attacks(kind):
+    model, liar = MODEL.with_lies, SINGLES[0]
+    posterior = Posterior(len(model.kinds), 0.5, 0.15, TEAM)
+    posterior.update(np.zeros(len(TEAM), dtype=bool), liar, told_of(model, kind))
+    clean = posterior.unattacked(posterior.masks(np.stack([~liar])))
+    expected = clean * gain(np.array([4])) - (1 - clean) * HARM
+    assert utility(Knowledge(model, posterior, Memory()), np.stack([~liar])) == pytest.approx(expected)
+
+
+@pytest.mark.parametrize("kind", [LIE, OPEN])
 def test_who_lies_about_objects_takes_nothing_from_what_the_others_add(kind):
     """Once one is known to lie, somebody else may, too: by that alone the answer of a large team does not shrink."""
     model, size = MODEL.with_lies, 14
     posterior = Posterior(len(model.kinds), 0.5, 0.15, [f"v{i:02d}" for i in range(size)])
-    told = np.full(CLEAN + CELLS * len(model.kinds), -30.0)
-    first = CLEAN + CELLS * model.kinds.index(kind)
-    told[first : first + CELLS] = 0.0
     liar = np.arange(size) == 13
-    posterior.update(np.zeros(size, dtype=bool), liar, told)
+    posterior.update(np.zeros(size, dtype=bool), liar, told_of(model, kind))
     known = Knowledge(model, posterior, Memory())
     few, others, everybody = np.arange(size) < 4, ~liar, liar | True
     clean = posterior.unattacked(posterior.masks(np.stack([few, others, everybody])))
