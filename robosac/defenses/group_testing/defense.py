@@ -239,7 +239,7 @@ class GroupTesting:
             if subset is None and passes > 0 and clearing:
                 best = judged.best_answer()
                 subset = inspection.asked_again(best)
-                if subset is None and not settings.inspections:
+                if subset is None and not settings.inspections:  # nor might a liar ever be left out of an answer
                     subset = inspection.next_test(best)
             passes -= 1
             if subset is None:

@@ -151,6 +151,18 @@ def test_inspections_are_bounded(inspections):
     assert LIAR in later[-1][0].named
 
 
+@pytest.mark.parametrize("budget", [2, 4])
+def test_without_inspections_the_budget_finds_who_lies_in_a_large_team(budget):
+    """It stays in the answer, as its boxes are contradicted: nothing else would ever leave it out."""
+    large = [*TEAM, *(f"van-{i}" for i in range(9))]
+    lied = World({"": NO, LIAR: YES, "car-2": NO, "car-3": NO}, with_liar(CAR, CAR[:0]), team=large)
+    defense = GroupTesting(MODEL, GroupTestingSettings(inspections=0, budget=budget))
+    met = lied.play(6, defense, quiet=8, before=World({}, lambda _: CAR[:0], team=large))
+    assert met[-1][0].named == (LIAR,)
+    assert LIAR not in met[-1][0].accepted
+    assert all(len(tested) <= budget for _, tested in met)
+
+
 @pytest.mark.parametrize(
     ("frame", "verdict", "audited"), [(0, "consensus", TEAM), (0, "dissensus", TEAM[:3]), (1, "consensus", TEAM[:3])]
 )
