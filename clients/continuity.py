@@ -200,13 +200,6 @@ class Traffic:
         phase.untold += all_sent and any(not (why.model_extra or {}).get("detail") for why in lacking)
 
 
-async def one_after_another(gateways: Any, settle_s: float) -> None:
-    """A rolling restart: each process is ended by SIGTERM and begun again, and found ready, before the next."""
-    for number in range(len(gateways.processes)):
-        await gateways.restart(number, gently=True)
-        await asyncio.sleep(settle_s)
-
-
 def affinity(writers: Sequence[Sequence[str]], moves: int) -> list[str]:
     """What is wrong if sessions may have moved so often: each is decided by one process between two moves."""
     return [

@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 from collections.abc import Iterator, Mapping, Sequence
-from typing import TypeVar
 
 import numpy as np
 
@@ -14,7 +13,6 @@ from robosac.defenses import EGO, Decision, Hypothesis, JudgedBox
 Decoded = Mapping[Hypothesis, FloatArray]
 """By subset, as it was proposed: the boxes (n, 6) that were decoded of it in this frame."""
 Judged = tuple[JudgedBox, ...]
-S = TypeVar("S", bound=Support)
 
 
 class UnverifiedAnswer(Exception):
