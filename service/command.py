@@ -10,6 +10,7 @@ import typer
 import uvicorn
 
 from robosac.extras import MissingExtra
+from service.settings import SettingsError, settings_of_environment
 
 HTTP = "service.arriving.connections:BoundedHTTP"
 """By its name, so that uvicorn imports it."""
@@ -56,6 +57,11 @@ def main(
             err=True,
         )
         raise typer.Exit(2)
+    try:  # before the application is imported, which takes long
+        settings_of_environment()
+    except SettingsError as fault:
+        typer.echo(f"Error: {fault}", err=True)
+        raise typer.Exit(2) from fault
     try:
         # as uvicorn's own command does, the working directory may hold modules of the user's own detectors
         uvicorn.run(

@@ -5,6 +5,7 @@ from __future__ import annotations
 from typing import TYPE_CHECKING
 
 from robosac.detectors.base import (
+    DEFAULT_DETECTOR,
     AttackSurface,
     Detector,
     DetectorError,
@@ -24,14 +25,13 @@ from robosac.lazy import lazily
 
 if TYPE_CHECKING:
     from robosac.detectors.embedded import EmbeddedDetector
-    from robosac.detectors.loading import DEFAULT_DETECTOR, available, load
+    from robosac.detectors.loading import available, load
     from robosac.detectors.v2xsim import V2XSimDetector
     from robosac.detectors.weights_file import WeightsError
 else:
     __getattr__, __dir__ = lazily(
         __name__,
         {
-            "DEFAULT_DETECTOR": "robosac.detectors.loading:DEFAULT_DETECTOR",
             "EmbeddedDetector": "robosac.detectors.embedded:EmbeddedDetector",
             "V2XSimDetector": "robosac.detectors.v2xsim:V2XSimDetector",
             "WeightsError": "robosac.detectors.weights_file:WeightsError",

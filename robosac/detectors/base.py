@@ -21,6 +21,8 @@ if TYPE_CHECKING:
 
     from robosac.testimony import Testimony
 
+DEFAULT_DETECTOR = "intersection-mean"
+"""Of those that ship, the one that is taken where none is named."""
 Role = Literal["ego", "teammate"]
 Precision = Literal["float32", "bfloat16", "float16"]
 """The numbers in which a decoder computes."""

@@ -11,6 +11,7 @@ from pathlib import Path
 from traceback import extract_tb
 
 from robosac.detectors.base import (
+    DEFAULT_DETECTOR,
     Batching,
     Detector,
     DetectorError,
@@ -25,13 +26,11 @@ from robosac.detectors.base import (
 )
 from robosac.detectors.declared import check_info
 from robosac.detectors.device import CPU, as_device
-from robosac.detectors.embedded import EmbeddedDetector
 from robosac.detectors.recorded import MOST
 from robosac.detectors.weights_file import WeightsError, read_weights
 from robosac.faults import describe
 from robosac.plugins import Kind, classes
 
-DEFAULT_DETECTOR = EmbeddedDetector.name
 DETECTORS: Kind[Detector] = Kind("detector", str(__package__), Preparer, forms="a weights file, or module:callable")
 
 

@@ -24,6 +24,7 @@ def loaded_by(code: str) -> set[str]:
         "from robosac import IntersectionScene",
         "from robosac import SampleConsensus",
         "from robosac.audit import verify",
+        "import service.settings",  # so that a wrong one is told at once
     ],
 )
 def test_light_things_are_light_to_import(code):
