@@ -2,17 +2,23 @@
 
 from __future__ import annotations
 
+from collections.abc import Collection
 from dataclasses import dataclass, replace
 from typing import ClassVar
 
 import numpy as np
+import torch
 
-from robosac.attacks.objects import OnObjects, Scope
+from robosac.attacks.base import Aim, Tensors
+from robosac.attacks.geometric import geometric
+from robosac.attacks.objects import OnObjects, Scope, View, harm
 from robosac.attacks.places import Followed, advanced, any_places, lane_places, path_places
 from robosac.attacks.situation import Lie, Situation
 from robosac.attacks.words import hearing_in
 from robosac.boxes import FloatArray
+from robosac.defenses import EGO
 from robosac.defenses.group_testing.claims import Claims
+from robosac.detectors.base import AttackSurface
 
 AREA_M = 30.0
 """A made-up object that is farther than this from the ego along an axis is given up, and another one is made up."""
@@ -22,8 +28,10 @@ SPEED_M_S = 6.0
 """Of a driving object that follows nobody who drives."""
 DRIVES_M_S = 1.0
 """A vehicle from this speed on counts as one that drives."""
+KNOWN = 6.0
+"""Whoever denies more than this denies no more for it."""
 MOST = 10
-_STANDING, _DRIVING, _BEFORE = "standing", "driving", "before"
+_STANDING, _DRIVING, _BEFORE, _FRAMED = "standing", "driving", "before", "framed"
 
 
 @dataclass(frozen=True)
@@ -81,6 +89,52 @@ class GhostHidden(Ghost):
         said = hearing_in(scope.situation).benign
         honest = said.of([name for name in said.agents if name not in scope.attackers])
         return int(Claims.of(places, honest).likelihood.sum(axis=0).argmax())
+
+
+@dataclass(frozen=True)
+class GhostFraming(Ghost):
+    """One car that does not exist, to frame the one honest teammate that denies it.
+
+    It is parked where one teammate denies it and all others say little: where ``min(6, -L1) + 3 min(0, L2) - s / 2`` is
+    greatest. L1 and L2 are the lowest L of honest messages, and s is the sum of those above 0. The fusion of all hides
+    it, and the one without that teammate shows it. So that teammate seems to take away a vehicle that the attackers
+    alone see. Where it is not in the frame, this is a `Ghost`.
+    """
+
+    name: ClassVar[str] = "ghost-framing"
+    hears: ClassVar[bool] = True
+
+    def places(self, situation: Situation, rng: np.random.Generator) -> FloatArray:
+        """In the gaps of lanes, and anywhere."""
+        return np.vstack([lane_places(situation.truth)[:, :5], any_places(rng)])
+
+    def choose(self, scope: Scope, places: FloatArray, rng: np.random.Generator) -> int:  # noqa: ARG002
+        """Where the one stands out; never the ego, which is in every fusion."""
+        said = hearing_in(scope.situation).benign
+        honest = said.of([name for name in said.agents if name not in scope.attackers])
+        claimed = Claims.of(places, honest).likelihood
+        ranked = np.sort(claimed, axis=0)
+        stands_out = np.minimum(-ranked[0], KNOWN) + 3 * np.minimum(ranked[1:2].sum(axis=0), 0.0)
+        stands_out -= 0.5 * np.maximum(ranked[1:], 0.0).sum(axis=0)
+        stands_out[claimed.argmin(axis=0) == honest.agents.index(EGO)] = -np.inf
+        chosen = int(stands_out.argmax())
+        scope.situation.memory[_FRAMED] = honest.agents[int(claimed[:, chosen].argmin())]
+        return chosen
+
+    def aim(self, surface: AttackSurface, attackers: Collection[str], situation: Situation) -> Aim:
+        """Hidden in the fusion of all, shown without whom it frames."""
+        framed = situation.memory.get(_FRAMED)
+        if framed not in surface.messages:
+            return super().aim(surface, attackers, situation)
+        hiding = replace(situation, lies=[replace(lie, kind="erased") for lie in situation.lies])
+        hidden = super().aim(surface, attackers, hiding)
+        showing, shown = harm(situation.lies, View.of(surface, situation).honest), geometric(surface)
+
+        def loss(sent: Tensors, delta: Tensors) -> torch.Tensor:
+            messages = {name: map_ for name, map_ in {**surface.messages, **sent}.items() if name != framed}
+            return hidden(sent, delta) + showing(*shown.perceive(messages))
+
+        return loss
 
 
 @dataclass(frozen=True)

@@ -7,7 +7,7 @@ says in each frame what its lies are, and a lie that is held in the world is hel
 from __future__ import annotations
 
 from abc import abstractmethod
-from collections.abc import Callable, Collection, Mapping
+from collections.abc import Callable, Collection, Mapping, Sequence
 from dataclasses import dataclass
 from typing import ClassVar
 
@@ -37,6 +37,8 @@ MOST_PLACES = 2000
 """So many places, the best, are looked at to see what is shown. It bounds the search where there are many anchors."""
 HARM = 3.0
 """Weight of the lies, where everything else that should stay as it is has the weight 1."""
+Harm = Callable[[torch.Tensor, torch.Tensor], torch.Tensor]
+"""Of what `robosac.detectors.base.GeometricSurface.perceive` gives, a scalar."""
 
 
 @dataclass(frozen=True)
@@ -144,7 +146,7 @@ class OnObjects(IterativeAttack):
     def aim(self, surface: AttackSurface, attackers: Collection[str], situation: Situation) -> Aim:  # noqa: ARG002
         """The loss of the situation's lies, and of all that should stay."""
         honest, shown = View.of(surface, situation).honest, geometric(surface)
-        losses = [_loss(lie, honest) for lie in situation.lies]
+        told = harm(situation.lies, honest)
         held = torch.ones_like(honest.scores, dtype=torch.bool)
         for lie in situation.lies:
             if lie.kind not in ("moved", "reshaped") or _is_far(lie):
@@ -160,8 +162,7 @@ class OnObjects(IterativeAttack):
             logits, boxes = shown.perceive({**surface.messages, **sent})
             kept = balanced(logits[held], honest.scores[held], honest.scores[held] >= SEEN)
             kept = kept + displacement(boxes, honest.geometry, still)
-            harm = [each(logits, boxes) for each in losses]
-            return kept + HARM * torch.stack(harm).mean() if harm else kept
+            return kept + told(logits, boxes) if situation.lies else kept
 
         return loss
 
@@ -243,8 +244,10 @@ def _is_far(lie: Lie) -> bool:
     return lie.truth is not None and bool(np.hypot(*(lie.box[:2] - lie.truth[:2])) > FAR_M)
 
 
-def _loss(lie: Lie, honest: Perception) -> Callable[[torch.Tensor, torch.Tensor], torch.Tensor]:
-    return _Carried(lie, honest) if _is_far(lie) else _LOSSES[lie.kind](lie, honest)
+def harm(lies: Sequence[Lie], honest: Perception) -> Harm:
+    """The weighted mean of the losses of some lies, see `OnObjects`; ``honest`` is the fusion of benign messages."""
+    losses = [_Carried(lie, honest) if _is_far(lie) else _LOSSES[lie.kind](lie, honest) for lie in lies]
+    return lambda logits, boxes: HARM * torch.stack([each(logits, boxes) for each in losses]).mean()
 
 
 _LOSSES: Mapping[str, type[_Ghost] | type[_Erased] | type[_Moved] | type[_Reshaped]] = {

@@ -50,7 +50,7 @@ RULES: Mapping[str, Rule] = {
     "moved": Rule(1.0, 1, 0.3, 2.0, ((0.7, 2.0), (1.4, 3.0), (2.1, 4.0)), times=2),
     "reshaped": Rule(1.0, 1, 0.3, 2.0, (), malice=False),
     "late": Rule(1.0, 1, 0.3, 2.0, ((0.7, 2.0), (1.4, 3.0), (2.1, 4.0)), malice=False),
-    "alone": Rule(1.0, 1, 0.3, 2.0, ((0.7, 2.0), (1.4, 3.0), (2.1, 4.0)), malice=False),
+    "alone": Rule(1.0, 1, 0.3, 2.0, (), malice=False),  # one word against one
     "veiled": Rule(1.25, 1, 0.5, 3.0, ((0.75, 2.5), (1.5, 2.5), (2.25, 4.0)), times=2),
     "conflict": Rule(1.0, 3, 0.5, 6.0, ((3.0, 2.0), (4.5, 4.0), (6.0, 4.0)), times=3),
     "unseen": Rule(1.0, 3, 0.5, 6.0, ((3.0, 2.0), (4.5, 4.0), (6.0, 4.0)), malice=False, times=3),

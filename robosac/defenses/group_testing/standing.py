@@ -36,7 +36,7 @@ def judge(answer: Shown, decoded: Sequence[Shown], reshaped: Sequence[tuple[int,
        from the part that has it in the shape that others show.
     3. A vehicle that a part of the answer shows, and the answer has lost although it stands by testimony, is taken from
        there. Of the answer without one teammate that of the others is enough, and the word of one witness, if nobody
-       else denies it. No vehicle is there twice by it.
+       else denies it: then it stands as any other box. No vehicle is there twice by it.
     4. Any other box is ``confirmed`` by the ego, if all but the teammate who supports it most support it together
        (`Claims.beside`), and ``disputed`` if they do not. Where the ego does not support it, it is ``disputed`` if
        somebody denies it, or all others together lean against it (`Claims.rest`); ``confirmed`` by two teammates, of
@@ -53,7 +53,7 @@ def judge(answer: Shown, decoded: Sequence[Shown], reshaped: Sequence[tuple[int,
     """
     parts = [shown for shown in decoded if shown.teammates and set(shown.teammates) < set(answer.teammates)]
     away, contradicted, displaced = answer.away(), answer.contradicted, answer.displaced
-    kept, repairs = ~contradicted, list[Repair]()
+    kept, repairs, by_one = ~contradicted, list[Repair](), set[tuple[Hypothesis, int]]()
     for index in np.flatnonzero(displaced).tolist():
         better = _in_place(answer.boxes[index], float(away[index]), parts)
         if better is not None:
@@ -67,7 +67,10 @@ def judge(answer: Shown, decoded: Sequence[Shown], reshaped: Sequence[tuple[int,
         left = [name for name in answer.teammates if name not in part.teammates]
         lost = set(gone(answer, part).tolist())
         if len(left) == 1:  # by the word of the others, too
-            lost.update(gone(answer, part, left).tolist(), gone_alone(answer, part, left).tolist())
+            lost.update(gone(answer, part, left).tolist())
+            alone = set(gone_alone(answer, part, left).tolist()) - lost
+            by_one.update((part.teammates, at) for at in alone)
+            lost |= alone
         for at in sorted(lost):
             place = part.boxes[at, :2]
             if all(np.hypot(*(place - other.boxes[i, :2])) > SAME_M for other, i in repairs):
@@ -79,7 +82,7 @@ def judge(answer: Shown, decoded: Sequence[Shown], reshaped: Sequence[tuple[int,
     repairs, kept = _each_once(repairs, answer, kept)
     objects = _judged(answer, np.flatnonzero(kept))
     for part, at in repairs:
-        objects += _judged(part, np.array([at]), Standing.REPAIRED)
+        objects += _judged(part, np.array([at]), None if (part.teammates, at) in by_one else Standing.REPAIRED)
     return tuple(objects), tuple(_judged(answer, np.flatnonzero(contradicted), Standing.CONTRADICTED))
 
 

@@ -109,7 +109,7 @@ FULL = Extent(
         ghost:1 ghost:2 ghost-driving:1 ghost-ahead:1 ghosts:1 swarm:1 remove:1 remove:2 remove-many:1 displace:1
         dim:1 jump:1 turn:1 stretch:1 ghost-beside:1
         frozen:1 stale:1 elsewhere:1 copy:1 shift@soft:1 shift@soft:2 shift@soft3:1 erase@soft3:1
-        ghost-hidden:1 deny:1 ghost@denying:1 remove@denying:1 ghost@vouching:2
+        ghost-hidden:1 ghost-framing@vouching:1 deny:1 ghost@denying:1 remove@denying:1 ghost@vouching:2
     """),
     scenes=40,
     frames=25,

@@ -8,7 +8,7 @@ from robosac.boxes import pose_matrix
 from robosac.calibrated import witness_of
 from robosac.consensus import at_least, compare
 from robosac.defenses import EGO
-from robosac.defenses.group_testing.claims import Claims
+from robosac.defenses.group_testing.claims import DENIES, Claims
 from robosac.evaluation.encounters import Encounters
 from robosac.scenes import IntersectionScene
 from tests.robosac.attacks.linear import VEHICLES, Linear, hearing, situation
@@ -97,3 +97,21 @@ def test_of_all_free_places_honest_messages_deny_that_of_a_hidden_ghost_least(de
     fused = met.prepare(met.ego, met.teammates).detect(met.team)
     near = fused[np.hypot(*(fused[:, :2] - met.lies[0].box[:2]).T) < 1.0]
     assert near[:, 5].max(initial=0.0) > 0.5
+
+
+def test_a_framing_ghost_is_hidden_with_the_one_that_denies_it_and_shows_without(detector):
+    denier, hidden, shown = "", [], []
+    for met in Encounters(detector, IntersectionScene(1)).sequence(3, "ghost-framing", ["car-3"]):
+        (box,) = (lie.box[:5] for lie in met.lies)
+        if not denier:
+            said = witness_of(detector.info).testify(EGO, {EGO: met.ego, **met.benign}).of([EGO, *met.honest])
+            claimed = Claims.of(box[None], said).likelihood[:, 0]
+            denier = said.agents[int(claimed.argmin())]
+            assert claimed.min() <= DENIES < np.sort(claimed)[1]
+        prepared = met.prepare(met.ego, met.teammates)
+        for scores, left_out in ((hidden, ""), (shown, denier)):
+            fused = prepared.detect([name for name in met.team if name != left_out])
+            scores.append(fused[np.hypot(*(fused[:, :2] - box[:2]).T) < 1.5, 5].max(initial=0.0))
+    assert denier in met.honest
+    assert max(hidden) < 0.3
+    assert min(shown) > 0.5
