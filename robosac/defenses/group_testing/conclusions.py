@@ -259,7 +259,7 @@ def _clear(found: Findings, comparisons: Mapping[tuple[Hypothesis, Hypothesis], 
     harmless = _harmless(found, comparisons)
     straying = found.known.memory.straying
     unsuspicious = [name for name in found.team if name in best or name in harmless]
-    cleared = tuple(name for name in unsuspicious if not found.lies.worst(name) and not straying.rising(name))
+    cleared = tuple(name for name in unsuspicious if not found.lies.doubted(name) and not straying.rising(name))
     if not cleared:
         return
     log_likelihood = np.zeros(CLEAN + CELLS * len(found.known.model.kinds))

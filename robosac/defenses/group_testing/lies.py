@@ -183,6 +183,10 @@ class Lies:
         known = self.levels.get(teammate)
         return max(level / RULES[k].names for k, (level, _) in known.items()) if known else 0.0
 
+    def doubted(self, teammate: str) -> bool:
+        """Whether it seemed to lie lately, by more than one word against its own."""
+        return any(kind != "alone" for kind in self.levels.get(teammate, ()))
+
     def guilt(self, teammate: str, frame: int) -> float:
         """The same of the kinds that somebody is named for: at 1 it is. It takes more words of which nothing came for
         long: a sensor may be mounted as no other is.
