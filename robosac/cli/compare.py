@@ -41,6 +41,7 @@ from robosac.evaluation.comparison import (
     Setting,
     built,
     compare_plans,
+    kept,
     write_comparison,
     write_worlds,
 )
@@ -50,6 +51,9 @@ from robosac.evaluation.comparison.worlds import WORLDS_REPORT
 from robosac.evaluation.playing import FaultyDefense
 from robosac.figures import need_figures
 from robosac.scenes import DEFAULT_DATA, SceneError, SceneSource
+
+UNFINISHED = "unfinished"
+"""Folder beside the report in which sequences are kept until all are played."""
 
 
 def run(  # the options of a command line
@@ -90,7 +94,9 @@ def run(  # the options of a command line
     world: Annotated[list[str] | None, typer.Option(help=f"A world to play all of this in: {WORLD_HELP}")] = None,
     force: Force = False,
 ) -> None:
-    """Play every defence against every attack on the same test sequences, and write tables and pictures."""
+    """Play every defence against every attack on the same test sequences, and write tables and pictures. If it is
+    stopped, the same command goes on from the sequences that are played.
+    """
     if live and recordings is not None:
         raise typer.BadParameter("nothing is recorded live", param_hint="--recordings")
     need_figures()
@@ -112,13 +118,24 @@ def run(  # the options of a command line
         console.print(f"Left out: {why}")
     extent = replace(extent, settings=possible)
     what = (chosen, columns, extent, seed, recordings, pose_error, live)
-    plans = {name: Plan(*what, source) for name, source in sources.items()}
+    plans = {name: Plan(*what, source, out / name / UNFINISHED) for name, source in sources.items()}
+    with blaming("--out", ValueError, OSError):
+        before = sum(kept.begin(plan) for plan in plans.values())
+    if before:
+        console.print(f"Going on: {before} of {len(plans) * extent.scenes} sequences were played before")
     started = time.monotonic()
-    blamed = blaming("--world" if world else "--data", SceneError)
-    with failing(AttackError, DetectorError, FaultyDefense, DomainError), blamed, progress(console) as bar:
-        task = bar.add_task("frames", total=len(plans) * len(extent.settings) * extent.scenes * extent.frames)
-        found = compare_plans(list(plans.values()), jobs, lambda: bar.advance(task))
-    path = _write(dict(zip(plans, found, strict=True)), plans, out, command(context))
+    try:
+        blamed = blaming("--world" if world else "--data", SceneError)
+        with failing(AttackError, DetectorError, FaultyDefense, DomainError), blamed, progress(console) as bar:
+            task = bar.add_task("frames", total=len(plans) * len(extent.settings) * extent.scenes * extent.frames)
+            found = compare_plans(list(plans.values()), jobs, lambda: bar.advance(task))
+        with failing(OSError):
+            path = _write(dict(zip(plans, found, strict=True)), plans, out, command(context))
+            for plan in plans.values():
+                kept.end(plan)
+    except KeyboardInterrupt:
+        console.print("Stopped. The same command goes on from the sequences that are played.")
+        raise typer.Exit(130) from None
     rows = sum(len(each) for each in found)
     console.print(f"{path}: {rows} rows in {(time.monotonic() - started) / 60:.1f} minutes")
 

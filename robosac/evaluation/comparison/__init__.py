@@ -1,5 +1,6 @@
 """Defences against attacks and numbers of attackers, all judged on the same frames."""
 
+from robosac.evaluation.comparison import kept
 from robosac.evaluation.comparison.playing import Plan
 from robosac.evaluation.comparison.report import write_comparison
 from robosac.evaluation.comparison.rows import Row
@@ -18,6 +19,7 @@ __all__ = [
     "built",
     "compare_defenses",
     "compare_plans",
+    "kept",
     "write_comparison",
     "write_worlds",
 ]

@@ -45,6 +45,8 @@ class Plan:
     live: bool = False
     """Record nothing: each defence decodes for itself, and is timed."""
     data: SceneSource = field(default_factory=Synthetic)
+    kept: Path | None = None
+    """Folder in which each sequence is kept that is played, and from which those are taken that are there."""
 
     def scenes(self) -> list[Scene]:
         """The scenes that are played.
@@ -116,7 +118,10 @@ class Played:
         self.passes.append(passes)
 
 
-def play_scene(plan: Plan, scene: Scene, tick: Callable[[], None] = lambda: None) -> dict[tuple[Setting, str], Played]:
+PlayedScene = dict[tuple[Setting, str], Played]
+
+
+def play_scene(plan: Plan, scene: Scene, tick: Callable[[], None] = lambda: None) -> PlayedScene:
     """Every defence in every setting, in one scene. ``tick`` is called after each frame of each setting.
 
     Raises
@@ -126,7 +131,7 @@ def play_scene(plan: Plan, scene: Scene, tick: Callable[[], None] = lambda: None
     """
     what = (plan.detector, scene, plan.seed, plan.pose_error_m, another_scene(plan.data, "test", scene))
     source = Encounters(*what) if plan.live else Recordings(*what, plan.recordings, plan.data.name)
-    played: dict[tuple[Setting, str], Played] = {}
+    played: PlayedScene = {}
     for setting in plan.extent.settings:
         chosen = attackers(scene, setting.attackers, plan.seed)
         sequence = source.sequence(plan.extent.frames, setting.campaign, chosen, tick)

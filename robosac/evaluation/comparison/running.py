@@ -9,13 +9,12 @@ from multiprocessing.sharedctypes import Synchronized
 
 import torch
 
-from robosac.evaluation.comparison.playing import ORACLE, Plan, Played, play_scene
+from robosac.evaluation.comparison import kept
+from robosac.evaluation.comparison.playing import ORACLE, Plan, PlayedScene, play_scene
 from robosac.evaluation.comparison.rows import Row, precisions, sum_up
-from robosac.evaluation.comparison.settings import Setting
+from robosac.scenes import Scene
 
 _POLL_S = 0.5
-
-PlayedScene = dict[tuple[Setting, str], Played]
 
 
 def compare_defenses(plan: Plan, jobs: int = 1, tick: Callable[[], None] = lambda: None) -> list[Row]:
@@ -49,10 +48,27 @@ def compare_plans(plans: Sequence[Plan], jobs: int = 1, tick: Callable[[], None]
     """Several comparisons, each as `compare_defenses` makes it; the processes share the scenes of all."""
     scenes = [plan.scenes() for plan in plans]
     if jobs == 1:
-        played = [[play_scene(plan, scene, tick) for scene in each] for plan, each in zip(plans, scenes, strict=True)]
+        played = [
+            [_sequence(plan, number, scene, tick) for number, scene in enumerate(each)]
+            for plan, each in zip(plans, scenes, strict=True)
+        ]
     else:
         played = _in_processes(plans, [len(each) for each in scenes], jobs, tick)
     return [_rows(plan, each) for plan, each in zip(plans, played, strict=True)]
+
+
+def _sequence(plan: Plan, number: int, scene: Scene, tick: Callable[[], None]) -> PlayedScene:
+    """One sequence of a plan, played now or earlier."""
+    if plan.kept is None:
+        return play_scene(plan, scene, tick)
+    played = kept.load(plan.kept, number)
+    if played is None:
+        played = play_scene(plan, scene, tick)
+        kept.keep(plan.kept, number, played)
+    else:
+        for _ in range(len(plan.extent.settings) * plan.extent.frames):
+            tick()
+    return played
 
 
 def _rows(plan: Plan, scenes: Sequence[PlayedScene]) -> list[Row]:
@@ -81,7 +97,7 @@ def _in_processes(
                     if future.done():
                         future.result()
         finally:
-            pool.shutdown(wait=False, cancel_futures=True)
+            pool.shutdown(cancel_futures=True)
     _tell(tick, told, done.value)
     return [[future.result() for future in each] for each in asked]
 
@@ -111,4 +127,4 @@ def _play_scene(which: int, number: int) -> PlayedScene:
         with done.get_lock():
             done.value += 1
 
-    return play_scene(plans[which], plans[which].scenes()[number], tick)
+    return _sequence(plans[which], number, plans[which].scenes()[number], tick)
