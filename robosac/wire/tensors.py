@@ -30,7 +30,8 @@ def tensor_fields(array: np.ndarray[Any, np.dtype[Any]], packing: Packing) -> di
     sent = array
     if packing.dtype is not None and narrow.may_narrow(array, packing.dtype):
         bits, exponents = narrow.narrowed(array, packing.dtype)
-        if np.array_equal(narrow.widened(bits, exponents, array.dtype.name), array):
+        # by bytes, as signatures are of these: -0 is not 0
+        if narrow.widened(bits, exponents, array.dtype.name).tobytes() == array.tobytes():
             sent, more = bits, {} if exponents is None else {"exponents": exponents.tobytes()}
     data = little_endian(sent)
     if packing.compress:

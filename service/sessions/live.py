@@ -48,6 +48,7 @@ class LiveSession:
     detector: Detector
     team: tuple[str, ...]
     public_keys: Mapping[str, str]
+    token_ids: Mapping[str, str]
     gathering: Gathering
     motion: Motion
     budget_s: float
@@ -74,17 +75,23 @@ class LiveSession:
 
     def follow(self, record: SessionRecord) -> None:
         """Catch up with what another process did to the session, if one did."""
-        if (self.team, self.public_keys) != (record.teammates, record.public_keys):
-            known = [one for one in record.teammates if self.public_keys.get(one) == record.public_keys.get(one)]
-            self.gathering.change_team(known)  # what those with another key now have sent does not count
+        ours = self.team, self.public_keys, self.token_ids
+        if ours != (record.teammates, record.public_keys, record.token_ids):
+            # whoever has another key or token now may have left and joined again: what it has sent does not count
+            known = [one for one in record.teammates if self._is_who_it_was(one, record)]
+            self.gathering.change_team(known)
             self.gathering.change_team(record.teammates)
             self.motion.forget_all_but((record.ego_id, *record.teammates))
-            self.team, self.public_keys = record.teammates, record.public_keys
+            self.team, self.public_keys, self.token_ids = record.teammates, record.public_keys, record.token_ids
         if record.last_frame is not None and record.last_frame > self.gathering.closed:
             self.gathering.close(record.last_frame)
         self.session.state = record.state
         if record.last_frame != self.answered:
             self.session.previous = self.ego_proof = None
+
+    def _is_who_it_was(self, vehicle: str, record: SessionRecord) -> bool:
+        same_key = self.public_keys.get(vehicle) == record.public_keys.get(vehicle)
+        return same_key and self.token_ids.get(vehicle) == record.token_ids.get(vehicle)
 
     @property
     def is_quiet(self) -> bool:

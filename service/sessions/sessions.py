@@ -249,6 +249,7 @@ class Sessions:
             detector,
             record.teammates,
             record.public_keys,
+            record.token_ids,
             Gathering(
                 record.teammates,
                 settings.max_pending_frames,

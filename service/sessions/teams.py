@@ -76,6 +76,7 @@ class Teams:
             token = self.tokens.issue(record.session_id, vehicle, is_ego=caller.is_ego)
             event = TokenRenewed(vehicle_id=vehicle, expires_at=token.expires_at)
             await self.store.renew_token(record.session_id, record.token_ids[vehicle], token.token_id, event)
+            caller.live.token_ids = {**caller.live.token_ids, vehicle: token.token_id}  # what it has sent still counts
             return RenewedToken(token=token.text, expires_at=token.expires_at)
 
     async def _change_team(

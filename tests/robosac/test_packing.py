@@ -26,6 +26,8 @@ def test_maps_travel_as_bytes_where_nothing_is_lost_by_it():
         assert message.tensors["features"].dtype == np.float16
         np.testing.assert_array_equal(message.tensors["features"], ROUNDED.tensors["features"])
     assert len({wire.content_digest(0, "car-2", message) for message in (*read, ROUNDED)}) == 1
+    signed = wire.pack_message(0, "x", Message(POSE, {"features": -ROUNDED.tensors["features"]}), packing=BYTES)
+    assert msgpack.unpackb(signed)["tensors"]["features"]["dtype"] == "float16"  # -0 is another message than 0
     odd = Message(POSE, {"features": FEATURES + np.float16(0.001)})
     assert msgpack.unpackb(wire.pack_message(0, "x", odd, packing=BYTES))["tensors"]["features"]["dtype"] == "float16"
     frame = msgpack.unpackb(wire.pack_frame(0, ROUNDED, {"car-2": odd, "rsu": ROUNDED}, packing=BYTES))

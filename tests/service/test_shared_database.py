@@ -83,6 +83,30 @@ async def test_who_left_at_one_gateway_is_a_stranger_at_the_other(two, messages,
     assert (await other.ego(session).ask(2, messages[EGO])).accepted == ("rsu",)
 
 
+async def test_what_an_earlier_member_sent_to_the_other_gateway_does_not_count(two, messages, benign):
+    one, other = two
+    session = await one.open(defense={"kind": "none"}, gather_ms=20)
+    await other.teammate(session, TEAM[-1]).send(1, messages["car-2"])  # by whoever stole its token
+    await other.teammate(session, TEAM[-1]).send(2, messages[TEAM[-1]])
+    await one.ego(session).dismiss(TEAM[-1])
+    session.teammate_tokens.update(await one.ego(session).enrol([TEAM[-1]]))
+    await other.teammate(session, TEAM[-1]).send(1, messages[TEAM[-1]])
+    assert (await other.ego(session).ask(1, messages[EGO])).accepted == (TEAM[-1],)
+    silent = await other.ego(session).ask(2, messages[EGO])
+    assert silent.rejected[TEAM[-1]].reason == "missing"
+    assert "equivocation" not in {record["event"] for record in await one.ego(session).audit()}
+
+
+async def test_what_waits_still_counts_where_its_sender_takes_a_fresh_token(two, messages):
+    one, _ = two
+    session = await one.open(defense={"kind": "none"}, gather_ms=20)
+    await one.teammate(session, "rsu").send(1, messages["rsu"])
+    session.teammate_tokens["rsu"] = (await one.teammate(session, "rsu").renew()).token
+    await one.teammate(session, "rsu").send(2, messages["rsu"])
+    for frame in (1, 2):
+        assert (await one.ego(session).ask(frame, messages[EGO])).accepted == ("rsu",)
+
+
 @contextlib.contextmanager
 def meanwhile(served, *happenings):
     """Let something happen in each of the next fusions, before the decision is kept."""
