@@ -7,14 +7,20 @@ method is missing and what it is for. The code of what is found is run: never ta
 
 from __future__ import annotations
 
+import ast
+import hashlib
 import inspect
 import pkgutil
 import re
+import sys
+import sysconfig
 from collections.abc import Callable, Collection, Iterator, Mapping
-from dataclasses import dataclass
+from dataclasses import dataclass, field
 from functools import cached_property
 from importlib import import_module
 from importlib.metadata import entry_points
+from importlib.util import resolve_name
+from pathlib import Path
 from typing import Any, Generic, TypeVar
 
 T = TypeVar("T")
@@ -55,6 +61,8 @@ class Kind(Generic[T]):
     """Other ways to ask for one than a name, for messages."""
     error: type[ValueError] = ValueError
     """Raised where one cannot be had."""
+    origins: set[str] = field(default_factory=set, compare=False)
+    """Modules of those that do not ship and were made in this process."""
 
     @cached_property
     def shipped(self) -> Mapping[str, type[T]]:
@@ -106,12 +114,53 @@ class Kind(Generic[T]):
         if offered is None and not _REFERENCE.fullmatch(text):
             names = [each for each in sorted(self.shipped) if f"{each}:" not in self.forms]  # the others are in these
             raise self.error(f"no {self.noun} {text!r}: give one of {', '.join(names)}, {self.forms}")
+        self.origins.add((offered or text).partition(":")[0])
         try:
             made: T = pkgutil.resolve_name(text)() if offered is None else pkgutil.resolve_name(offered)(*arguments)
         except (Exception, SystemExit) as error:  # the user's code may raise anything, or be a script that ends
             said = " ".join(str(error).split())
             raise self.error(f"{text}: {type(error).__name__}: {said}") from error
         return made
+
+
+def code_of(*kinds: Kind[Any]) -> str:
+    """A digest of the user's own code that things of some kinds were made by in this process; empty if there was none.
+
+    It is of the modules that they came from, and of what these import, but not of what is installed.
+    """
+    files: dict[str, Path] = {}
+    names = [name for kind in kinds for name in kind.origins]
+    while names:
+        name = names.pop()
+        place = getattr(sys.modules.get(name), "__file__", None)
+        if name in files or not place or _is_installed(Path(place)):
+            continue
+        files[name] = Path(place)
+        if place.endswith(".py"):
+            names += _imported(Path(place).read_bytes(), sys.modules[name].__package__ or "")
+    return digest_of(*files.values()) if files else ""
+
+
+def digest_of(*files: Path) -> str:
+    """A digest of the contents of files, whatever their order."""
+    contents = sorted(hashlib.sha256(file.read_bytes()).digest() for file in files)
+    return hashlib.sha256(b"".join(contents)).hexdigest()
+
+
+def _imported(source: bytes, package: str) -> Iterator[str]:
+    """Names of modules that the source of one imports, and of what may be some."""
+    for node in ast.walk(ast.parse(source)):
+        if isinstance(node, ast.Import):
+            yield from (alias.name for alias in node.names)
+        elif isinstance(node, ast.ImportFrom) and (package or not node.level):
+            base = resolve_name("." * node.level + (node.module or ""), package)
+            yield from (base, *(f"{base}.{alias.name}" for alias in node.names))
+
+
+def _is_installed(file: Path) -> bool:
+    paths = sysconfig.get_paths()
+    roots = {Path(paths[name]) for name in ("stdlib", "platstdlib", "purelib", "platlib")} | {Path(__file__).parent}
+    return any(file.is_relative_to(root) for root in roots)
 
 
 def parts(contract: type[Any]) -> dict[str, str]:

@@ -13,6 +13,7 @@ import typer
 from rich.console import Console
 
 from robosac import defenses
+from robosac.attacks import KIND as ATTACKS
 from robosac.attacks import AttackError, lacking, load_campaign
 from robosac.budget import DomainError
 from robosac.cli.blame import blaming, check_known, failing, listed
@@ -31,6 +32,7 @@ from robosac.cli.options import (
 from robosac.cli.outputs import Force, make_folder
 from robosac.defenses import Defense
 from robosac.detectors import DEFAULT_DETECTOR, Detector, DetectorError
+from robosac.detectors.loading import DETECTORS
 from robosac.evaluation.comparison import (
     DEFENSES,
     FULL,
@@ -50,7 +52,8 @@ from robosac.evaluation.comparison.rows import EARLY
 from robosac.evaluation.comparison.worlds import WORLDS_REPORT
 from robosac.evaluation.playing import FaultyDefense
 from robosac.figures import need_figures
-from robosac.scenes import DEFAULT_DATA, SceneError, SceneSource
+from robosac.plugins import code_of
+from robosac.scenes import DEFAULT_DATA, SOURCES, SceneError, SceneSource
 
 UNFINISHED = "unfinished"
 """Folder beside the report in which sequences are kept until all are played."""
@@ -118,7 +121,8 @@ def run(  # the options of a command line
         console.print(f"Left out: {why}")
     extent = replace(extent, settings=possible)
     what = (chosen, columns, extent, seed, recordings, pose_error, live)
-    plans = {name: Plan(*what, source, out / name / UNFINISHED) for name, source in sources.items()}
+    code = code_of(ATTACKS, DETECTORS, SOURCES)
+    plans = {name: Plan(*what, source, out / name / UNFINISHED, code) for name, source in sources.items()}
     with blaming("--out", ValueError, OSError):
         before = sum(kept.begin(plan) for plan in plans.values())
     if before:

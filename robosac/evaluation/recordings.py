@@ -66,6 +66,8 @@ class Recordings(Encounters):
     """Where they are kept and looked for; by default nowhere."""
     data: str = DEFAULT_DATA
     """Name of the scenes' source."""
+    code: str = ""
+    """Digest of the user's own code that makes them; empty where all of it ships."""
     _recorded: dict[Act, dict[int, DecodedOnce]] = field(default_factory=dict, init=False)
 
     def met(self, act: Act, indices: Sequence[int]) -> Iterator[DecodedOnce]:
@@ -89,7 +91,16 @@ class Recordings(Encounters):
     def _file(self, act: Act) -> str:
         info, scene = self.detector.info, self.scene.number
         data = [self.data] if self.data != DEFAULT_DATA else []
-        identity = [FORMAT, *data, info.name, info.weights_digest, scene, act.attack, *act.acting]
+        identity = [
+            FORMAT,
+            *data,
+            *filter(None, [self.code]),
+            info.name,
+            info.weights_digest,
+            scene,
+            act.attack,
+            *act.acting,
+        ]
         digest = hashlib.sha256(json.dumps([*identity, self.seed, self.pose_error_m]).encode()).hexdigest()
         return f"{scene}-{re.sub('[^A-Za-z0-9-]', '-', act.attack)}-{len(act.acting)}-{digest[:16]}.npz"
 

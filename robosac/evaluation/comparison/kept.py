@@ -3,10 +3,8 @@
 from __future__ import annotations
 
 import gzip
-import hashlib
 import json
 import shutil
-import sys
 from collections.abc import Mapping, Sequence
 from dataclasses import asdict
 from importlib.metadata import version
@@ -18,12 +16,14 @@ import numpy as np
 
 import robosac
 from robosac.calibrated import calibration_digest
+from robosac.defenses.registry import DEFENSES
 from robosac.evaluation.average_precision import Matched
 from robosac.evaluation.comparison.playing import Naming, Plan, Played, PlayedScene
 from robosac.evaluation.comparison.settings import Setting
 from robosac.evaluation.objects import Judged, ObjectHistory
 from robosac.evaluation.standing import TrueBoxes
 from robosac.files import replacing, write_text
+from robosac.plugins import code_of, digest_of
 
 _PLAN = "plan.json"
 _SEQUENCES = "*.msgpack.gz"
@@ -35,7 +35,7 @@ def begin(plan: Plan) -> int:
     Returns
     -------
     int
-        How many are there already, by an earlier run of the same plan.
+        How many of those that the plan wants are there already.
 
     Raises
     ------
@@ -47,8 +47,7 @@ def begin(plan: Plan) -> int:
     if plan.kept is None:
         return 0
     path, ours = plan.kept / _PLAN, _described(plan)
-    there = len(list(plan.kept.glob(_SEQUENCES)))
-    theirs = json.loads(path.read_text()) if there else ours
+    theirs = json.loads(path.read_text()) if any(plan.kept.glob(_SEQUENCES)) else ours
     other = [name for name, value in ours.items() if theirs.get(name) != value]
     if other:
         raise ValueError(
@@ -56,7 +55,7 @@ def begin(plan: Plan) -> int:
             "choose another folder or delete it"
         )
     write_text(path, json.dumps(ours, indent=1))
-    return there
+    return sum(_file(plan.kept, number).exists() for number in range(plan.extent.scenes))
 
 
 def load(folder: Path, number: int) -> PlayedScene | None:
@@ -107,11 +106,9 @@ def _described(plan: Plan) -> dict[str, Any]:
 
 
 def _code(plan: Plan) -> str:
-    """A digest of this package, and of the modules that what is the user's own comes from."""
-    own = (type(each).__module__ for each in (plan.detector, plan.data, *plan.defenses.values()))
-    files = {Path(place) for name in own if (place := getattr(sys.modules[name], "__file__", None))}
-    files.update(file for place in robosac.__path__ for file in Path(place).rglob("*.py"))
-    return hashlib.sha256(b"".join(hashlib.sha256(file.read_bytes()).digest() for file in sorted(files))).hexdigest()
+    """A digest of this package, and of what is the user's own."""
+    package = digest_of(*(file for place in robosac.__path__ for file in Path(place).rglob("*.py")))
+    return f"{package} {plan.code} {code_of(DEFENSES)}"
 
 
 def _played(values: Mapping[str, Any]) -> Played:

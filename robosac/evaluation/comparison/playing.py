@@ -47,6 +47,8 @@ class Plan:
     data: SceneSource = field(default_factory=Synthetic)
     kept: Path | None = None
     """Folder in which each sequence is kept that is played, and from which those are taken that are there."""
+    code: str = ""
+    """Digest of the user's own code of attacks, detector and scenes; what is recorded belongs to it."""
 
     def scenes(self) -> list[Scene]:
         """The scenes that are played.
@@ -130,7 +132,7 @@ def play_scene(plan: Plan, scene: Scene, tick: Callable[[], None] = lambda: None
         If a defence fails.
     """
     what = (plan.detector, scene, plan.seed, plan.pose_error_m, another_scene(plan.data, "test", scene))
-    source = Encounters(*what) if plan.live else Recordings(*what, plan.recordings, plan.data.name)
+    source = Encounters(*what) if plan.live else Recordings(*what, plan.recordings, plan.data.name, plan.code)
     played: PlayedScene = {}
     for setting in plan.extent.settings:
         chosen = attackers(scene, setting.attackers, plan.seed)

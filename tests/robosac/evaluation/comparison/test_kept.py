@@ -1,6 +1,7 @@
 """A comparison that is stopped goes on from the sequences that are played."""
 
 import re
+import sys
 from dataclasses import replace
 
 import pytest
@@ -94,6 +95,78 @@ def test_code_that_has_changed_plays_anew(whole, tmp_path, monkeypatch):
     monkeypatch.setattr(kept.robosac, "__path__", [*kept.robosac.__path__, str(package)])
     with pytest.raises(ValueError, match="differs in code;"):
         kept.begin(plan)
+
+
+def test_fewer_sequences_than_there_are_can_be_asked_for(whole, tmp_path):
+    plan = replace(whole[0], kept=tmp_path / "kept")
+    kept.begin(plan)
+    compare_defenses(plan)
+    assert kept.begin(replace(plan, extent=replace(plan.extent, scenes=1))) == 1
+
+
+MINE = """
+import torch
+from robosac.attacks import Attack
+from {helper} import STRENGTH
+
+class Mine(Attack):
+    name = "mine"
+
+    def run(self, surface, attackers, rng, situation=None):
+        return {{name: surface.messages[name] + STRENGTH for name in attackers}}
+"""
+
+
+@pytest.fixture
+def own(tmp_path, monkeypatch):
+    """The file that one's own attack takes its strength from, and the attack's name."""
+    monkeypatch.syspath_prepend(tmp_path)
+    for name in ("kept_strength", "kept_mine"):
+        monkeypatch.delitem(sys.modules, name, raising=False)
+    (tmp_path / "kept_strength.py").write_text("STRENGTH = 0.5\n")
+    (tmp_path / "kept_mine.py").write_text(MINE.format(helper="kept_strength"))
+    return tmp_path / "kept_strength.py", "kept_mine:Mine:1"
+
+
+def compare(*arguments):
+    return CliRunner().invoke(app, ["compare", *SHORT, *map(str, arguments)], env={"COLUMNS": "300"})
+
+
+SHORT = ["--only", "no defence", "--scenes", "2", "--frames", "6"]
+
+
+def test_ones_own_code_counts_with_what_it_imports(own, tmp_path, monkeypatch):
+    helper, attack = own
+    play = running.play_scene
+
+    def once(plan, scene, tick):
+        if scene.number != 0:
+            raise KeyboardInterrupt
+        return play(plan, scene, tick)
+
+    arguments = ["--setting", attack, "--live", "--out", tmp_path / "out"]
+    with monkeypatch.context() as patched:
+        patched.setattr(running, "play_scene", once)
+        assert compare(*arguments).exit_code == 130
+    helper.write_text("STRENGTH = 0.1\n")
+    refused = compare(*arguments)
+    assert refused.exit_code == 2
+    assert "differs in code;" in refused.output
+    helper.write_text("STRENGTH = 0.5\n")
+    assert compare(*arguments).exit_code == 0
+
+
+def test_what_other_code_recorded_is_not_used(own, tmp_path):
+    helper, attack = own
+    folder = tmp_path / "recordings"
+    arguments = ["--setting", attack, "--recordings", folder, "--force", "--out", tmp_path / "out"]
+    files = []
+    for strength in (0.5, 0.5, 0.1):
+        helper.write_text(f"STRENGTH = {strength}\n")
+        assert compare(*arguments).exit_code == 0
+        files.append(len(list(folder.iterdir())))
+    assert files[0] == files[1]
+    assert files[2] == 2 * files[0]
 
 
 def test_the_same_command_goes_on_and_leaves_the_report_alone(tmp_path, monkeypatch):
