@@ -10,6 +10,7 @@ from collections.abc import Collection, Iterable, Mapping
 
 import numpy as np
 
+from robosac.boxes import pose_fault
 from robosac.budget import DomainError
 from robosac.deadline import Deadline
 from robosac.defenses import EGO, Defense
@@ -17,6 +18,9 @@ from robosac.detectors import DetectorInfo, Message
 from robosac.detectors.base import Role
 from robosac.plugins import lacks
 from robosac.screening import Screening
+
+_WIDEST = 8
+"""Bytes of the widest numbers that torch has."""
 
 
 def check_session(team: object, defense: object, rng: object, screening: object) -> None:
@@ -90,7 +94,8 @@ def check_deadline(deadline: object) -> None:
 
 
 def check_frame(info: DetectorInfo, ego: Message, teammates: Mapping[str, Message]) -> None:
-    """Refuse messages that are not of a detector's layout; what their numbers are is not looked at.
+    """Refuse messages that are not of a detector's layout, and an ego that is nowhere; what the numbers of tensors are
+    is not looked at.
 
     Raises
     ------
@@ -100,6 +105,8 @@ def check_frame(info: DetectorInfo, ego: Message, teammates: Mapping[str, Messag
         raise TypeError("teammates must be a mapping of ids to messages")
     check_ids("teammates", teammates)
     _check_message(info, "ego", ego, "ego")
+    if fault := pose_fault(ego.pose):
+        raise ValueError(f"ego: the pose {fault}")
     for name, message in teammates.items():
         _check_message(info, "teammate", message, f"teammates[{name!r}]")
 
@@ -120,7 +127,7 @@ def _check_array(what: str, array: object, shape: tuple[int, ...], wanted: str, 
         raise TypeError(f"{what} must be a numpy array, got {type(array).__name__}")
     if array.shape != shape:
         raise ValueError(f"{what} must be of shape {shape}, got {array.shape}")
-    if array.dtype.kind not in kinds:
+    if array.dtype.kind not in kinds or array.dtype.itemsize > _WIDEST:
         raise ValueError(f"{what} must be of {wanted}, got {array.dtype}")
 
 

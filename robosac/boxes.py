@@ -8,6 +8,7 @@ for both arguments wherever two sets of boxes meet. Lists of numbers will do for
 
 from __future__ import annotations
 
+from operator import mul
 from typing import Any
 
 import numpy as np
@@ -21,6 +22,8 @@ MIN_UPRIGHT = 0.5
 """Cosine of the largest tilt of a sensor; views from above mean nothing beyond it."""
 MAX_TRANSLATION_M = 1e8
 """Farther than any earth-fixed frame needs; beyond it single precision would lose the warp."""
+_LAST_ROW, _LAST_ONE = 1e-9, 1e-5
+"""By how much the zeros and the one of a transform's last row may be off."""
 _UNIT_CORNERS = np.array([[0.5, 0.5], [-0.5, 0.5], [-0.5, -0.5], [0.5, -0.5]])
 _CLOSED = _UNIT_CORNERS[[0, 1, 2, 3, 0]]
 _NMS_BLOCK = 64
@@ -71,17 +74,23 @@ def pose_matrix(x: float, y: float, z: float, yaw: float) -> FloatArray:
 
 
 def pose_fault(pose: FloatArray) -> str | None:
-    """Why a matrix (4, 4) of finite numbers can be no sensor's pose; None if it can."""
-    pose = as_pose(pose)
-    rotation = pose[:3, :3]
-    rigid = (np.abs(rotation) <= 1 + RIGID_TOLERANCE).all() and np.allclose(
-        rotation @ rotation.T, np.eye(3), atol=RIGID_TOLERANCE
+    """Why a matrix (4, 4) of finite numbers can be no sensor's pose; None if it can.
+
+    By plain numbers, which takes a tenth of what it takes with arrays: each message of each frame is checked.
+    """
+    (a, b, c, x), (d, e, f, y), (g, h, i, z), last = as_pose(pose).tolist()
+    rows = (a, b, c), (d, e, f), (g, h, i)
+    small = all(abs(value) <= 1 + RIGID_TOLERANCE for row in rows for value in row)
+    rigid = small and all(
+        abs(sum(map(mul, rows[m], rows[n])) - (m == n)) <= RIGID_TOLERANCE for m in range(3) for n in range(m, 3)
     )
-    if not rigid or np.linalg.det(rotation) < 0 or not np.allclose(pose[3], (0, 0, 0, 1), atol=1e-9):
+    mirrored = a * (e * i - f * h) - b * (d * i - f * g) + c * (d * h - e * g) < 0
+    affine = all(abs(value) <= _LAST_ROW for value in last[:3]) and abs(last[3] - 1) <= _LAST_ONE
+    if not rigid or mirrored or not affine:
         return "must be a rigid transform: a rotation, a translation, last row 0 0 0 1"
-    if rotation[2, 2] < MIN_UPRIGHT:
+    if i < MIN_UPRIGHT:
         return "must be upright: the sensor's z axis within 60 degrees of the world's"
-    if np.abs(pose[:3, 3]).max() > MAX_TRANSLATION_M:
+    if not max(abs(x), abs(y), abs(z)) <= MAX_TRANSLATION_M:
         return f"must lie within {MAX_TRANSLATION_M:g} m of the world's origin"
     return None
 

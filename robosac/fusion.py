@@ -18,7 +18,7 @@ import numpy as np
 from robosac.ahead import Ahead
 from robosac.answers import Reason, Source, Verdict
 from robosac.arguments import check_deadline, check_defense, check_frame, check_rng
-from robosac.boxes import FloatArray
+from robosac.boxes import FloatArray, pose_fault
 from robosac.calibrated import witness_of
 from robosac.consensus import at_least, compare
 from robosac.deadline import Deadline
@@ -80,7 +80,7 @@ def fuse(  # all that a decision follows from, so that it can be made again
     defense : Defense
     ego : Message
     teammates : mapping of teammate id to Message
-        Those present in this frame; their numbers finite, their poses such as can be (`robosac.wire.check_message`).
+        Those present in this frame, their numbers finite. Whose pose cannot be is rejected as malformed.
     rng : numpy.random.Generator
         All randomness of the defence.
     state : mapping, optional
@@ -141,11 +141,15 @@ class FrameRun:
             state = first_state(self.defense, team)
         state, memory = separated(state)
         screened = Screened({}, (), memory)
+        nowhere = {name: fault for name in team if (fault := pose_fault(teammates[name].pose))}
+        refused = {name: Rejection(Reason.MALFORMED, {"field": "pose", "detail": nowhere[name]}) for name in nowhere}
         try:
             if self.screening is not None:
                 yield
-                screened = self._screen(self.screening, memory, teammates)
-            passed = {name: teammates[name] for name in team if name not in screened.refused}
+                placed = {name: message for name, message in teammates.items() if name not in refused}
+                screened = self._screen(self.screening, memory, placed)
+                refused |= screened.refused
+            passed = {name: teammates[name] for name in team if name not in refused}
             yield
             passes = self._prepare(passed)
             if getattr(self.defense, "asks_witnesses", False):
@@ -156,14 +160,14 @@ class FrameRun:
         except Exception as error:
             logger.exception("fusion failed; answering with the ego's own perception")
             self.fault = describe(error)
-            passed = {name: teammates[name] for name in team if name not in screened.refused}
+            passed = {name: teammates[name] for name in team if name not in refused}
             rejected = {name: Rejection(Reason.NOT_SAMPLED, {"fault": self.fault}) for name in passed}
             decision = Decision((), Source.EGO_ONLY, rejected, None, state)
             yield
             answered = yield from self._assemble(self._prepare({}), decision)
         boxes = answered["boxes"]
         decided = {part.name: getattr(decision, part.name) for part in fields(Decision)}
-        answered["rejected"] = {**decision.rejected, **screened.refused}
+        answered["rejected"] = {**decision.rejected, **refused}
         answered["state"] = joined(decision.state, screened.memory)
         return FusionResult(
             **decided | answered,

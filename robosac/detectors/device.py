@@ -60,7 +60,8 @@ def by_cell(maps: Sequence[np.ndarray[Any, np.dtype[Any]]], device: torch.device
 def gone_up(arrays: Sequence[np.ndarray[Any, np.dtype[Any]]], device: torch.device = CPU) -> torch.Tensor:
     """Arrays together on a device, in their own type and in C order."""
     pinned = device.type == "cuda"  # so that nothing waits for them to arrive
-    dtype = torch.from_numpy(np.empty(0, arrays[0].dtype)).dtype
+    wide = np.result_type(*{array.dtype for array in arrays}).newbyteorder("=")  # torch knows no other order
+    dtype = torch.from_numpy(np.empty(0, wide)).dtype
     together = torch.empty((len(arrays), *arrays[0].shape), dtype=dtype, pin_memory=pinned)
     np.stack(arrays, out=together.numpy())
     return together.to(device, non_blocking=pinned)

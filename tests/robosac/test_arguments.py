@@ -54,6 +54,19 @@ def test_fuse_names_the_message_and_the_tensor_that_is_not_of_the_layout(detecto
             fused(rng, detector, None, Message(pose, ego_message.tensors), benign)
 
 
+@pytest.mark.parametrize("pose", [np.zeros((4, 4)), np.full((4, 4), np.nan), np.diag([1.0, 1, -1, 1])])
+def test_a_teammate_that_is_nowhere_costs_only_itself(pose, detector, ego_message, benign):
+    session = robosac.Session(detector, list(benign), rng=np.random.default_rng(0))
+    broken = benign | {"car-2": Message(pose, benign["car-2"].tensors)}
+    for frame in range(2):
+        result = session.answer(frame, ego_message, broken)
+        assert result.fault is None
+        assert (result.rejected["car-2"].reason, result.rejected["car-2"].evidence["field"]) == ("malformed", "pose")
+        assert set(result.accepted) == set(benign) - {"car-2"}
+    with pytest.raises(ValueError, match=r"^ego: the pose must be a rigid transform"):
+        session.answer(2, Message(pose, ego_message.tensors), benign)
+
+
 def test_fuse_names_the_array_that_is_none_or_of_other_things_than_numbers(detector, ego_message, benign, rng):
     features, pose = ego_message.tensors["features"], ego_message.pose
     for wrong, kind, told in (
@@ -61,6 +74,7 @@ def test_fuse_names_the_array_that_is_none_or_of_other_things_than_numbers(detec
         (Message(pose.astype(str), ego_message.tensors), ValueError, "the pose must be of numbers, got <U"),
         (Message(pose, {"features": torch.tensor(features)}), TypeError, "the tensor 'features' must be a numpy array"),
         (Message(pose, {"features": features.astype(int)}), ValueError, "'features' must be of float16, got int64"),
+        (Message(pose, {"features": features.astype("g")}), ValueError, "'features' must be of float16, got float128"),
         (Message(pose, {"features": features.astype(str)}), ValueError, "'features' must be of float16, got <U"),
     ):
         for who, ego, teammates in (
@@ -83,10 +97,13 @@ def test_a_message_may_be_frozen_spaced_or_of_wider_numbers(detector, ego_messag
     frozen = features.copy()
     frozen.flags.writeable = False
     wanted = fused(np.random.default_rng(0), detector, None, ego_message, benign)
-    for array in (frozen, features.astype(">f2"), features.astype(np.float32), np.asfortranarray(features)):
-        said = {**benign, "rsu": replace(benign["rsu"], tensors={"features": array})}
-        result = fused(np.random.default_rng(0), detector, None, ego_message, said)
-        assert (result.accepted, result.boxes.tolist()) == (wanted.accepted, wanted.boxes.tolist())
+    wider = (features.astype(dtype) for dtype in (">f2", ">f4", np.float32, np.float64))
+    for array in (frozen, *wider, np.asfortranarray(features)):
+        for sender in ("rsu", min(benign)):
+            mine = array if sender == "rsu" else benign[sender].tensors["features"].astype(array.dtype)
+            said = {**benign, sender: replace(benign[sender], tensors={"features": mine})}
+            result = fused(np.random.default_rng(0), detector, None, ego_message, said)
+            assert (result.accepted, result.boxes.tolist()) == (wanted.accepted, wanted.boxes.tolist())
 
 
 def test_a_frame_that_is_no_integer_is_refused_and_spoils_no_later_one(detector, ego_message, benign):
