@@ -19,7 +19,7 @@ from robosac.attacks.alibi import Alibi, covering, framing, keeping
 from robosac.attacks.base import Attack, IterativeAttack, Tensors, Term
 from robosac.attacks.geometric import SHOWN
 from robosac.attacks.hearing import Hearing
-from robosac.attacks.returned import check_returned, of_attackers
+from robosac.attacks.returned import check_returned, check_sent, of_attackers
 from robosac.attacks.situation import Past, Situation
 from robosac.boxes import FloatArray, pose_matrix
 from robosac.detectors.base import AttackSurface, Detector, Encoder, GeometricSurface, Message, Preparer, blank
@@ -207,7 +207,9 @@ class Campaign:
             known = replace(known, hearing=Hearing.of(detector.info, ego, surface.messages, known.poses))
         tensors = self._attacked(surface, acting, rng, known)
         check_returned(self.name, tensors, surface, acting)
-        attacking = {name: detector.perturbed(sent[name], tensor) for name, tensor in tensors.items()}
+        with np.errstate(over="ignore"):  # what is too large is told below
+            attacking = {name: detector.perturbed(sent[name], tensor) for name, tensor in tensors.items()}
+        check_sent(self.name, attacking, known.lies)
         return {**sent, **attacking} if self.pose is not None else attacking
 
     def _attacked(

@@ -2,14 +2,20 @@
 
 from __future__ import annotations
 
-from collections.abc import Collection, Mapping
+from collections.abc import Collection, Mapping, Sequence
 from typing import TypeVar
 
+import numpy as np
 import torch
 
-from robosac.detectors.base import AttackSurface
+from robosac.attacks.situation import Lie
+from robosac.detectors.base import AttackSurface, Message
 
 T = TypeVar("T")
+
+_OF_NUMPY = frozenset(
+    torch.from_numpy(np.empty(0, kind)).dtype for kind in ("f2", "f4", "f8", "i1", "i2", "i4", "i8", "u1", "?")
+)
 
 
 class AttackError(ValueError):
@@ -71,8 +77,41 @@ def check_returned(name: str, sent: object, surface: AttackSurface, acting: Coll
             raise AttackError(f"{part} must be of shape {tuple(benign.shape)}, got {tuple(tensor.shape)}")
         if tensor.is_complex():
             raise AttackError(f"{part} must be of real numbers, got {tensor.dtype}")
+        if tensor.layout is not torch.strided or tensor.dtype not in _OF_NUMPY:
+            raise AttackError(f"{part} must be dense, of a type that numpy has, got {tensor.dtype}, {tensor.layout}")
         if not torch.isfinite(tensor).all():
             raise AttackError(f"{part} holds NaN or infinity")
+
+
+def check_sent(name: str, sent: Mapping[str, Message], lies: Sequence[object]) -> None:
+    """Refuse what became of it: numbers that a message cannot hold, and lies that are none.
+
+    Parameters
+    ----------
+    name : str
+        The attack's.
+    sent : mapping of attacker to Message
+        Its messages, in the types of the detector.
+    lies : sequence of object
+        What it says that it lies about.
+
+    Raises
+    ------
+    AttackError
+        That says which part is wrong.
+    """
+    for vehicle, message in sent.items():
+        for tensor, values in message.tensors.items():
+            if not np.isfinite(values).all():
+                part = f"{name}: the message of {vehicle!r} that run returned"
+                raise AttackError(
+                    f"{part} holds numbers too large for the tensor {tensor!r}, which is of {values.dtype}"
+                )
+    for lie in lies:
+        if not isinstance(lie, Lie):
+            raise AttackError(f"{name}: situation.lies must hold each a Lie, got {lie!r:.100}")
+        if lie.kind in ("moved", "reshaped") and lie.truth is None:
+            raise AttackError(f"{name}: a lie of kind {lie.kind!r} needs the true box of its vehicle")
 
 
 def check_aim(name: str, value: object) -> None:

@@ -53,7 +53,7 @@ def check_boxes(boxes: object) -> FloatArray:
     Raises
     ------
     DetectorError
-        If they are no (n, 6) ndarray of finite numbers.
+        If they are no (n, 6) ndarray of finite numbers, or a length or width is negative.
     """
     if not isinstance(boxes, np.ndarray):
         raise DetectorError(f"detect must return an array of boxes (n, 6), got a {type(boxes).__name__}")
@@ -61,6 +61,8 @@ def check_boxes(boxes: object) -> FloatArray:
         raise DetectorError(f"detect must return boxes (n, 6), got {boxes.shape}")
     if boxes.dtype.kind not in "fiu" or not np.isfinite(boxes).all():
         raise DetectorError("detect must return finite numbers")
+    if (boxes[:, 2:4] < 0).any():
+        raise DetectorError(f"detect must return lengths and widths of 0 or more, got {boxes[:, 2:4].min():g}")
     return boxes
 
 

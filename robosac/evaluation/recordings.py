@@ -18,6 +18,7 @@ from robosac.attacks.situation import Lie
 from robosac.boxes import FloatArray
 from robosac.defenses import EGO
 from robosac.detectors import Detector, Message
+from robosac.detectors.base import check_boxes
 from robosac.evaluation.encounters import NOBODY_ACTS, Act, Encounters
 from robosac.evaluation.frames import DecodedOnce, EvaluationFrame, Subset
 from robosac.files import replacing
@@ -42,7 +43,7 @@ def record(frame: EvaluationFrame, unattacked: DecodedOnce | None = None) -> Dec
         if unattacked is not None and frame.attackers.isdisjoint(subset):
             boxes[subset] = unattacked.detect(subset)
         else:
-            boxes[subset] = prepared.detect(sorted(subset)).astype(np.float32).astype(np.float64)
+            boxes[subset] = check_boxes(prepared.detect(sorted(subset))).astype(np.float32).astype(np.float64)
     return decoded(frame, boxes)
 
 

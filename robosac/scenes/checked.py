@@ -132,7 +132,7 @@ class CheckedScene(SceneAround):
         period_s = self.scene.frame_period_s
         if not isinstance(period_s, Real) or not 0 < period_s < math.inf:
             raise SceneError(f"{self._where}: frame_period_s must be a positive number of seconds, got {period_s!r}")
-        return period_s
+        return float(period_s)
 
     @property
     def _where(self) -> str:

@@ -31,6 +31,7 @@ def test_a_fault_inside_is_answered_by_the_ego_alone(part, caplog):
         (SEEN[0], r"boxes \(n, 6\), got \(6,\)"),
         (SEEN * np.nan, "finite numbers"),
         (SEEN.astype(str), "finite numbers"),
+        (SEEN * [1, 1, -1, 1, 1, 1], "lengths and widths of 0 or more, got -"),
     ],
 )
 def test_what_are_no_boxes_is_a_fault_that_is_told(boxes, words, caplog):

@@ -22,6 +22,11 @@ SHAPE = (3, 4)
         ({"b": np.zeros(SHAPE)}, "mine: the message of 'b' that run returned must be a tensor, got a ndarray"),
         ({"b": torch.zeros(1, 4)}, r"the message of 'b' .* must be of shape \(3, 4\), got \(1, 4\)"),
         ({"b": torch.zeros(SHAPE, dtype=torch.complex64)}, "must be of real numbers, got torch.complex64"),
+        (
+            {"b": torch.zeros(SHAPE, dtype=torch.bfloat16)},
+            "must be dense, of a type that numpy has, got torch.bfloat16",
+        ),
+        ({"b": torch.zeros(SHAPE).to_sparse()}, "must be dense, of a type that numpy has, .* torch.sparse_coo"),
         ({"b": torch.full(SHAPE, torch.nan)}, "the message of 'b' that run returned holds NaN or infinity"),
     ],
 )
@@ -33,6 +38,31 @@ def test_what_is_no_message_of_an_attacker_is_refused(sent, words):
 def test_messages_of_some_attackers_will_do():
     for sent in ({}, {"a": torch.zeros(SHAPE)}, {"b": torch.zeros(SHAPE, dtype=torch.float64)}):
         check_returned("mine", sent, Linear(), ["a", "b"])
+
+
+BOX = np.array([5.0, 0.0, 4.5, 1.9, 0.0])
+
+
+@pytest.mark.parametrize(
+    ("more", "lie", "words"),
+    [
+        (1e30, None, "the message of 'car-2' that run returned holds numbers too large for the tensor 'features'"),
+        (0.0, "ghost", "situation.lies must hold each a Lie, got 'ghost'"),
+        (0.0, Lie("moved", BOX), "a lie of kind 'moved' needs the true box of its vehicle"),
+    ],
+)
+def test_what_a_message_cannot_hold_and_lies_that_are_none_are_refused(
+    more, lie, words, detector, ego_message, benign, rng
+):
+    class Mine(Attack):
+        name = "mine"
+
+        def run(self, surface, attackers, rng, situation=None):
+            situation.lies.extend([] if lie is None else [lie])
+            return {name: surface.messages[name].double() + more for name in attackers}
+
+    with pytest.raises(AttackError, match=f"^mine: {words}"):
+        Campaign.of(Mine()).messages(detector, ego_message, benign, ["car-2"], 0, rng)
 
 
 @pytest.mark.parametrize(

@@ -83,6 +83,11 @@ def test_what_is_sound_stays_as_it_is():
     assert frame(seen(points=None, message=message)).views["van-0"].message is message
 
 
+def test_a_period_is_a_plain_number_as_json_has_it():
+    scene = CheckedScene(type("Odd", (Scene,), {"frame_period_s": np.float32(0.5)})(), "t7")
+    assert type(scene.frame_period_s) is float
+
+
 def test_a_scene_is_what_it_was():
     (scene,) = CheckedSource(Source()).scenes("test")
     assert (scene.number, scene.length, scene.frame_period_s) == (7, 50, 0.2)
