@@ -23,7 +23,7 @@ _WIDEST = 8
 """Bytes of the widest numbers that torch has."""
 
 
-def check_session(team: object, defense: object, rng: object, screening: object) -> None:
+def check_session(team: object, defense: object, saved: object, rng: object, screening: object) -> None:
     """Refuse what `robosac.Session` cannot be made of.
 
     Raises
@@ -33,6 +33,8 @@ def check_session(team: object, defense: object, rng: object, screening: object)
     check_team(team)
     if defense is not None:
         check_defense(defense)
+    if saved is not None and not (isinstance(saved, Mapping) and isinstance(saved.get("state"), Mapping)):
+        raise TypeError(f"saved must be what Session.save gave, got {saved!r:.100}")
     if rng is not None:
         check_rng(rng)
     if not isinstance(screening, Screening | None) and screening != "calibrated":

@@ -109,7 +109,7 @@ class Session:
         rng: np.random.Generator | None = None,
         screening: Screening | Literal["calibrated"] | None = "calibrated",
     ) -> None:
-        check_session(team, defense, rng, screening)
+        check_session(team, defense, saved, rng, screening)
         self.detector = detector
         self.screening = screening_for(detector.info) if screening == "calibrated" else screening
         self.defense = defense or _default(detector)

@@ -37,6 +37,8 @@ def read_weights(path: Path) -> tuple[dict[str, torch.Tensor], dict[str, Any]]:
     WeightsError
         If the file cannot be read or its tensors do not have the digest that its metadata gives.
     """
+    if Path(path).is_dir():
+        raise WeightsError(f"{path} is a folder; a weights file is wanted")
     try:
         with safe_open(path, framework="pt") as file:
             metadata = file.metadata() or {}

@@ -122,6 +122,8 @@ def test_a_session_names_what_it_cannot_be_made_of():
         ({"team": "car-2"}, TypeError, "team must be a sequence of ids, got 'car-2'"),
         ({"team": ["a", "b", "a"]}, ValueError, "team: id 2 is there twice"),
         ({"defense": "none"}, TypeError, "defense must be a defence, and str lacks"),
+        ({"saved": {}}, TypeError, "saved must be what Session.save gave, got {}"),
+        ({"saved": "state"}, TypeError, "saved must be what Session.save gave, got 'state'"),
         ({"rng": 7}, TypeError, r"rng must be a numpy.random.Generator"),
         ({"screening": "none"}, TypeError, "screening must be a Screening"),
     ):

@@ -250,6 +250,8 @@ def test_recipes_with_impossible_numbers_are_refused(name, value, tmp_path):
 
 def test_a_file_that_is_no_weights_file_is_refused(tmp_path):
     path = tmp_path / "weights.safetensors"
+    with pytest.raises(WeightsError, match="is a folder; a weights file is wanted"):
+        EmbeddedDetector(tmp_path)
     with pytest.raises(WeightsError, match="not a readable safetensors file"):
         EmbeddedDetector(path)
     path.write_bytes(b"junk")
