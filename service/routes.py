@@ -266,8 +266,8 @@ async def get_messages(kept: Annotated[bytes, Depends(_kept_messages)]) -> Respo
 
 
 def _room(gateway: Gateway, caller: Caller) -> Share:
-    """What bodies of a session may take of the room for all."""
-    return gateway.bodies.share(caller.record.key_id, caller.record.session_id)
+    """What a body of a vehicle may take of the room for all."""
+    return gateway.bodies.share(caller.record.key_id, caller.record.session_id, caller.vehicle_id)
 
 
 async def _read_body(request: Request, caller: Caller, gateway: Gateway, limit: int) -> bytes:

@@ -136,15 +136,15 @@ class Gathering:
                 if frame <= self._closed:
                     self.refuse(sender, frame, Reason.REPLAYED, detail)
                 raise Unusable(Kind.DUPLICATE_MESSAGE, Reason.REPLAYED, detail)
-            self._put(mine, frame, None)
+            self._put(sender, frame, None)
             raise Contradiction(said)
         if frame <= self._closed:
             reason = Reason.LATE if frame == self._closed else Reason.STALE
             detail = f"frame {frame} is answered; the latest answered is {self._closed}"
             self.refuse(sender, frame, reason, detail)
             raise Unusable(Kind.STALE_FRAME, reason, detail)
-        self._room.check(received.nbytes)
-        self._put(mine, frame, received)
+        self._room.of(sender).check(received.nbytes)
+        self._put(sender, frame, received)
         self._said[sender][frame] = received.proof
         if sum(later > self._closed for later in mine) > self._max_ahead + 1:
             farthest = max(mine)
@@ -244,17 +244,18 @@ class Gathering:
         self._set_aside = {name: told for name, told in self._refusals.items() if name not in later}
         self._refusals = later
 
-    def _put(self, mine: dict[int, Received | None], frame: int, received: Received | None) -> None:
+    def _put(self, sender: str, frame: int, received: Received | None) -> None:
+        mine = self._pending[sender]
         before = mine.get(frame)
         if received is None and frame <= self._closed and frame not in mine:
             return
         mine[frame] = received
-        self._room.add((received.nbytes if received else 0) - (before.nbytes if before else 0))
+        self._room.of(sender).add((received.nbytes if received else 0) - (before.nbytes if before else 0))
 
     def _drop(self, sender: str, frame: int) -> None:
         dropped = self._pending[sender].pop(frame)
         if dropped is not None:
-            self._room.add(-dropped.nbytes)
+            self._room.of(sender).add(-dropped.nbytes)
 
     def _forget(self, sender: str, frames: Sequence[int]) -> None:
         for frame in frames:

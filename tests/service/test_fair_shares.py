@@ -8,8 +8,10 @@ from collections import Counter
 import pytest
 
 from clients.client import GatewayClient
+from clients.errors import RequestRefused
 from robosac import wire
 from robosac.detectors import EmbeddedDetector
+from service.arriving.bodies import JSON_BYTES
 from service.schemas import SessionCreated
 from tests.service.conftest import EGO, TEAM, problem, serve
 from tests.service.many import MANY
@@ -193,6 +195,67 @@ async def test_bodies_of_one_session_leave_room_for_those_of_another(good_frame)
         go_on.set()
         assert (await held).status_code == 200
         assert served.gateway.bodies.nbytes == 0
+
+
+@pytest.mark.parametrize("keys", ["a" * 20, "a" * 20 + "," + "b" * 20])
+async def test_bodies_that_a_teammate_never_sends_keep_no_frame_out(keys, messages, good_frame):
+    async with serve(max_inflight_bytes=4 * 2**20, api_keys=keys) as served:
+        mine, other = await open_one(served, "a", TEAM), await open_one(served, "a", TEAM)
+
+        async def never():
+            await asyncio.Event().wait()
+            yield b""
+
+        token, size = mine.teammate_tokens["rsu"], len(wire.pack_message(0, "rsu", messages["rsu"]))
+        posts = [
+            asyncio.create_task(served.post(mine, "messages", never(), token, **{"Content-Length": str(size)}))
+            for _ in range(40)
+        ]
+        await asyncio.sleep(0.3)
+        assert 2 <= sum(not task.done() for task in posts) <= 8
+        for session in (mine, other):
+            assert (await served.post(session, "frames", good_frame(0))).status_code == 200
+            await served.teammate(session, "car-2").send(1, messages["car-2"])
+        for task in posts:
+            task.cancel()
+        await asyncio.gather(*posts, return_exceptions=True)
+        assert served.gateway.bodies.nbytes == 0
+
+
+async def test_openings_of_one_key_do_not_keep_another_from_opening():
+    async with serve(max_inflight_bytes=2**20, api_keys="a" * 20 + "," + "b" * 20) as served:
+
+        async def never():
+            await asyncio.Event().wait()
+            yield b""
+
+        headers = {"Authorization": f"Bearer {'a' * 20}", "Content-Type": "application/json"}
+        headers["Content-Length"] = str(JSON_BYTES)
+        posts = [
+            asyncio.create_task(served.http.post("/v1/sessions", content=never(), headers=headers)) for _ in range(6)
+        ]
+        await asyncio.sleep(0.3)
+        assert any(task.done() for task in posts)
+        await open_one(served, "b")
+        for task in posts:
+            task.cancel()
+        await asyncio.gather(*posts, return_exceptions=True)
+
+
+async def test_waiting_messages_of_one_teammate_leave_room_to_the_others_of_its_session(messages):
+    settings = {"max_pending_bytes": 2**22, "max_pending_bytes_per_key": 2**21, "max_pending_frames": 30}
+    async with serve(api_keys="a" * 20 + "," + "b" * 20, **settings) as served:
+        session = await open_one(served, "a", TEAM)
+
+        async def send_ahead():
+            for frame in range(31):
+                await served.teammate(session, "rsu").send(frame, messages["rsu"])
+
+        with pytest.raises(RequestRefused, match="no more than is left for others"):
+            await send_ahead()
+        for name in set(TEAM) - {"rsu"}:
+            await served.teammate(session, name).send(0, messages[name])
+        assert set((await served.ego(session).ask(0, messages[EGO])).accepted) == set(TEAM)
 
 
 async def test_a_body_counts_as_what_its_tensors_hold_once_they_are_expanded(messages):
