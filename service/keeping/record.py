@@ -50,7 +50,7 @@ class SessionRecord:
     holder: str = ""
     """Name of the process that the ego asked last (`service.sessions.moving.Moving`); empty if that is not known."""
     kept_bytes: int = 0
-    """Of its log, and of the messages that are kept with it once it has ended."""
+    """Of its log, and once it has ended of its row and of the messages that are kept with it."""
     revision: int = 0
     """Changes to the session so far, other than to its log."""
 

@@ -20,7 +20,7 @@ from service.keeping.database import connect
 from service.keeping.limits import Limits
 from service.keeping.patience import Patience
 from service.keeping.record import SessionRecord
-from service.keeping.rows import ADD_MESSAGES, FIELDS, GET, GET_BUT_KNOWN, NO_CHANGE, OPEN, TOUCH, columns, read_row
+from service.keeping.rows import ADD_REST, FIELDS, GET, GET_BUT_KNOWN, NO_CHANGE, OPEN, TOUCH, columns, read_row
 from service.keeping.sealing import Draft, Ready, Sealing, drafted, sealed
 from service.keeping.seen import Seen
 from service.keeping.tables import audit_lines, kept_messages, sessions
@@ -255,7 +255,7 @@ class Store:
         return await self._database.read(lambda connection: connection.execute(query).scalar())
 
     async def end(self, session_id: str, event: SessionEnded, unused_since: float | None = None) -> None:
-        """End a session; its log stays until it is purged.
+        """End a session; its log stays until it is purged. What nobody reads any more is forgotten.
 
         Raises
         ------
@@ -264,11 +264,13 @@ class Store:
         """
 
         def keep(connection: Connection) -> None:
-            connection.execute(ADD_MESSAGES, {"this": session_id})
+            connection.execute(ADD_REST, {"this": session_id})
             connection.execute(once.forget_proofs(session_id))
 
         first = partial(check_unused, session_id=session_id, since=unused_since)
-        await self._append(session_id, event, lambda _: {"ended_at": event.time}, keep, first=first)
+        await self._append(
+            session_id, event, lambda _: {"ended_at": event.time, "defense": {}, "state": {}}, keep, first=first
+        )
         self._sealing.forget(session_id)
 
     async def unused_since(self, moment: float) -> list[str]:

@@ -9,7 +9,7 @@ from zlib import crc32
 from sqlalchemy import Connection, Select, func, select
 
 from service.errors import Kind, Refused
-from service.keeping.rows import ENDED, OPEN
+from service.keeping.rows import ENDED, IN_ROW, OPEN
 from service.keeping.tables import sessions
 
 _LOCK = 0x0D5EAD
@@ -41,7 +41,8 @@ def check_room(connection: Connection, key_id: str, most: int) -> None:
 def of_keys(connection: Connection) -> Counter[str]:
     """Bytes that are kept of the sessions of each API key, open or ended."""
     kept: Counter[str] = Counter()
-    for some in (OPEN, ENDED):  # apart, as only ended ones are summed by an index alone, and there may be many
-        query = select(sessions.c.key_id, func.sum(sessions.c.kept_bytes)).where(some).group_by(sessions.c.key_id)
+    nbytes = sessions.c.kept_bytes
+    for some, kept_of in ((OPEN, nbytes + IN_ROW), (ENDED, nbytes)):  # many may have ended: an index alone sums those
+        query = select(sessions.c.key_id, func.sum(kept_of)).where(some).group_by(sessions.c.key_id)
         kept.update({key_id: int(total) for key_id, total in connection.execute(query)})
     return kept

@@ -95,7 +95,7 @@ async def test_what_was_there_before_stays_and_the_log_goes_on(url):
     await store.close()
     await run(url, *(f"ALTER TABLE {table} DROP COLUMN {name}" for table, name in later.items()))
     async with opened(url) as store:
-        assert await store.kept_bytes() == {"": 2 * 2048}
+        assert (await store.get(sid)).kept_bytes == 2 * 2048
         await store.log(sid, note())
         assert len(await check_chain(store, sid)) == 3
     assert (await run(url, f"SELECT count(*) FROM {partitions.BEFORE}"))[0][0] == 2

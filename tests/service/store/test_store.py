@@ -21,6 +21,7 @@ from service.errors import (
 )
 from service.keeping.once import MOST_PROOFS
 from service.keeping.record import SessionRecord
+from service.keeping.rows import ROW_BYTES
 from service.keeping.store import PAGE, Store
 from tests.service.store.conftest import (
     A_TEAM,
@@ -321,10 +322,34 @@ async def test_it_is_known_what_is_kept_for_each_key(store):
         await store.decide(record, a_decision(frame), seed, messages, keep_frames=1)
     await store.end(ended, THE_END)
     lines = {sid: sum(len(line.encode()) for line in await store.audit(sid, 0)) for sid in (open_one, ended, of_other)}
-    assert await store.kept_bytes() == {"a": lines[open_one] + lines[ended] + 3000, "b": lines[of_other]}
+    rows = {sid: row_bytes(await store.get(sid)) for sid in lines}
+    kept = {sid: lines[sid] + rows[sid] for sid in lines}
+    assert await store.kept_bytes() == {"a": kept[open_one] + kept[ended] + 3000, "b": kept[of_other]}
     assert (await store.get(open_one)).kept_bytes == lines[open_one]
     await store.purge(time.time() + 1)
-    assert await store.kept_bytes() == {"a": lines[open_one], "b": lines[of_other]}
+    assert await store.kept_bytes() == {"a": kept[open_one], "b": kept[of_other]}
+
+
+def row_bytes(record):
+    """Bytes of what can be long in a session's row, and of the rest of it."""
+    fields = (record.teammates, record.defense, record.token_ids, record.public_keys, record.state)
+    return ROW_BYTES + sum(len(json.dumps(field)) for field in fields)
+
+
+async def test_what_a_defence_remembers_is_kept_until_its_session_ends(store):
+    sid = await added(store, 0, key_id="a", state={"memory": "x" * 100_000})
+    assert (await store.kept_bytes())["a"] > 100_000
+    await decided(store, sid, 1, memory="x" * 300_000)
+    assert (await store.kept_bytes())["a"] > 300_000
+    other = await added(store, 1, key_id="b", defense={"kind": "conformal", "calibration": [0.1] * 9000})
+    before = (await store.kept_bytes())["b"]
+    await store.end(other, THE_END)
+    assert (await store.kept_bytes())["b"] < before - 40_000
+    await store.end(sid, THE_END)
+    ended = await store.get(sid)
+    assert (ended.state, ended.defense, ended.token_ids) == ({}, {}, {"ego": "t0", "a": "t1", "b": "t2"})
+    assert ended.kept_bytes == (await store.kept_bytes())["a"]
+    await check_chain(store, sid)
 
 
 async def test_a_full_log_takes_only_the_end(url):
