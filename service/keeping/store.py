@@ -268,9 +268,7 @@ class Store:
             connection.execute(once.forget_proofs(session_id))
 
         first = partial(check_unused, session_id=session_id, since=unused_since)
-        await self._append(
-            session_id, event, lambda _: {"ended_at": event.time, "defense": {}, "state": {}}, keep, first=first
-        )
+        await self._append(session_id, event, lambda _: {"ended_at": event.time, "state": {}}, keep, first=first)
         self._sealing.forget(session_id)
 
     async def unused_since(self, moment: float) -> list[str]:
