@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import os
 from pathlib import Path
-from typing import BinaryIO
+from typing import BinaryIO, cast
 
 from robosac import wire
 from robosac.answers import Typed
@@ -30,6 +30,44 @@ from robosac.recording.content import (
     Poses,
     TrueFrame,
 )
+
+
+class _Growing:
+    """A new file that is only added to, and is open only as long as it is of use."""
+
+    def __init__(self, path: Path) -> None:
+        self._path = path
+        self._file: BinaryIO = path.open("xb")
+        self._size = 0
+
+    @property
+    def is_removed(self) -> bool:
+        return not self._path.exists() if self._file.closed else os.fstat(self._file.fileno()).st_nlink == 0
+
+    def rest(self) -> None:
+        self._size = self.tell()
+        self._file.close()
+
+    def write(self, data: bytes) -> int:
+        return self._open().write(data)
+
+    def flush(self) -> None:
+        self._open().flush()
+
+    def tell(self) -> int:
+        return self._size if self._file.closed else self._file.tell()
+
+    def fileno(self) -> int:
+        return self._open().fileno()
+
+    def close(self) -> None:
+        self._file.close()
+
+    def _open(self) -> BinaryIO:
+        if self._file.closed:
+            self._file = self._path.open("r+b")  # not "ab", which would make a file anew that is removed
+            self._file.seek(0, os.SEEK_END)
+        return self._file
 
 
 class RecordingFile:
@@ -64,9 +102,9 @@ class RecordingFile:
         self._left_previous: PreviousAnswer | None = None
         self._begun = False
         self._channels: dict[str, int] = {}
-        self._file: BinaryIO = path.open("xb")
+        self._file = _Growing(path)
         try:
-            self._writer = Writer(self._file, compression=CompressionType.LZ4)
+            self._writer = Writer(cast("BinaryIO", self._file), compression=CompressionType.LZ4)
             self._writer.start(profile="", library="robosac")
             self._writer.add_metadata(METADATA, {"format": FORMAT, "session": opening.session_id})
             for topic in FORMS:
@@ -88,7 +126,11 @@ class RecordingFile:
     @property
     def is_removed(self) -> bool:
         """Whether somebody has removed the file, so that nothing can be read any more of what is written to it."""
-        return os.fstat(self._file.fileno()).st_nlink == 0
+        return self._file.is_removed
+
+    def rest(self) -> None:
+        """Have no file open until more is added: of those a process may have only so many."""
+        self._file.rest()
 
     def add(self, moment: Moment, dropped: int = 0) -> None:
         """Add a frame, after so many that were not added."""

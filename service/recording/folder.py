@@ -44,7 +44,7 @@ class Folder:
     bodies : bool
         Whether messages are recorded, or their digests.
     most_open : int
-        Files that are open at a time; the one unused for longest is closed for another.
+        Files that the system has open at a time. The others wait for their sessions' next frames as they are.
     """
 
     root: Path
@@ -53,9 +53,11 @@ class Folder:
     bodies: bool
     most_open: int = 64
     _files: dict[str, _Open] = field(default_factory=dict)
+    _at_hand: dict[str, None] = field(default_factory=dict)
+    """Sessions whose files may be open, those used last at the end."""
     _ros2: Ros2 = field(default_factory=Ros2)
-    _written: int = 0
-    """Bytes since the folder was measured."""
+    _written: int | None = None
+    """Bytes since the folder was measured, if it was."""
 
     def make(self) -> None:
         """Make the folder, and make sure that it can be written to.
@@ -87,17 +89,18 @@ class Folder:
         if opened is not None and opened.file.is_removed:
             self._files.pop(session_id).file.abandon()
             opened = None
+        before = 0 if opened is None else opened.file.size
         opened = opened or self._begin(record, moment)
-        opened.used = now
+        self._use(session_id, opened, now)
         try:
-            before = opened.file.size
             opened.file.add(moment, dropped)
-            self._written += opened.file.size - before
         except BaseException:
             self._files.pop(session_id).file.abandon()
             raise
-        if opened.file.size >= min(self.most_file, self.most // 2):
+        size = opened.file.size
+        if size >= min(self.most_file, self.most // 2):
             self.end(session_id)
+        self._written = (self._written or 0) + size - before
         if self._written * LOOKS >= self.most:
             self.make_room()
 
@@ -109,7 +112,9 @@ class Folder:
         OSError
         """
         opened = self._files.pop(session_id, None)
-        if opened is not None:
+        if opened is not None and opened.file.is_removed:
+            opened.file.abandon()
+        elif opened is not None:
             opened.file.close()
 
     def close(self, idle_s: float = 0.0) -> None:
@@ -145,18 +150,27 @@ class Folder:
             total -= size
 
     def _begin(self, record: SessionRecord, moment: Moment) -> _Open:
-        if len(self._files) >= self.most_open:
-            self.end(min(self._files, key=lambda name: self._files[name].used))
-        self.make_room()
+        if self._written is None:
+            self.make_room()
         part = 1 + max((int(m["part"]) for m, _ in self._found() if m["session"] == record.session_id), default=0)
         began = time.strftime("%Y%m%dT%H%M%SZ", time.gmtime(moment.time_ns / 1e9))
         path = self.root / f"{began}-{record.session_id}-{part:04d}.mcap"
         kept = {name: value for name, value in vars(record).items() if name in Opening.model_fields}
         more = {"version": version("robosac"), "least_score": moment.least_score, "bodies": self.bodies, "part": part}
         opening = Opening(**kept, **more)
-        file = RecordingFile(path, opening, moment.time_ns, self._ros2)
-        opened = self._files[record.session_id] = _Open(file, time.monotonic())
-        return opened
+        return _Open(RecordingFile(path, opening, moment.time_ns, self._ros2), time.monotonic())
+
+    def _use(self, session_id: str, opened: _Open, now: float) -> None:
+        """A session's file is written to now; others that are open rest where they are too many."""
+        opened.used = now
+        self._files[session_id] = opened
+        self._at_hand.pop(session_id, None)
+        self._at_hand[session_id] = None
+        while len(self._at_hand) > self.most_open:
+            first = next(iter(self._at_hand))
+            del self._at_hand[first]
+            if first in self._files:
+                self._files[first].file.rest()
 
     def _found(self) -> Iterator[tuple[re.Match[str], Path]]:
         for path in self.root.iterdir():

@@ -149,11 +149,15 @@ class Recorder:
 
     def _work(self) -> None:
         """What the thread does."""
+        look_at = 0.0
         while True:
+            now = time.monotonic()
+            if now >= look_at:
+                self._try(lambda folder: folder.close(IDLE_S))
+                look_at = now + IDLE_S / 2
             try:
                 noted = self._waiting.get(timeout=IDLE_S / 2)
             except queue.Empty:
-                self._try(lambda folder: folder.close(IDLE_S))
                 continue
             if noted is None:
                 self._try(Folder.close)

@@ -1,4 +1,5 @@
 import asyncio
+import contextlib
 import os
 import threading
 import time
@@ -223,19 +224,74 @@ def test_files_are_rotated_and_the_oldest_are_removed(recorded_moments, tmp_path
     assert all(file.frames[0].decided.before is not None for file in latest.files)
 
 
-def test_of_many_sessions_some_files_are_closed(recorded_moments, tmp_path):
-    folder = Folder(tmp_path, most_file=2**28, most=2**33, bodies=False, most_open=2)
+def open_files(folder):
+    """Recordings in a folder that this process has open."""
+    places = []
+    for number in Path("/proc/self/fd").iterdir():
+        with contextlib.suppress(FileNotFoundError):  # that of this very look
+            places.append(number.readlink())
+    return [place for place in places if folder in place.parents]
+
+
+def test_of_many_sessions_that_take_turns_each_has_one_file_and_few_are_open(recorded_moments, tmp_path):
+    folder = Folder(tmp_path, most_file=2**28, most=2**33, bodies=False)
     folder.make()
-    for turn in range(2):
-        for number in range(3):
+    for turn in range(4):
+        for number in range(folder.most_open + 2):
             folder.add(a_session(number), recorded_moments[turn], 0)
-            assert len(folder._files) <= 2
+    assert len(open_files(tmp_path)) == folder.most_open == 64
     folder.close(idle_s=60.0)
-    assert len(folder._files) == 2
+    assert len(list(tmp_path.iterdir())) == 66
+    folder.end(a_session(0).session_id)
     folder.close()
-    assert not folder._files
-    assert sorted(len(session.frames) for session in sessions(tmp_path)) == [2, 2, 2]
-    assert folder.recorded() == {f"{number:032x}" for number in range(3)}
+    assert not open_files(tmp_path)
+    found = sessions(tmp_path)
+    assert [[frame.number for frame in session.frames] for session in found] == [[0, 1, 2, 3]] * 66
+    assert not any(file.damage for session in found for file in session.files)
+    assert folder.recorded() == {f"{number:032x}" for number in range(66)}
+
+
+def test_a_file_that_is_removed_while_it_waits_for_its_next_frame_is_not_missed(recorded_moments, tmp_path):
+    folder = Folder(tmp_path, most_file=2**28, most=2**33, bodies=False, most_open=1)
+    folder.make()
+    for number in range(2):
+        folder.add(a_session(number), recorded_moments[0], 0)
+    (removed,) = tmp_path.glob(f"*-{a_session(0).session_id}-*")
+    removed.unlink()
+    for number in range(2):
+        folder.add(a_session(number), recorded_moments[1], 0)
+    folder.add(a_session(2), recorded_moments[0], 0)
+    folder.add(a_session(3), recorded_moments[0], 0)
+    next(tmp_path.glob(f"*-{a_session(2).session_id}-*")).unlink()
+    folder.close()
+    found = {session.opening.session_id: session for session in sessions(tmp_path)}
+    frames = [[frame.number for frame in found[a_session(number).session_id].frames] for number in range(2)]
+    assert frames == [[1], [0, 1]]
+
+
+def test_the_folder_is_measured_as_much_is_written_and_not_for_every_file(recorded_moments, tmp_path, monkeypatch):
+    folder = Folder(tmp_path, most_file=2**28, most=2**33, bodies=False)
+    folder.make()
+    measured = []
+    monkeypatch.setattr(folder, "make_room", lambda: measured.append(True))
+    for number in range(20):
+        folder.add(a_session(number), recorded_moments[0], 0)
+    assert len(measured) == 1
+    folder.close()
+
+
+async def test_files_of_sessions_that_went_elsewhere_are_closed_while_others_go_on(fleet, tmp_path, monkeypatch):
+    monkeypatch.setattr("service.recording.recorder.IDLE_S", 1.0)
+    async with serve(record=tmp_path) as served:
+        gone = await served.open()
+        async for _ in drive(served, gone, fleet[:1]):
+            pass
+        await until_recorded(served, 1)
+        recorder = served.gateway.recorder
+        async with asyncio.timeout(5):
+            while gone.session_id in recorder._folder._files:
+                recorder.end("another session, so that there is always something to do")
+                await asyncio.sleep(0.01)
 
 
 def test_where_all_files_are_open_the_one_unused_for_longest_goes(recorded_moments, tmp_path):
