@@ -49,7 +49,9 @@ class Frames:
     max_jump: int
     """By how much a frame's number may exceed the latest answered one."""
     reading: Line = field(default_factory=lambda: Line(busy=lambda: False))
-    """Bodies that take long to read, by turns of keys: else whoever sends many at once is read before all others."""
+    """Bodies that take long to read, by turns of keys, of a key's sessions and of a session's vehicles: else whoever
+    sends many at once is read before all others.
+    """
 
     async def post_message(self, caller: Caller, body: bytes, arrived: float, room: Share) -> Answered | Receipt:
         """A vehicle's own message, whose request came then: kept for a teammate, answered for the ego.
@@ -115,7 +117,7 @@ class Frames:
         """A turn to read a body, if it comes in time. For how long the body itself was on its way does not count."""
         try:
             async with asyncio.timeout(READING_SHARE * caller.live.budget_s):
-                return await self.reading.turn((caller.live.key, caller.record.session_id))
+                return await self.reading.turn((caller.live.key, caller.record.session_id, caller.vehicle_id))
         except TimeoutError:
             detail = "bodies of other requests took the time that this one had"
             raise Refused(Kind.OVERLOADED, detail, retry_after_s=1) from None

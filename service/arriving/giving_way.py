@@ -7,6 +7,7 @@ import re
 import time
 from collections import OrderedDict, deque
 from collections.abc import Callable
+from dataclasses import dataclass, field
 
 from starlette.types import ASGIApp, Message, Receive, Scope, Send
 
@@ -23,8 +24,10 @@ _LOOK_S = 0.004
 _NEVER_WAIT = re.compile(r"/healthz|/v1/live/.*|/v1/sessions/[^/]+/(frames|messages|standby)")
 
 
-Party = tuple[str, str]
-"""Who has the same number of turns as any other, and who of theirs asks, who has as many as the others of theirs."""
+Party = tuple[str, ...]
+"""Who has the same number of turns as any other, then who of theirs asks, who has as many as the others of theirs, and
+so on.
+"""
 
 
 class Turn:
@@ -48,9 +51,35 @@ class Turn:
             self._line.ended()
 
 
+@dataclass
+class _Waiting:
+    """Those of a party that wait: its own, and those of its members by turns."""
+
+    own: deque[Turn] = field(default_factory=deque)
+    members: OrderedDict[str, _Waiting] = field(default_factory=OrderedDict)
+
+    def __bool__(self) -> bool:
+        return bool(self.own or self.members)
+
+    def put(self, turn: Turn, party: Party) -> None:
+        if party:
+            self.members.setdefault(party[0], _Waiting()).put(turn, party[1:])
+        else:
+            self.own.append(turn)
+
+    def take(self) -> Turn:
+        if self.own:
+            return self.own.popleft()
+        name, member = self.members.popitem(last=False)
+        turn = member.take()
+        if member:
+            self.members[name] = member  # behind the others
+        return turn
+
+
 class Line:
-    """Requests that wait: the parties' by turns, of a party its members' by turns, and of a member in the order in
-    which they came.
+    """Requests that wait: the parties' by turns, of a party its members' by turns, and of one without members in the
+    order in which they came.
 
     Parameters
     ----------
@@ -60,7 +89,7 @@ class Line:
 
     def __init__(self, busy: Callable[[], bool]) -> None:
         self._busy = busy
-        self._waiting: OrderedDict[str, OrderedDict[str, deque[Turn]]] = OrderedDict()
+        self._waiting = _Waiting()
         self._at_work = 0
         self._latest = -1.0
         self._look: asyncio.TimerHandle | None = None
@@ -68,8 +97,7 @@ class Line:
     async def turn(self, party: Party) -> Turn:
         """A turn of a party, once it has come."""
         turn = Turn(self)
-        name, member = party
-        self._waiting.setdefault(name, OrderedDict()).setdefault(member, deque()).append(turn)
+        self._waiting.put(turn, party)
         self._go_on()
         try:
             await turn.began
@@ -90,21 +118,11 @@ class Line:
                 if self._look is None:
                     self._look = asyncio.get_running_loop().call_later(_LOOK_S, self._look_again)
                 return
-            turn = self._next()
+            turn = self._waiting.take()
             if not turn.began.done():  # it was not given up
                 self._latest = now
                 self._at_work += 1
                 turn.begin()
-
-    def _next(self) -> Turn:
-        name, members = self._waiting.popitem(last=False)
-        member, turns = members.popitem(last=False)
-        turn = turns.popleft()
-        if turns:
-            members[member] = turns  # behind the others
-        if members:
-            self._waiting[name] = members
-        return turn
 
     def _look_again(self) -> None:
         self._look = None

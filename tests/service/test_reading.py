@@ -37,6 +37,28 @@ async def test_bodies_are_read_by_turns_of_keys(monkeypatch, good_frame):
     assert len(set(read[: AT_A_TIME + 2])) == 2
 
 
+async def test_bodies_of_a_session_are_read_by_turns_of_its_vehicles(monkeypatch, messages, good_frame):
+    read = []
+
+    def slowly(caller, _):
+        read.append(caller.vehicle_id)
+        time.sleep(0.25)
+        raise InFrame(wire.WireError("malformed-msgpack", "", "it is read slowly"), None)
+
+    for name in ("read_frame", "read_message"):
+        monkeypatch.setattr(f"service.arriving.frames.{name}", slowly)
+    async with serve() as served:
+        session = await served.open()
+        token, body = session.teammate_tokens["rsu"], wire.pack_message(0, "rsu", messages["rsu"])
+        posts = [asyncio.create_task(served.post(session, "messages", body, token)) for _ in range(12)]
+        while len(read) < AT_A_TIME:
+            await asyncio.sleep(0.001)
+        problem(await served.post(session, "frames", good_frame(0)), 400, "malformed-msgpack")
+        await asyncio.gather(*posts)
+    assert len(read) == len(posts) + 1
+    assert EGO in read[: 2 * AT_A_TIME + 1]
+
+
 async def test_a_small_body_that_may_be_compressed_is_not_read_on_the_event_loop(served, monkeypatch, messages):
     read = []
 
