@@ -86,8 +86,8 @@ def test_whoever_holds_nothing_else_may_take_as_much_as_is_left():
 
 
 def test_it_is_said_who_allows_how_much():
-    room = Room(LIMIT, 2 * BODY, "ROBOSAC_THIS")
-    with pytest.raises(Refused, match=f"ROBOSAC_THIS_PER_KEY allows {2 * BODY} bytes of one key"):
+    room = Room(LIMIT, 2 * BODY, "ROBOSAC_MAX_INFLIGHT_BYTES")
+    with pytest.raises(Refused, match=f"ROBOSAC_MAX_INFLIGHT_BYTES_PER_KEY allows {2 * BODY} bytes of one key"):
         room.share("a", "x", "ego").check(3 * BODY)
-    with pytest.raises(Refused, match=f"ROBOSAC_THIS allows {LIMIT} bytes"):
-        Room(LIMIT, None, "ROBOSAC_THIS").share("a", "x", "ego").check(LIMIT + 1)
+    with pytest.raises(Refused, match=f"ROBOSAC_MAX_INFLIGHT_BYTES allows {LIMIT} bytes"):
+        Room(LIMIT, None, "ROBOSAC_MAX_INFLIGHT_BYTES").share("a", "x", "ego").check(LIMIT + 1)
