@@ -57,7 +57,7 @@ def test_the_version_is_told():
         (["evaluate", "--attack", "nonesuch"], "no attack 'nonesuch'"),
         (["evaluate", "--attackers", "3", "--collaborators", "3"], "free of 3 attackers"),
         (["evaluate", "--weights", "/nowhere"], "there is no file /nowhere"),
-        (["evaluate", "--weights", "."], "not a readable"),
+        (["evaluate", "--weights", "."], "is a folder; a weights file is wanted"),
         (["evaluate", "--detector", "nonesuch:build"], "No module named 'nonesuch'"),
         (["evaluate", "--scenes", "1001"], "1000 test scenes; 1001 are wanted"),
         (["evaluate", "--data", "."], "no scene source '.': give one of synthetic, world:NAME, "),
