@@ -90,11 +90,18 @@ class _Vehicle:
             if not conflict.type.endswith("stale-frame"):
                 raise
 
-    async def ask(self, frame: EgoFrame, index: int) -> tuple[FrameAnswer, float]:
-        """The answer, and after how many milliseconds it came."""
-        started = time.perf_counter()
+    async def ask(self, frame: EgoFrame, index: int) -> tuple[FrameAnswer, float] | None:
+        """The answer, and after how many milliseconds it came; None if it is lost, as the gateway could not say in time
+        whether the frame was kept, and it was.
+        """
+        started, before = time.perf_counter(), self.refused.copy()
         truth = Truth(frame.truth, tuple(sorted(frame.attackers))) if self._tells else None
-        answer = await _patiently(lambda: self._at[frame.ego_id].ask(index, frame.message, truth), self.refused)
+        try:
+            answer = await _patiently(lambda: self._at[frame.ego_id].ask(index, frame.message, truth), self.refused)
+        except FrameConflict as conflict:
+            if not conflict.type.endswith("stale-frame") or self.refused == before:
+                raise
+            return None
         return answer, (time.perf_counter() - started) * 1e3
 
 
@@ -173,7 +180,11 @@ async def _run_scene(options: FleetOptions, fleet: Fleet, summary: FleetSummary,
             if options.real_time:
                 await asyncio.sleep(max(0.0, start + index * fleet.scene.frame_period_s - time.monotonic()))
             answers = await asyncio.gather(*(_exchange(vehicles, frame, index) for frame in frames))
-            for frame, (answer, latency_ms) in zip(frames, answers, strict=True):
+            for frame, answered in zip(frames, answers, strict=True):
+                if answered is None:
+                    summary.lost += 1
+                    continue
+                answer, latency_ms = answered
                 await asyncio.to_thread(summary.add, frame, answer, latency_ms)
                 screen.add(fleet.scene.number, frame, answer, latency_ms)
         while opened:
@@ -193,8 +204,8 @@ async def _leave(egos: list[_Vehicle]) -> None:
             await asyncio.gather(*(ego.leave() for ego in egos), return_exceptions=True)
 
 
-async def _exchange(vehicles: dict[str, _Vehicle], frame: EgoFrame, index: int) -> tuple[FrameAnswer, float]:
-    """All vehicles post at the same time; the ego's post is answered."""
+async def _exchange(vehicles: dict[str, _Vehicle], frame: EgoFrame, index: int) -> tuple[FrameAnswer, float] | None:
+    """All vehicles post at the same time; the ego's post is answered, as `_Vehicle.ask` says."""
     sending = [vehicles[name].send(frame, index) for name in frame.sent]
     answered, _ = await asyncio.gather(vehicles[frame.ego_id].ask(frame, index), asyncio.gather(*sending))
     return answered

@@ -60,6 +60,8 @@ class FleetSummary:
     sources: Counter[str] = field(default_factory=Counter)
     refused: Counter[str] = field(default_factory=Counter)
     """By problem: requests that the gateway could not serve at first, and that were sent again."""
+    lost: int = 0
+    """Frames that were decided, whose answers never came."""
     degraded: Counter[str] = field(default_factory=Counter)
     """By what cut the defence short: answers."""
     fault: str | None = None
@@ -162,6 +164,7 @@ class FleetSummary:
             "latency_ms": trial.percentiles(self.latencies_ms),
             "deadline_met_share": self.in_time / self.frames,
             "refused_first": dict(self.refused),
+            "answers_lost": self.lost,
             "degraded": dict(self.degraded),
             "fault": self.fault,
         }
@@ -208,6 +211,9 @@ class FleetSummary:
         if count := self.refused.total():
             requests = "request was" if count == 1 else "requests were"
             console.print(f"{count} {requests} refused first ({', '.join(self.refused)}) and sent again.")
+        if self.lost:
+            answers = "answer was" if self.lost == 1 else "answers were"
+            console.print(f"{self.lost} {answers} lost: the frame was kept later than it had time for.")
         if (naming := values["naming"]) is not None:
             after = naming["frames_until_named"]
             console.print(

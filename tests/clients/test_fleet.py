@@ -269,6 +269,20 @@ async def test_a_gateway_that_is_slow_for_a_while_is_asked_again(refusals, retry
     assert vehicle.refused == ({"store-too-slow": asked - 1} if asked > 1 else {})
 
 
+@pytest.mark.parametrize(("first", "raised"), [(503, False), (409, True)])
+async def test_an_answer_that_is_lost_ends_no_fleet(first, raised, ego_message):
+    """The database was writing when the frame's time was over, so the gateway could not say what would come of it."""
+    slow = httpx.Response(503, json={"type": "urn:robosac:problem:store-too-slow"}, headers={"Retry-After": "0"})
+    stale = httpx.Response(409, json={"type": "urn:robosac:problem:stale-frame"})
+    answers = [slow, stale] if first == 503 else [stale]
+    transport = httpx.MockTransport(lambda _: answers.pop(0))
+    ego = _Vehicle("car-1", GatewayClient("http://gateway", transport=transport), options("http://gateway"))
+    ego.enrol("car-1", OpenedSession("s", "e", {}, "", {}, {}))
+    with pytest.raises(FrameConflict) if raised else nullcontext():
+        assert await ego.ask(SimpleNamespace(ego_id="car-1", message=ego_message), 0) is None
+    assert not answers
+
+
 @pytest.mark.parametrize(
     ("refused", "said"),
     [
@@ -287,6 +301,10 @@ def test_the_summary_tells_what_was_refused_first(refused, said, detector):
     text = console.file.getvalue()
     assert said in text if said else "refused first" not in text
     assert summary.as_dict()["refused_first"] == refused
+    assert "lost" not in text
+    summary.lost = 1
+    summary.print(console)
+    assert "1 answer was lost: the frame was kept later" in console.file.getvalue()
 
 
 class Silent(Halving):
