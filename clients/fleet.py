@@ -17,7 +17,7 @@ from rich.console import Console
 
 from clients import trial
 from clients.client import GatewayClient, OpenedSession, VehicleClient
-from clients.errors import FrameConflict, GatewayUnavailable
+from clients.errors import FrameConflict, GatewayUnavailable, GatewayUnreachable
 from clients.screen import Screen
 from clients.simulation import EgoFrame, Fleet, team_fault
 from clients.summary import REPORT, FleetSummary
@@ -94,14 +94,16 @@ class _Vehicle:
         """The answer, and after how many milliseconds it came; None if it is lost, as the gateway could not say in time
         whether the frame was kept, and it was.
         """
-        started, before = time.perf_counter(), self.refused.copy()
+        started, refused = time.perf_counter(), Counter[str]()
         truth = Truth(frame.truth, tuple(sorted(frame.attackers))) if self._tells else None
         try:
-            answer = await _patiently(lambda: self._at[frame.ego_id].ask(index, frame.message, truth), self.refused)
+            answer = await _patiently(lambda: self._at[frame.ego_id].ask(index, frame.message, truth), refused)
         except FrameConflict as conflict:
-            if not conflict.type.endswith("stale-frame") or self.refused == before:
+            if not conflict.type.endswith("stale-frame") or "store-too-slow" not in refused:
                 raise
             return None
+        finally:
+            self.refused.update(refused)
         return answer, (time.perf_counter() - started) * 1e3
 
 
@@ -149,6 +151,8 @@ async def run_fleet(options: FleetOptions, console: Console) -> FleetSummary:
             other = another_scene(source, "test", scene)
             fleet = Fleet(scene, detector, options.egos, options.attackers, attack, options.seed, other)
             await _run_scene(options, fleet, summary, screen)
+    if not summary.frames:
+        raise GatewayUnreachable("the database took longer than a frame has over every one, so no answer came")
     return summary
 
 

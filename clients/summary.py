@@ -213,7 +213,7 @@ class FleetSummary:
             console.print(f"{count} {requests} refused first ({', '.join(self.refused)}) and sent again.")
         if self.lost:
             answers = "answer was" if self.lost == 1 else "answers were"
-            console.print(f"{self.lost} {answers} lost: the frame was kept later than it had time for.")
+            console.print(f"{self.lost} {answers} lost: the database took longer than a frame has.")
         if (naming := values["naming"]) is not None:
             after = naming["frames_until_named"]
             console.print(

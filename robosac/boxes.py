@@ -74,7 +74,7 @@ def pose_matrix(x: float, y: float, z: float, yaw: float) -> FloatArray:
 
 
 def pose_fault(pose: FloatArray) -> str | None:
-    """Why a matrix (4, 4) of finite numbers can be no sensor's pose; None if it can.
+    """Why a matrix (4, 4) can be no sensor's pose; None if it can. What is no number makes it none.
 
     By plain numbers, which takes a tenth of what it takes with arrays: each message of each frame is checked.
     """
@@ -90,7 +90,7 @@ def pose_fault(pose: FloatArray) -> str | None:
         return "must be a rigid transform: a rotation, a translation, last row 0 0 0 1"
     if i < MIN_UPRIGHT:
         return "must be upright: the sensor's z axis within 60 degrees of the world's"
-    if not max(abs(x), abs(y), abs(z)) <= MAX_TRANSLATION_M:
+    if not all(abs(value) <= MAX_TRANSLATION_M for value in (x, y, z)):
         return f"must lie within {MAX_TRANSLATION_M:g} m of the world's origin"
     return None
 

@@ -92,16 +92,8 @@ class Recordings(Encounters):
     def _file(self, act: Act) -> str:
         info, scene = self.detector.info, self.scene.number
         data = [self.data] if self.data != DEFAULT_DATA else []
-        identity = [
-            FORMAT,
-            *data,
-            *filter(None, [self.code]),
-            info.name,
-            info.weights_digest,
-            scene,
-            act.attack,
-            *act.acting,
-        ]
+        code = [self.code] if self.code else []
+        identity = [FORMAT, *data, *code, info.name, info.weights_digest, scene, act.attack, *act.acting]
         digest = hashlib.sha256(json.dumps([*identity, self.seed, self.pose_error_m]).encode()).hexdigest()
         return f"{scene}-{re.sub('[^A-Za-z0-9-]', '-', act.attack)}-{len(act.acting)}-{digest[:16]}.npz"
 

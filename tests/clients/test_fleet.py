@@ -281,6 +281,7 @@ async def test_an_answer_that_is_lost_ends_no_fleet(first, raised, ego_message):
     with pytest.raises(FrameConflict) if raised else nullcontext():
         assert await ego.ask(SimpleNamespace(ego_id="car-1", message=ego_message), 0) is None
     assert not answers
+    assert ego.refused == ({"store-too-slow": 1} if first == 503 else {})
 
 
 @pytest.mark.parametrize(
@@ -304,7 +305,7 @@ def test_the_summary_tells_what_was_refused_first(refused, said, detector):
     assert "lost" not in text
     summary.lost = 1
     summary.print(console)
-    assert "1 answer was lost: the frame was kept later" in console.file.getvalue()
+    assert "1 answer was lost: the database took longer" in console.file.getvalue()
 
 
 class Silent(Halving):

@@ -141,3 +141,22 @@ def test_other_arguments_are_named_too():
     with pytest.raises(ValueError, match=r"^boxes must be of shape \(n, 6\+\)"):
         in_units(BOX)
     assert pose_fault(np.eye(4).tolist()) is None
+
+
+@pytest.mark.parametrize(
+    ("place", "most", "over"),
+    [
+        ((0, 0), 1.0004, 1.0006),  # the length of an axis, squared: 1 to a thousandth
+        ((0, 1), 9e-4, 1.1e-3),
+        ((3, 1), 9e-10, 1.1e-9),
+        ((3, 3), 1 + 9e-6, 1 + 1.1e-5),
+        ((1, 3), 1e8, 1.1e8),
+    ],
+)
+def test_a_pose_may_be_off_by_as_little_as_rounding_makes_it(place, most, over):
+    pose = np.eye(4)
+    pose[place] = most
+    assert pose_fault(pose) is None
+    for wrong in (over, np.nan, np.inf):
+        pose[place] = wrong
+        assert pose_fault(pose) is not None
