@@ -80,8 +80,8 @@ def foreign_place(traceback: TracebackType | None, packages: Collection[str]) ->
 
 def told(error: Exception) -> str:
     """The message of an exception, without the number that the system has for it."""
-    if isinstance(error, OSError) and error.strerror and error.filename is not None:
-        return f"{error.filename}: {error.strerror}"
+    if isinstance(error, OSError) and error.strerror:
+        return error.strerror if error.filename is None else f"{error.filename}: {error.strerror}"
     return str(error)
 
 

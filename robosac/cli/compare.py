@@ -130,7 +130,7 @@ def run(  # the options of a command line
     started = time.monotonic()
     try:
         blamed = blaming("--world" if world else "--data", SceneError)
-        with failing(AttackError, DetectorError, FaultyDefense, DomainError), blamed, progress(console) as bar:
+        with failing(AttackError, DetectorError, FaultyDefense, DomainError, OSError), blamed, progress(console) as bar:
             task = bar.add_task("frames", total=len(plans) * len(extent.settings) * extent.scenes * extent.frames)
             found = compare_plans(list(plans.values()), jobs, lambda: bar.advance(task))
         with failing(OSError):

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import re
 import shlex
+import time
 from collections.abc import Sequence
 from typing import Annotated, Any
 
@@ -14,6 +15,7 @@ from rich.progress import (
     MofNCompleteColumn,
     Progress,
     ProgressColumn,
+    TaskID,
     TextColumn,
     TimeElapsedColumn,
     TimeRemainingColumn,
@@ -37,6 +39,8 @@ WORLD_HELP = (
 MOST_POSE_ERROR_M = 100.0
 POSE_ERROR_HELP = "Standard deviation of the teammates' positions, metres."
 PoseError = Annotated[float, typer.Option(min=0.0, max=MOST_POSE_ERROR_M, help=POSE_ERROR_HELP)]
+TOLD_EVERY_S = 60.0
+"""How often it is told how far the work is where no bar can be drawn, as in a file."""
 Seed = Annotated[int, typer.Option(min=0, help="Of everything random.")]
 
 
@@ -75,9 +79,32 @@ def check_attack(attack: Attack | Campaign, detector: Detector) -> None:
 
 
 def progress(console: Console, *more: ProgressColumn) -> Progress:
-    """A progress bar with a count and times, and more columns if wanted."""
+    """A progress bar with a count and times, and more columns if wanted; where none can be drawn, lines."""
     columns = (TextColumn("{task.description}"), BarColumn(), MofNCompleteColumn())
-    return Progress(*columns, TimeElapsedColumn(), TimeRemainingColumn(), *more, console=console)
+    return _Told(*columns, TimeElapsedColumn(), TimeRemainingColumn(), *more, console=console)
+
+
+class _Told(Progress):
+    """Progress that is also told to a file or a pipe, where rich draws it only once all is done."""
+
+    _told = 0.0
+
+    def start(self) -> None:
+        self._told = time.monotonic()
+        super().start()
+
+    def advance(self, task_id: TaskID, advance: float = 1) -> None:
+        super().advance(task_id, advance)
+        self._tell()
+
+    def update(self, task_id: TaskID, **changes: Any) -> None:
+        super().update(task_id, **changes)
+        self._tell()
+
+    def _tell(self) -> None:
+        if not self.console.is_terminal and time.monotonic() - self._told >= TOLD_EVERY_S:
+            self._told = time.monotonic()
+            self.console.print(self.get_renderable())
 
 
 def command(context: typer.Context) -> str:

@@ -1,5 +1,7 @@
 """A comparison that is stopped goes on from the sequences that are played."""
 
+import errno
+import os
 import re
 import sys
 from dataclasses import replace
@@ -154,6 +156,16 @@ def test_ones_own_code_counts_with_what_it_imports(own, tmp_path, monkeypatch):
     assert "differs in code;" in refused.output
     helper.write_text("STRENGTH = 0.5\n")
     assert compare(*arguments).exit_code == 0
+
+
+def test_a_full_disk_ends_it_in_a_line(tmp_path, monkeypatch):
+    def full(*_):
+        raise OSError(errno.ENOSPC, os.strerror(errno.ENOSPC))
+
+    monkeypatch.setattr(kept, "keep", full)
+    ended = compare("--setting", "noise:1", "--live", "--out", tmp_path / "out")
+    assert ended.exit_code == 1
+    assert "Error: No space left on device" in ended.output
 
 
 def test_what_other_code_recorded_is_not_used(own, tmp_path):
