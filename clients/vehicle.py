@@ -25,6 +25,7 @@ from robosac.signatures import sign
 
 MSGPACK = "application/vnd.msgpack"
 SESSION_HEADER = "X-Session-Id"
+RECEIPT_HEADER = "Audit-Receipt"
 AUDIT_PAGE = 1000
 """Audit records that are asked for at a time."""
 T = TypeVar("T")
@@ -38,6 +39,7 @@ class _Accepted(Typed):
 @dataclass(frozen=True)
 class _ChangedTeam:
     teammate_tokens: dict[str, str]
+    receipt: LogReceipt | None = None
 
 
 @dataclass(frozen=True)
@@ -46,6 +48,7 @@ class RenewedToken:
 
     token: str
     expires_at: str
+    receipt: LogReceipt | None = None
 
 
 class _Proving(httpx.Auth):
@@ -104,6 +107,7 @@ class VehicleClient:
         response = await self._request("POST", f"{self._path}/token", **self._proven)
         renewed = told(response, RenewedToken)
         self.token = renewed.token
+        await self._keep(renewed.receipt)
         return renewed
 
     def signature(self, frame: int, message: Message) -> bytes | None:
@@ -223,15 +227,18 @@ class VehicleClient:
         """As the ego: let teammates join; their tokens."""
         body = {"teammates": list(teammates), "public_keys": dict(public_keys or {})}
         response = await self._request("POST", f"{self._path}/teammates", json=body, **self._proven)
-        return told(response, _ChangedTeam).teammate_tokens
+        changed = told(response, _ChangedTeam)
+        await self._keep(changed.receipt)
+        return changed.teammate_tokens
 
     async def dismiss(self, teammate: str) -> None:
         """As the ego: let a teammate leave."""
-        await self._request("DELETE", f"{self._path}/teammates/{teammate}", **self._proven)
+        await self._keep(_promised(await self._request("DELETE", f"{self._path}/teammates/{teammate}", **self._proven)))
 
     async def close(self) -> str:
         """As the ego: end the session; the head of its audit log, to verify it against later."""
         response = await self._request("DELETE", self._path, **self._proven)
+        await self._keep(_promised(response))
         return str(response.headers.get("audit-head", ""))
 
     async def _answered(self, what: str, body: bytes) -> FrameAnswer:
@@ -252,6 +259,15 @@ class VehicleClient:
 def bearer(credential: str) -> dict[str, str]:
     """The header that carries a key or a token."""
     return {"Authorization": f"Bearer {credential}"}
+
+
+def _promised(response: httpx.Response) -> LogReceipt | None:
+    """The receipt of an answer without a body."""
+    text = response.headers.get(RECEIPT_HEADER)
+    try:
+        return None if text is None else LogReceipt.model_validate_json(text)
+    except ValidationError as error:
+        raise ProtocolError(f"{RECEIPT_HEADER} is no receipt: {error}") from error
 
 
 def _answer(response: httpx.Response) -> FrameAnswer:

@@ -10,7 +10,7 @@ from typing import Any
 
 from pydantic import BaseModel
 
-from robosac.answers import FrameAnswer
+from robosac.answers import FrameAnswer, LogReceipt
 from robosac.detectors import DetectorInfo
 from service import tensor_bodies
 from service.arriving.bodies import JSON, MSGPACK, described
@@ -101,8 +101,9 @@ EXAMPLES: Mapping[type[BaseModel], dict[str, Any]] = {
         "teammates": ["car-2", "car-3", "car-4", "rsu"],
         "teammate_tokens": {"car-4": _TOKEN},
         "tokens_expire_at": _TIME,
+        "receipt": _RECEIPT,
     },
-    RenewedToken: {"token": _TOKEN, "expires_at": _TIME},
+    RenewedToken: {"token": _TOKEN, "expires_at": _TIME, "receipt": _RECEIPT},
     WatchableList: {
         "sessions": [
             {
@@ -216,6 +217,12 @@ AT_THE_DOORS = documented(403, 414, 421, 431)
 _OF_EGO, _OF_JSON = documented(401, 403, 404), documented(400, 408, 413, 415)
 _PROVEN = documented(401, 403, 404, 429)
 _ON_RECORD = documented(507)
+_PROMISED = {
+    "Audit-Receipt": {
+        "description": "The log's end at this moment, signed by the gateway: JSON.",
+        "content": {JSON: {"schema": {"$ref": f"#/components/schemas/{LogReceipt.__name__}"}, "example": _RECEIPT}},
+    }
+}
 _AUDIT_HEAD = {"Audit-Head": {"description": "SHA-256 of the log's last record.", "schema": {"type": "string"}}}
 DETECTORS: Answers = {200: _answer(DetectorList, "All detectors.")}
 KEYS: Answers = {200: _answer(GatewayKeyList, "All keys.")}
@@ -226,10 +233,10 @@ OPENED: Answers = {
     201: _answer(SessionCreated, "The session and its tokens."),
 }
 STATE: Answers = {**_OF_EGO, 200: _answer(SessionState, "The session now.")}
-ENDED: Answers = {**_PROVEN, 204: {"description": "It has ended.", "headers": _AUDIT_HEAD}}
+ENDED: Answers = {**_PROVEN, 204: {"description": "It has ended.", "headers": _AUDIT_HEAD | _PROMISED}}
 RENEWED: Answers = {**documented(401, 404, 429), **_ON_RECORD, 201: _answer(RenewedToken, "The fresh token.")}
 JOINED: Answers = {**_PROVEN, **_OF_JSON, **_ON_RECORD, **documented(409), 201: _answer(ChangedTeam, "The team now.")}
-LEFT: Answers = {**_PROVEN, **_ON_RECORD, **documented(409), 204: {"description": "It has left."}}
+LEFT: Answers = {**_PROVEN, **_ON_RECORD, **documented(409), 204: {"description": "It has left.", "headers": _PROMISED}}
 AUDIT: Answers = {**_OF_EGO, **_as_text(JSONL, AUDIT_LINE, "A record a line.")}
 DECIDED: Answers = {
     **_OF_EGO,

@@ -15,6 +15,7 @@ from pydantic import BaseModel
 from starlette.types import Send
 
 from robosac import wire
+from robosac.answers import LogReceipt
 from service import description
 from service.arriving.arrival import arrival_of
 from service.arriving.bodies import JSON_BYTES, MSGPACK, MSGPACK_TYPES, STREAMED, check_type, read_json
@@ -146,8 +147,11 @@ async def get_session(caller: Ego, gateway: GatewayDep) -> SessionState:
     responses=description.ENDED,
 )
 async def delete_session(caller: ProvenEgo, gateway: GatewayDep, response: Response) -> None:
-    """End the session; its log can be read until it is purged. The header `Audit-Head` is its last record's hash."""
-    response.headers["Audit-Head"] = await gateway.sessions.close(caller)
+    """End the session; its log can be read until it is purged. The header `Audit-Head` is its last record's hash, and
+    `Audit-Receipt` the same, signed.
+    """
+    receipt = await gateway.sessions.close(caller)
+    response.headers.update({"Audit-Head": receipt.head, **_promised(receipt)})
     gateway.recorder.end(caller.record.session_id)
 
 
@@ -187,9 +191,11 @@ async def enrol_teammates(
     tags=["sessions"],
     responses=description.LEFT,
 )
-async def dismiss_teammate(vehicle_id: str, caller: ProvenEgo, gateway: GatewayDep) -> None:
-    """Let a teammate leave from the next frame on; its token is worth nothing any more."""
-    await gateway.teams.dismiss(caller, vehicle_id)
+async def dismiss_teammate(vehicle_id: str, caller: ProvenEgo, gateway: GatewayDep, response: Response) -> None:
+    """Let a teammate leave from the next frame on; its token is worth nothing any more. The header `Audit-Receipt` is
+    the log's end, signed.
+    """
+    response.headers.update(_promised(await gateway.teams.dismiss(caller, vehicle_id)))
 
 
 @v1.get(
@@ -278,6 +284,11 @@ async def _read_body(request: Request, caller: Caller, gateway: Gateway, limit: 
     except Refused as refused:
         await gateway.frames.refuse(caller, refused)
         raise
+
+
+def _promised(receipt: LogReceipt) -> dict[str, str]:
+    """What carries a receipt where an answer has no body."""
+    return {"Audit-Receipt": receipt.model_dump_json()}
 
 
 def _handed_over(answered: Answered, accept: str | None, gateway: Gateway) -> Response:

@@ -245,6 +245,7 @@ class ChangedTeam(BaseModel):
     teammates: list[str]
     teammate_tokens: dict[str, str]
     tokens_expire_at: str
+    receipt: LogReceipt = Field(description="The log's end at this moment, signed by the gateway.")
 
 
 class RenewedToken(BaseModel):
@@ -252,6 +253,7 @@ class RenewedToken(BaseModel):
 
     token: str
     expires_at: str
+    receipt: LogReceipt = Field(description="The log's end at this moment, signed by the gateway.")
 
 
 class SessionState(BaseModel):

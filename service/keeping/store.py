@@ -215,9 +215,9 @@ class Store:
 
         return await self._append(record.session_id, event, change)
 
-    async def renew_token(self, session_id: str, before: str, token_id: str, event: TokenRenewed) -> None:
+    async def renew_token(self, session_id: str, before: str, token_id: str, event: TokenRenewed) -> SessionRecord:
         """Let another token of a vehicle count instead of ``before``; `TokenReplaced` if that one counts no more."""
-        await self._append(session_id, event, renewal(event.vehicle_id, before, token_id))
+        return await self._append(session_id, event, renewal(event.vehicle_id, before, token_id))
 
     async def hold(self, session_id: str, holder: str) -> None:
         """Note which process a session's ego asks now; that changes nothing that was decided."""

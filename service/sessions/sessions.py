@@ -10,7 +10,7 @@ from dataclasses import dataclass
 
 import structlog
 
-from robosac.answers import Reason
+from robosac.answers import LogReceipt, Reason
 from robosac.audit import commitment
 from robosac.audit.events import SessionEnded
 from robosac.budget import DomainError
@@ -152,8 +152,8 @@ class Sessions:
         }
         return SessionState.model_validate(shown)
 
-    async def close(self, caller: Caller) -> str:
-        """End a session, after the frame in hand; the head of its log, which is complete by then."""
+    async def close(self, caller: Caller) -> LogReceipt:
+        """End a session, after the frame in hand; the promise of its log, which is complete by then."""
         async with caller.live.lock:
             with contextlib.suppress(SessionOver):  # somebody else has just ended it
                 caller.check_token(await self.current(caller))
@@ -161,7 +161,7 @@ class Sessions:
         record = await self.store.get(caller.record.session_id)
         if record is None:
             raise SessionOver
-        return record.audit_head
+        return self.keys.receipt(record)
 
     async def expire_idle(self) -> None:
         """`sweep` every so often and for ever."""

@@ -5,6 +5,7 @@ from __future__ import annotations
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
 
+from robosac.answers import LogReceipt
 from robosac.audit.events import TeamChanged, TokenRenewed
 from robosac.budget import DomainError
 from robosac.session import changed_team
@@ -44,14 +45,15 @@ class Teams:
             tokens = {name: self.tokens.issue(record.session_id, name, is_ego=False) for name in newcomers}
             token_ids = {**record.token_ids, **{name: token.token_id for name, token in tokens.items()}}
             keys = {**record.public_keys, **public_keys}
-            await self._change_team(caller, record, (*record.teammates, *newcomers), token_ids, keys)
+            kept = await self._change_team(caller, record, (*record.teammates, *newcomers), token_ids, keys)
             return ChangedTeam(
                 teammates=[*record.teammates, *newcomers],
                 teammate_tokens={name: token.text for name, token in tokens.items()},
                 tokens_expire_at=min(token.expires_at for token in tokens.values()),
+                receipt=self.sessions.keys.receipt(kept),
             )
 
-    async def dismiss(self, caller: Caller, leaver: str) -> None:
+    async def dismiss(self, caller: Caller, leaver: str) -> LogReceipt:
         """Let a teammate leave, from the next frame on; its token is worth nothing any more."""
         async with caller.live.lock:
             record = await self.sessions.current(caller)
@@ -61,7 +63,8 @@ class Teams:
             token_ids = {name: token_id for name, token_id in record.token_ids.items() if name != leaver}
             keys = {name: key for name, key in record.public_keys.items() if name != leaver}
             team = tuple(name for name in record.teammates if name != leaver)
-            await self._change_team(caller, record, team, token_ids, keys)
+            kept = await self._change_team(caller, record, team, token_ids, keys)
+            return self.sessions.keys.receipt(kept)
 
     async def renew(self, caller: Caller) -> RenewedToken:
         """A fresh token of the caller; the one it came with is worth nothing any more."""
@@ -75,9 +78,10 @@ class Teams:
             caller.live.renewals[vehicle] += 1
             token = self.tokens.issue(record.session_id, vehicle, is_ego=caller.is_ego)
             event = TokenRenewed(vehicle_id=vehicle, expires_at=token.expires_at)
-            await self.store.renew_token(record.session_id, record.token_ids[vehicle], token.token_id, event)
+            kept = await self.store.renew_token(record.session_id, record.token_ids[vehicle], token.token_id, event)
             caller.live.token_ids = {**caller.live.token_ids, vehicle: token.token_id}  # what it has sent still counts
-            return RenewedToken(token=token.text, expires_at=token.expires_at)
+            receipt = self.sessions.keys.receipt(kept)
+            return RenewedToken(token=token.text, expires_at=token.expires_at, receipt=receipt)
 
     async def _change_team(
         self,
@@ -86,8 +90,8 @@ class Teams:
         team: Sequence[str],
         token_ids: Mapping[str, str],
         keys: Mapping[str, str],
-    ) -> None:
-        """Keep a new team of the session ``record``. The session's lock is held."""
+    ) -> SessionRecord:
+        """Keep a new team of the session ``record``; the session with it. The session's lock is held."""
         check_size(team, self.settings.max_teammates)
         if caller.live.team_changes >= MAX_CHANGES:
             detail = f"a team may change {MAX_CHANGES} times between two frames; several may join at once"
@@ -107,6 +111,7 @@ class Teams:
         caller.live.team_changes += 1
         self.sessions.quota.add(kept, record)
         caller.live.follow(await self.sessions.current(caller))
+        return kept
 
 
 def check_size(team: Sequence[str], most: int) -> None:

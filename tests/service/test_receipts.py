@@ -44,6 +44,41 @@ async def test_every_answer_promises_the_log_that_it_is_in(messages, tmp_path):
     assert [finding.fault for finding in verify(lines[:2], receipts=kept)] == ["broken-promise"]
 
 
+async def test_whoever_changes_or_ends_a_session_is_promised_that_it_is_on_record(tmp_path):
+    async with serve() as served:
+        (key,) = await served.client.public_keys()
+        transport, file = served.client._http._transport, tmp_path / "receipts.jsonl"
+        pinned = GatewayClient("http://gateway", transport=transport, gateway_keys=[key], receipts=file)
+        session = await pinned.open_session(EGO, TEAM)
+        ego = pinned.vehicle(session.session_id, EGO, session.ego_token)
+        for change in (ego.renew(), ego.enrol(["car-9"]), ego.dismiss("car-9")):
+            before = pinned.receipts.latest(session.session_id).seq
+            await change
+            assert pinned.receipts.latest(session.session_id).seq == before + 1
+        head = await ego.close()
+        assert pinned.receipts.latest(session.session_id).head == head
+        lines = [line.encode() for line in await ego.audit_lines()]
+    kept = Receipts.read(file.read_bytes().splitlines(), by_id([key]))
+    assert sorted(kept.of(session.session_id)) == [1, 2, 3, 4, 5]
+    assert verify(lines, receipts=kept) == []
+    assert [finding.fault for finding in verify(lines[:-1], receipts=kept)] == ["broken-promise"]
+
+
+async def test_a_header_that_is_no_receipt_is_told():
+    async with serve() as served:
+        session, trusted = await served.open(), await served.client.public_keys()
+
+        def client(headers):
+            transport = httpx.MockTransport(lambda _: httpx.Response(204, headers=headers))
+            pinned = GatewayClient("http://gateway", transport=transport, gateway_keys=trusted)
+            return pinned.vehicle(session.session_id, EGO, "token")
+
+        with pytest.raises(ProtocolError, match="Audit-Receipt is no receipt"):
+            await client({"Audit-Receipt": "{}"}).dismiss("rsu")
+        with pytest.raises(ProtocolError, match="the answer has no receipt"):
+            await client({}).close()
+
+
 async def last(ego):
     return (await ego.audit())[-1]
 
