@@ -60,7 +60,7 @@ class Opening:
         self.sessions.quota.check(key_id)
         session_id = secrets.token_hex(16)
         vehicles = (request.ego_id, *request.teammates)
-        tokens = {v: self.tokens.issue(session_id, v, is_ego=v == request.ego_id) for v in vehicles}
+        tokens = await self.tokens.issue_all(session_id, vehicles, request.ego_id)
         record = SessionRecord(
             session_id=session_id,
             ego_id=request.ego_id,
@@ -99,7 +99,7 @@ class Opening:
             "defense": defense,
             "receipt": self.sessions.keys.receipt(kept),
         }
-        return SessionCreated.model_validate(shown)
+        return await asyncio.to_thread(SessionCreated.model_validate, shown)
 
     def _detector(self, name: str) -> DetectorInfo:
         self.engine.check_ready()

@@ -2,12 +2,14 @@
 
 from __future__ import annotations
 
+import asyncio
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
 
 from robosac.answers import LogReceipt
 from robosac.audit.events import TeamChanged, TokenRenewed
 from robosac.budget import DomainError
+from robosac.defenses import Defense
 from robosac.session import changed_team
 from service.errors import Kind, Refused
 from service.keeping.record import SessionRecord
@@ -42,7 +44,7 @@ class Teams:
             for name in newcomers:
                 if name == record.ego_id or name in record.teammates:
                     raise Refused(Kind.ALREADY_ENROLLED, f"{name} is in the session already", "teammates")
-            tokens = {name: self.tokens.issue(record.session_id, name, is_ego=False) for name in newcomers}
+            tokens = await self.tokens.issue_all(record.session_id, newcomers, record.ego_id)
             token_ids = {**record.token_ids, **{name: token.token_id for name, token in tokens.items()}}
             keys = {**record.public_keys, **public_keys}
             kept = await self._change_team(caller, record, (*record.teammates, *newcomers), token_ids, keys)
@@ -96,22 +98,27 @@ class Teams:
         if caller.live.team_changes >= MAX_CHANGES:
             detail = f"a team may change {MAX_CHANGES} times between two frames; several may join at once"
             raise Refused(Kind.TOO_MANY_CHANGES, detail)
-        try:
-            state = changed_team(caller.live.session.defense, record.state, team)
-        except DomainError as error:
-            raise Refused(Kind.IMPOSSIBLE_DEFENSE, str(error), "teammates") from error
-        event = TeamChanged(
-            joined=tuple(name for name in team if name not in record.teammates),
-            left=tuple(name for name in record.teammates if name not in team),
-            teammates=tuple(team),
-            public_keys=dict(keys),
-            state=dict(state),
-        )
+        event = await asyncio.to_thread(_change, caller.live.session.defense, record, team, keys)
         kept = await self.store.change_team(record, event, token_ids)
         caller.live.team_changes += 1
         self.sessions.quota.add(kept, record)
         caller.live.follow(await self.sessions.current(caller))
         return kept
+
+
+def _change(defense: Defense, record: SessionRecord, team: Sequence[str], keys: Mapping[str, str]) -> TeamChanged:
+    """What is put on record of a new team, with what the defence remembers of it."""
+    try:
+        state = changed_team(defense, record.state, team)
+    except DomainError as error:
+        raise Refused(Kind.IMPOSSIBLE_DEFENSE, str(error), "teammates") from error
+    return TeamChanged(
+        joined=tuple(name for name in team if name not in record.teammates),
+        left=tuple(name for name in record.teammates if name not in team),
+        teammates=tuple(team),
+        public_keys=dict(keys),
+        state=dict(state),
+    )
 
 
 def check_size(team: Sequence[str], most: int) -> None:

@@ -1,6 +1,7 @@
 import asyncio
 import dataclasses
 import json
+import threading
 import time
 from datetime import datetime
 
@@ -8,6 +9,7 @@ import jwt
 import pytest
 
 from clients.errors import AccessDenied, InvalidRequest, SessionNotFound
+from service.sessions import identity, teams
 from service.sessions.identity import AUDIENCE, CLAIMS, ISSUER
 from tests.service.conftest import EGO, problem, serve
 from tests.service.credentials import OTHER_SECRET, SECRET, bearer, claims_of, forged, segment
@@ -25,6 +27,21 @@ async def test_a_token_says_whose_it_is_and_until_when():
         assert claims_of(session.ego_token)["role"] == "ego"
         every = [session.ego_token, *session.teammate_tokens.values()]
         assert len({claims_of(token)["jti"] for token in every}) == 6
+
+
+async def test_neither_tokens_nor_teams_are_made_on_the_event_loop(served, monkeypatch):
+    threads = []
+
+    def noted(made):
+        return lambda *args, **options: threads.append(threading.get_ident()) or made(*args, **options)
+
+    monkeypatch.setattr(identity.jwt, "encode", noted(jwt.encode))
+    monkeypatch.setattr(teams, "changed_team", noted(teams.changed_team))
+    session = await served.open()
+    await served.ego(session).enrol(["car-9"])
+    await served.ego(session).dismiss("car-9")
+    assert len(threads) == 6 + 2 + 1
+    assert threading.get_ident() not in threads
 
 
 FORGERIES = {
