@@ -5,7 +5,6 @@ from __future__ import annotations
 import asyncio
 import contextlib
 import time
-from collections import Counter
 from dataclasses import dataclass, field
 
 from robosac import wire
@@ -20,7 +19,7 @@ from service.errors import GivenUp, StoreTooSlow
 from service.keeping.patience import GRACE_S, Patience, ask_for_the_exception
 from service.keeping.record import SessionRecord
 from service.keeping.store import Store
-from service.sessions.live import unlogged
+from service.sessions.live import Refusals
 from service.sessions.sessions import Sessions
 
 
@@ -76,7 +75,7 @@ class _Write:
     asked: Asked
     present: Present
     result: FusionResult
-    counted: Counter[str]
+    counted: Refusals
     """Refusals since the decision before."""
     patience: Patience = field(default_factory=Patience)
     kept: SessionRecord = field(init=False)
@@ -105,7 +104,7 @@ class _Write:
     def undo(self) -> None:
         """It is not kept: the session is as it was before the frame."""
         live = self.asked.caller.live
-        live.refusals.update(self.counted)
+        live.refusals.add(self.counted)
         live.gathering.reopen(self.asked.frame)
 
     def _event(self, record: SessionRecord, answer: FrameAnswer, next_seed: str) -> FrameAnswered:
@@ -120,7 +119,7 @@ class _Write:
             out_of_time=self.result.out_of_time,
             fault=self.result.fault,
             state=dict(self.result.state),
-            unlogged_refusals=unlogged(self.counted),
+            unlogged_refusals=dict(self.counted.unlogged),
             next_seed_commitment=commitment(next_seed),
             gateway=self.keeping.sessions.moving.name,
         )

@@ -25,8 +25,14 @@ from service.keeping.sealing import Draft, Ready, Sealing, drafted, sealed
 from service.keeping.seen import Seen
 from service.keeping.tables import audit_lines, kept_messages, sessions
 
+Allowed = Callable[[SessionRecord], None]
+"""Raises unless something may go on record in a session as it is."""
 PAGE, REMEMBERED = 128, 4096
 """Audit lines that are read at a time, and sessions that `Store.seen` knows."""
+
+
+def always(now: SessionRecord) -> None:
+    """Whatever the session is like by then."""
 
 
 class Store:
@@ -228,9 +234,14 @@ class Store:
         query = select(sessions.c.session_id, sessions.c.holder).where(sessions.c.session_id.in_(session_ids))
         return await self._database.read(lambda connection: {row[0]: row[1] for row in connection.execute(query)})
 
-    async def log(self, session_id: str, event: Event) -> None:
-        """Append to a session's log."""
-        await self._append(session_id, event, lambda _: {})
+    async def log(self, session_id: str, event: Event, allowed: Allowed = always) -> None:
+        """Append to a session's log where that is ``allowed`` as the session is then; what that raises, this raises."""
+
+        def change(now: SessionRecord) -> Mapping[str, Any]:
+            allowed(now)
+            return {}
+
+        await self._append(session_id, event, change)
 
     async def audit(self, session_id: str, after: int, limit: int = PAGE) -> list[str]:
         """The ``limit`` lines with the numbers after ``after``, in order, or as many of them as there are."""

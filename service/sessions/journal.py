@@ -1,18 +1,18 @@
 """What goes on record besides decisions: who was refused, and who said two things at once. Nobody can fill a log: of
 one vehicle, and of all strangers together, only so many records are kept between two frames; the others are counted.
+So is what came with a token that counts no more by then: the log has its vehicle under another key, or not at all.
 """
 
 from __future__ import annotations
 
-import contextlib
 from dataclasses import dataclass
 
 import structlog
 
 from robosac.answers import Reason
 from robosac.audit.events import AccessRefused, Equivocation, Event, MessageRefused, Proof
-from service.errors import AuditFull, SessionOver, TokenRefused
-from service.keeping.store import Store
+from service.errors import AuditFull, SessionOver, TokenRefused, TokenReplaced
+from service.keeping.store import Allowed, Store, always
 from service.sessions.gathering import Received
 from service.sessions.live import EQUIVOCATIONS_LOGGED, REFUSALS_LOGGED, STRANGERS, Caller, LiveSession
 from service.watching.metrics import Metrics
@@ -40,31 +40,43 @@ class Journal:
                 frame=frame,
             )
             event = MessageRefused(vehicle_id=vehicle_id, frame=frame, reason=reason, detail=detail, field=field)
-            await self._append(session_id, event)
+            await self._append(caller.live, session_id, vehicle_id, event, caller.check_token)
 
     async def equivocation(self, caller: Caller, frame: int, first: Proof, second: Received) -> None:
         """A vehicle said two different things about one frame."""
         session_id, vehicle_id = caller.record.session_id, caller.vehicle_id
         caller.live.equivocations[vehicle_id] += 1
         proven = caller.live.equivocations[vehicle_id] <= EQUIVOCATIONS_LOGGED  # however much was refused before
-        if self._counted(caller.live, vehicle_id, Reason.REPLAYED, logged=proven):
+        if self._counted(caller.live, vehicle_id, Reason.REPLAYED, proven=proven):
             logger.warning("equivocation", session_id=session_id, vehicle_id=vehicle_id, frame=frame)
             event = Equivocation(vehicle_id=vehicle_id, frame=frame, first=first, second=second.proof)
-            await self._append(session_id, event)
+            await self._append(caller.live, session_id, vehicle_id, event, caller.check_token)
 
     async def stranger(self, session_id: str, live: LiveSession | None, refused: TokenRefused) -> None:
         """Somebody came without a token that counts; ``live`` is None for a session not served."""
         if live is None:
             self.metrics.refused(Reason.UNAUTHENTICATED.value)
         elif self._counted(live, STRANGERS, Reason.UNAUTHENTICATED):
-            await self._append(session_id, AccessRefused(vehicle_id=refused.vehicle_id, detail=refused.detail))
+            event = AccessRefused(vehicle_id=refused.vehicle_id, detail=refused.detail)
+            await self._append(live, session_id, STRANGERS, event)
 
-    def _counted(self, live: LiveSession, who: str, reason: Reason, *, logged: bool = False) -> bool:
-        """Count a refusal, unless it is ``logged`` anyway; whether it gets a record."""
+    def _counted(self, live: LiveSession, who: str, reason: Reason, *, proven: bool = False) -> bool:
+        """Count a refusal, unless it is ``proven``; whether it gets a record."""
         self.metrics.refused(reason.value)
-        live.refusals[who] += not logged
-        return logged or live.refusals[who] <= REFUSALS_LOGGED
+        if proven:
+            return True
+        is_logged = live.refusals.logged[who] < REFUSALS_LOGGED
+        (live.refusals.logged if is_logged else live.refusals.unlogged)[who] += 1
+        return is_logged
 
-    async def _append(self, session_id: str, event: Event) -> None:
-        with contextlib.suppress(SessionOver, AuditFull):
-            await self.store.log(session_id, event)
+    async def _append(
+        self, live: LiveSession, session_id: str, who: str, event: Event, allowed: Allowed = always
+    ) -> None:
+        try:
+            await self.store.log(session_id, event, allowed)
+        except AuditFull:
+            live.refusals.unlogged[who] += 1
+        except TokenReplaced:
+            live.refusals.unlogged[STRANGERS] += 1
+        except SessionOver:
+            pass

@@ -35,6 +35,19 @@ class Standing:
 
 
 @dataclass
+class Refusals:
+    """How many there were since the last decision, by vehicle: with a record of their own, and without one."""
+
+    logged: Counter[str] = field(default_factory=Counter)
+    unlogged: Counter[str] = field(default_factory=Counter)
+
+    def add(self, more: Refusals) -> None:
+        """Count others with these."""
+        self.logged += more.logged
+        self.unlogged += more.unlogged
+
+
+@dataclass
 class LiveSession:
     """What a session holds in this process only; the lock is held while a frame is answered or the team changes.
 
@@ -60,7 +73,7 @@ class LiveSession:
     ego_proof: Proof | None = None
     lock: asyncio.Lock = field(default_factory=asyncio.Lock)
     last_used: float = field(default_factory=time.monotonic)
-    refusals: Counter[str] = field(default_factory=Counter)
+    refusals: Refusals = field(default_factory=Refusals)
     equivocations: Counter[str] = field(default_factory=Counter)
     renewals: Counter[str] = field(default_factory=Counter)
     team_changes: int = 0
@@ -105,15 +118,10 @@ class LiveSession:
         for standing in self.standing.values():
             standing.over.set()
 
-    def count_anew(self) -> Counter[str]:
-        """Refusals by vehicle since the last decision; all counts begin again, unless they are given back."""
-        counted, self.refusals = self.refusals, Counter()
+    def count_anew(self) -> Refusals:
+        """Refusals since the last decision; all counts begin again, unless they are given back."""
+        counted, self.refusals = self.refusals, Refusals()
         return counted
-
-
-def unlogged(counted: Mapping[str, int]) -> dict[str, int]:
-    """Of counted refusals, how many got no record of their own."""
-    return {name: n - REFUSALS_LOGGED for name, n in counted.items() if n > REFUSALS_LOGGED}
 
 
 @dataclass(frozen=True)

@@ -108,6 +108,69 @@ async def test_what_waits_at_one_gateway_does_not_count_for_whoever_joins_at_ano
         assert await faults(ego) == []
 
 
+@contextlib.asynccontextmanager
+async def two_gateways(tmp_path):
+    """Of one database, and a session in which rsu signs."""
+    where = {"database_url": f"sqlite:///{tmp_path}/robosac.db", "extra_detectors": HOOKED}
+    async with serve(**where) as one, serve(**where) as other:
+        keys = {"rsu": show_public_key(KEY)}
+        yield one, other, await one.client.open_session(EGO, TEAM, defense=NONE, gather_ms=20, public_keys=keys)
+
+
+@pytest.mark.parametrize("back", [True, False])
+@pytest.mark.parametrize("second", ["another", "junk"])
+async def test_who_left_at_another_gateway_puts_nothing_on_record(tmp_path, messages, back, second):
+    async with two_gateways(tmp_path) as (one, other, session):
+        said = [
+            wire.pack_message(0, "rsu", message, signed(KEY, session, 0, "rsu", message))
+            for message in (messages["rsu"], messages["car-2"])
+        ]
+        token, ego = session.teammate_tokens["rsu"], one.ego(session)
+        assert (await one.post(session, "messages", said[0], token)).status_code == 202
+        body = said[1] if second == "another" else b"junk" * 10
+        async with on_the_way(one, session, "messages", body, token):
+            await other.ego(session).dismiss("rsu")
+            if back:
+                await other.ego(session).enrol(["rsu"], {"rsu": show_public_key(OTHER_KEY)})
+        assert [record["event"] for record in await ego.audit()] == ["session_opened"] + ["team_changed"] * (1 + back)
+        await ego.ask(0, messages[EGO])
+        assert (await ego.audit())[-1]["unlogged_refusals"] == {"?": 1}
+        assert await faults(ego) == []
+
+
+async def test_an_ego_whose_token_was_renewed_at_another_gateway_puts_nothing_on_record(tmp_path, messages, benign):
+    async with two_gateways(tmp_path) as (one, other, session):
+        benign = {name: message for name, message in benign.items() if name != "rsu"}
+        await one.ego(session).post_frame(0, messages[EGO], benign)
+        body = wire.pack_frame(0, messages["car-2"], benign)
+        async with on_the_way(one, session, "frames", body, session.ego_token):
+            renewed = await other.ego(session).renew()
+        ego = other.client.vehicle(session.session_id, EGO, renewed.token)
+        events = [record["event"] for record in await ego.audit()]
+        assert events == ["session_opened", "frame_answered", "token_renewed"]
+
+
+async def test_a_message_in_hand_does_not_count_by_a_key_that_was_replaced_at_another_gateway(tmp_path, messages):
+    async with two_gateways(tmp_path) as (one, other, session):
+        loop, changes = asyncio.get_running_loop(), [None]
+
+        async def join_again():
+            await other.ego(session).dismiss("rsu")
+            await other.ego(session).enrol(["rsu"], {"rsu": show_public_key(OTHER_KEY)})
+
+        def change(*_):
+            if changes.pop() is None:
+                asyncio.run_coroutine_threadsafe(join_again(), loop).result()
+
+        body = wire.pack_message(0, "rsu", messages["rsu"], signed(KEY, session, 0, "rsu", messages["rsu"]))
+        await one.post(session, "messages", body, session.teammate_tokens["rsu"])
+        await one.teammate(session, "car-2").send(0, messages["car-2"])
+        one.detector.before_prepare = lambda *_: change() if changes else None
+        answer = await one.ego(session).ask(0, messages[EGO])
+        assert (changes, answer.accepted, answer.rejected["rsu"].reason) == ([], ("car-2",), "unauthenticated")
+        assert await faults(one.ego(session)) == []
+
+
 async def test_nothing_is_remembered_of_where_those_were_who_left(served, messages, benign):
     session = await served.open(defense=NONE)
     ego, live = served.ego(session), served.gateway.sessions.in_use(session.session_id)
