@@ -150,6 +150,10 @@ class SessionInUse(Exception):
     """A session was used meanwhile, so it is not ended for being idle."""
 
 
+class ShareFull(Exception):
+    """Others than the ego have put on record as much as they may; this is only counted."""
+
+
 class GivenUp(Exception):
     """Nobody waits any more for what was to be kept, so it is not kept."""
 

@@ -23,16 +23,11 @@ from service.keeping.record import SessionRecord
 from service.keeping.rows import ADD_REST, FIELDS, GET, GET_BUT_KNOWN, NO_CHANGE, OPEN, TOUCH, columns, read_row
 from service.keeping.sealing import Draft, Ready, Sealing, drafted, sealed
 from service.keeping.seen import Seen
+from service.keeping.shares import Shares
 from service.keeping.tables import audit_lines, kept_messages, sessions
 
-Allowed = Callable[[SessionRecord], None]
-"""Raises unless something may go on record in a session as it is."""
 PAGE, REMEMBERED = 128, 4096
 """Audit lines that are read at a time, and sessions that `Store.seen` knows."""
-
-
-def always(now: SessionRecord) -> None:
-    """Whatever the session is like by then."""
 
 
 class Store:
@@ -70,6 +65,7 @@ class Store:
     ) -> None:
         self._database = connect(url, limits)
         self._most_records = most_records
+        self.shares = Shares(most_records)
         self._sealing = Sealing(full_every, remembered)
         self._seen = Seen(remembered)
 
@@ -234,11 +230,12 @@ class Store:
         query = select(sessions.c.session_id, sessions.c.holder).where(sessions.c.session_id.in_(session_ids))
         return await self._database.read(lambda connection: {row[0]: row[1] for row in connection.execute(query)})
 
-    async def log(self, session_id: str, event: Event, allowed: Allowed = always) -> None:
-        """Append to a session's log where that is ``allowed`` as the session is then; what that raises, this raises."""
+    async def log(self, session_id: str, event: Event, *checks: Callable[[SessionRecord], None]) -> None:
+        """Append to a session's log, unless one of the ``checks`` of the session as it is then raises."""
 
         def change(now: SessionRecord) -> Mapping[str, Any]:
-            allowed(now)
+            for check in checks:
+                check(now)
             return {}
 
         await self._append(session_id, event, change)
