@@ -68,7 +68,9 @@ class LiveSession:
     key: str = ""
     """Which API key opened it (`service.sessions.identity.ApiKeys`)."""
     digests: tuple[str | None, str | None] = (None, None)
-    """As `service.keeping.record.SessionRecord.digests` when it began here."""
+    """As `service.keeping.record.SessionRecord.digests` when it began here, or its ego took it to these weights."""
+    has_other_weights: bool = False
+    """Whether the detector has others here than those: the session goes on with them once its ego asks here."""
     answered: int | None = None
     ego_proof: Proof | None = None
     lock: asyncio.Lock = field(default_factory=asyncio.Lock)
@@ -117,6 +119,11 @@ class LiveSession:
         self.held = False
         for standing in self.standing.values():
             standing.over.set()
+
+    def count_on(self, before: LiveSession) -> None:
+        """Count what there was before since the last decision."""
+        self.refusals, self.equivocations = before.refusals, before.equivocations
+        self.renewals, self.team_changes = before.renewals, before.team_changes
 
     def count_anew(self) -> Refusals:
         """Refusals since the last decision; all counts begin again, unless they are given back."""

@@ -107,8 +107,16 @@ class Sessions:
             self._forget(session_id)
             raise SessionOver("there is no such session; it may have ended or expired")
         vehicle = await self._holder(record, token)
-        record = await self._noting_other_weights(record)
-        live = self._live_session(record)
+        is_ego = vehicle == record.ego_id
+        try:
+            live = self._live_session(record)
+        except Refused:
+            if is_ego:
+                await self._note_other_weights(record)
+            raise
+        if is_ego and live.has_other_weights:
+            record = await self._with_other_weights(record, live)
+            live = self._live_session(record)
         live.follow(record)
         live.last_used = time.monotonic()
         return Caller(record, live, vehicle)
@@ -261,24 +269,23 @@ class Sessions:
             record.latency_budget_ms / 1e3,
             record.key_id,
             record.digests,
+            has_changed(record, detector.info),
         )
 
-    async def _noting_other_weights(self, record: SessionRecord) -> SessionRecord:
-        """The session, after a start with other weights of its detector's name with these, if that is allowed; it goes
-        on record either way, once in the life of a process, or as often as another one lets it go on with its own.
-        """
-        detector = self.engine.detectors.get(record.detector)
-        if self._held(record) is not None or detector is None or not has_changed(record, detector.info):
-            return record
-        event = detector_changed(detector.info, accepted=self.settings.allow_other_weights)
-        if not event.accepted and record.session_id in self._standing:
-            return record
-        logger.warning("other weights", session_id=record.session_id, detector=record.detector, accepted=event.accepted)
-        if event.accepted:
-            return await self.store.change_detector(record, event)
-        self._standing.add(record.session_id)
-        await self.store.log(record.session_id, event)
-        return record
+    async def _with_other_weights(self, record: SessionRecord, live: LiveSession) -> SessionRecord:
+        """The session, which goes on with those that its detector has here from now on."""
+        logger.warning("other weights", session_id=record.session_id, detector=record.detector, accepted=True)
+        after = await self.store.change_detector(record, detector_changed(live.detector.info, accepted=True))
+        live.digests, live.has_other_weights = after.digests, False  # what waits here still counts
+        return after
+
+    async def _note_other_weights(self, record: SessionRecord) -> None:
+        """A session stands still: put on record, once in the life of a process, that it is for other weights, if so."""
+        detector, session_id = self.engine.detectors.get(record.detector), record.session_id
+        if detector is not None and has_changed(record, detector.info) and session_id not in self._standing:
+            logger.warning("other weights", session_id=session_id, detector=record.detector, accepted=False)
+            self._standing.add(session_id)
+            await self.store.log(session_id, detector_changed(detector.info, accepted=False))
 
     def _forget(self, session_id: str) -> None:
         live = self._live.pop(session_id, None)
@@ -308,18 +315,15 @@ class Sessions:
         return True
 
     def _live_session(self, record: SessionRecord) -> LiveSession:
-        live = self._held(record)
-        if live is None:
-            live = self._live[record.session_id] = self._revive(record)
-        return live
-
-    def _held(self, record: SessionRecord) -> LiveSession | None:
-        """What this process holds of a session, unless another let it go on with other weights since."""
-        live = self._live.get(record.session_id)
-        if live is None or live.digests == record.digests:
-            return live
+        """What this process holds of a session; anew where another process let it go on with other weights since."""
+        before = self._live.get(record.session_id)
+        if before is not None and before.digests == record.digests:
+            return before
         self._forget(record.session_id)
-        return None
+        live = self._live[record.session_id] = self._revive(record)
+        if before is not None:
+            live.count_on(before)
+        return live
 
     async def _holder(self, record: SessionRecord, token: str | None) -> str:
         """The vehicle of the session that a token belongs to; a refusal goes on record, but only so many of them."""

@@ -1,7 +1,9 @@
+import contextlib
 import json
 import shutil
 import sys
 import types
+from collections import Counter
 
 import pytest
 
@@ -148,6 +150,53 @@ async def test_two_gateways_with_different_weights_decide_each_as_the_log_says(t
         for frame in (0, 1, 2, 3) if allowed else (0, 1, 3):
             decision, body = replay.find(lines, frame), await second.ego(session).kept_messages(frame)
             assert replay.replay(decision, body, own[decision.session.weights_digest]) == []
+
+
+@contextlib.asynccontextmanager
+async def two_with_different_weights(tmp_path):
+    shared = {"database_url": f"sqlite:///{tmp_path}/robosac.db", "allow_other_weights": True}
+    async with serve(**shared) as one, serve(**shared, extra_detectors=(str(ADVERSARIAL_WEIGHTS),)) as other:
+        yield one, other
+
+
+def counted(records):
+    return Counter(record["event"] for record in records)
+
+
+async def test_only_the_ego_takes_a_session_to_other_weights(tmp_path, messages):
+    async with two_with_different_weights(tmp_path) as (one, other):
+        session = await one.open(defense={"kind": "none"}, gather_ms=20)
+        for _ in range(20):
+            for served in (one, other):
+                await served.post(session, "messages", b"x", session.teammate_tokens["rsu"])
+        await other.teammate(session, "car-2").send(0, messages["car-2"])
+        assert counted(await one.ego(session).audit()) == {"session_opened": 1, "message_refused": 32}
+        assert (await other.ego(session).ask(0, messages["car-1"])).accepted == ("car-2",)
+        lines = [line.encode() for line in await other.ego(session).audit_lines()]
+        assert counted(map(json.loads, lines[-2:])) == {"detector_changed": 1, "frame_answered": 1}
+        assert verify(lines) == []
+
+
+async def test_refusals_are_not_counted_anew_with_other_weights(tmp_path):
+    async with two_with_different_weights(tmp_path) as both:
+        session = await both[0].open(defense={"kind": "none"})
+        for number in range(40):
+            served = both[number % 2]
+            await served.ego(session).state()
+            await served.post(session, "messages", b"x", session.teammate_tokens["rsu"])
+            await served.post(session, "messages", b"x", session.teammate_tokens["rsu"])
+        assert counted(await both[0].ego(session).audit())["message_refused"] == 32
+
+
+async def test_a_session_goes_on_with_no_weights_that_cannot_serve_it(tmp_path, good_frame):
+    async with two_with_different_weights(tmp_path) as (one, other):
+        session = await one.open(defense={"kind": "group_testing"})
+        for _ in range(2):
+            problem(await other.post(session, "frames", good_frame(0)), 503, "detector-unavailable")
+        await one.ego(session).post_frame_body(good_frame(0))
+        records = await one.ego(session).audit()
+    assert counted(records) == {"session_opened": 1, "detector_changed": 1, "frame_answered": 1}
+    assert next(record["accepted"] for record in records if "accepted" in record) is False
 
 
 async def test_a_precision_is_served_logged_and_needed_for_replay(good_frame):
