@@ -15,7 +15,6 @@ from cryptography.hazmat.primitives.asymmetric.ed25519 import Ed25519PrivateKey,
 
 SIGNATURE_BYTES = 64
 _PURPOSE = "robosac message v2"
-_PURPOSE_V1 = b"robosac message v1"
 _HEAD_PURPOSE = "robosac audit head v1"
 _P = 2**255 - 19
 _SMALL_ORDER_Y = frozenset({
@@ -80,11 +79,6 @@ def is_valid(
 ) -> bool:
     """Whether a signature is that of the key's owner over this message of this vehicle, for this frame and session."""
     return _verifies(key, signature, _signed(session_id, vehicle_id, frame, content_digest))
-
-
-def is_valid_v1(key: Ed25519PublicKey, session_id: str, content_digest: str, signature: bytes) -> bool:
-    """As `is_valid`, of a signature as it was made before: it named no frame, and proves no equivocation."""
-    return _verifies(key, signature, b"\n".join((_PURPOSE_V1, session_id.encode(), content_digest.encode())))
 
 
 def key_id(key: Ed25519PublicKey) -> str:

@@ -58,12 +58,14 @@ def _of_answer(answer: FrameAnswered, trusted: Collection[str] | None) -> Iterat
 def _of_hypotheses(answer: FrameAnswered, threshold: float | None) -> Iterator[str]:
     if answer.sampling_steps != len(answer.hypotheses):
         yield f"{answer.sampling_steps} sampling steps, but {len(answer.hypotheses)} hypotheses"
+    tested: set[str] = set().union(*(o.teammates for o in answer.hypotheses))
     contradicted: set[str] = set().union(*(o.teammates for o in answer.hypotheses if o.verdict is Verdict.DISSENSUS))
     blamed = {
         name
         for name, why in answer.rejected.items()
-        if why.reason is Reason.DISSENSUS and not hasattr(why, "p_value")  # which is judged by rank, not by threshold
-    } - contradicted
+        # one that is judged by rank has passed the threshold perhaps, but not gone untested
+        if why.reason is Reason.DISSENSUS and name not in (tested if hasattr(why, "p_value") else contradicted)
+    }
     if blamed:
         yield f"{_listed(blamed)} rejected for a dissensus, but in no hypothesis of that verdict"
     if threshold is None:

@@ -92,8 +92,6 @@ class SessionOpened(_Event):
     version: str
     ego_id: str
     teammates: tuple[str, ...]
-    format: int = 1
-    """Of the log's records, see `robosac.audit.expanding`."""
     detector: str
     weights_digest: str
     calibration_digest: str | None = None

@@ -43,10 +43,11 @@ def expanded(record: Mapping[str, Any], but: Collection[str] = ()) -> dict[str, 
     ValueError
         If a part of it cannot be unpacked.
     """
-    if record.get("format", 1) == 1:
+    written = record.get("format", 1)
+    if type(written) is not int or written not in (1, FORMAT):
+        raise ValueError(f"format: {written!r:.64} is none that this version knows")
+    if written == 1:
         return dict(record)
-    if record["format"] != FORMAT:
-        raise ValueError(f"format: {record['format']!r} is of a later version")
     read = dict(record)
     names = sorted(read["messages"]) if isinstance(read.get("messages"), dict) else []
     if read.get("event") == "frame_answered":

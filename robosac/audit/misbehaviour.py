@@ -186,8 +186,10 @@ class _Case:
         self.location = {"frame": answer.frame, "worldFromSensor": answer.ego_pose.reshape(-1).tolist()}
 
     def _take_equivocation(self, lie: Equivocation) -> None:
+        if self.key is None or lie.vehicle_id != self.vehicle:  # without a key a signature is no proof
+            return
         first = lie.first if lie.first.signature else self.proofs.get(lie.first.digest, lie.first)
-        if lie.vehicle_id == self.vehicle and first.signature and lie.second.signature:  # else nothing proves it
+        if first.signature and lie.second.signature:
             obs = {"frame": lie.frame, "time": lie.time}
             self._observe("message", "equivocation", SAME_STATION, obs, lie.frame, [first, lie.second])
 

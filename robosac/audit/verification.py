@@ -7,8 +7,6 @@ from collections.abc import Iterable, Mapping
 from dataclasses import dataclass, field
 from typing import Any
 
-from cryptography.hazmat.primitives.asymmetric.ed25519 import Ed25519PublicKey
-
 from robosac.audit.chain import GENESIS, commitment
 from robosac.audit.contradictions import contradictions
 from robosac.audit.events import (
@@ -20,13 +18,12 @@ from robosac.audit.events import (
     TeamChanged,
     event_of,
 )
-from robosac.audit.expanding import FORMAT
 from robosac.audit.findings import Fault, Finding
 from robosac.audit.lines import RecordError, is_canonical, read
 from robosac.audit.receipts import Receipts
 from robosac.consensus import DEFAULT_THRESHOLD
 from robosac.defenses import trusted_in
-from robosac.signatures import is_valid, is_valid_v1, read_public_key
+from robosac.signatures import is_valid, read_public_key
 
 
 def verify(lines: Iterable[bytes], head: str | None = None, receipts: Receipts | None = None) -> list[Finding]:
@@ -76,8 +73,12 @@ class _History:
     team: tuple[str, ...] | None = None
     keys: dict[str, str] = field(default_factory=dict)
     doubtful: set[str] = field(default_factory=set)
-    format: int = FORMAT
     latest: FrameAnswered | None = None
+
+    @property
+    def is_whole(self) -> bool:
+        """Whether an unbroken chain leads back to the latest answer, or to the opening where there is none."""
+        return self.commitment is not None
 
     def doubt(self) -> None:
         """Forget all that a missing or changed record may have changed."""
@@ -98,6 +99,7 @@ class _Verification:
         self._digest: str | None = GENESIS
         self._damaged = False
         self._session: str | None = None
+        self._format: Any = None
         self._ended = False
         self._history = _History()
 
@@ -204,24 +206,29 @@ class _Verification:
             case SessionOpened() as opened:
                 self._open(opened)
             case TeamChanged() as change:
-                self._enrol(change.public_keys)
-                self._history.trusted, self._history.team = trusted_in(change.state), change.teammates
+                self._change_team(change)
             case FrameAnswered() as answer:
                 self._check_answer(answer)
             case Equivocation() as lie:
                 self._check_equivocation(lie)
             case SessionEnded():
                 self._ended = True
+        written = record.get("format", 1)
+        if self._format not in (None, written):
+            self._find(Fault.MALFORMED, f"of format {written!r:.64} after one of format {self._format!r:.64}")
+        self._format = written
 
     def _open(self, opened: SessionOpened) -> None:
         threshold = opened.defense.get("consensus_threshold", DEFAULT_THRESHOLD)
+        if isinstance(threshold, bool) or not isinstance(threshold, int | float):
+            self._find(Fault.MALFORMED, "defense.consensus_threshold: must be a number")
+            threshold = None
         self._history = _History(
             ego_id=opened.ego_id,
-            threshold=threshold if isinstance(threshold, int | float) else None,
+            threshold=threshold,
             commitment=opened.next_seed_commitment,
             trusted=trusted_in(opened.state),
             team=opened.teammates,
-            format=opened.format,
         )
         self._enrol(opened.public_keys)
 
@@ -234,6 +241,14 @@ class _Verification:
                 self._find(Fault.MALFORMED, f"public_keys.{name}: {error}")
             else:
                 self._history.keys[name] = key
+
+    def _change_team(self, change: TeamChanged) -> None:
+        before, team = self._history.keys, self._history.team
+        self._enrol(change.public_keys)
+        stayed = [] if team is None else [self._history.ego_id or "", *(set(team) & set(change.teammates))]
+        if others := sorted(name for name in stayed if before.get(name) != self._history.keys.get(name)):
+            self._find(Fault.CONTRADICTION, f"another key, or none any more, of {', '.join(others)} who stayed")
+        self._history.trusted, self._history.team = trusted_in(change.state), change.teammates
 
     def _check_answer(self, answer: FrameAnswered) -> None:
         known = self._history
@@ -264,7 +279,7 @@ class _Verification:
         if first.signature is None and latest is not None and latest.frame == lie.frame:
             seen = latest.messages.get(lie.vehicle_id, first)
             first = seen if seen.digest == first.digest else first
-        if first.signature is None and known.format > 1:
+        if first.signature is None and known.is_whole:
             self._find(Fault.NO_EVIDENCE, f"the first message of {lie.vehicle_id} is neither signed nor in the log")
         elif first.signature is None or self._check_signature(lie.vehicle_id, lie.frame, first):
             self._check_signature(lie.vehicle_id, lie.frame, lie.second)
@@ -276,7 +291,7 @@ class _Verification:
             return True
         if proof.signature is None:
             detail = f"the message of {vehicle} is not signed, though it has registered a key"
-        elif not self._is_signed(read_public_key(key), vehicle, frame, proof.digest, proof.signature):
+        elif not is_valid(read_public_key(key), self._session or "", vehicle, frame, proof.digest, proof.signature):
             detail = f"the signature is not that of {vehicle} over its message for frame {frame}"
         else:
             return True
@@ -284,9 +299,3 @@ class _Verification:
         if vehicle in self._history.doubtful:
             del self._history.keys[vehicle]
         return False
-
-    def _is_signed(self, key: Ed25519PublicKey, vehicle: str, frame: int, digest: str, signature: bytes) -> bool:
-        session = self._session or ""
-        if is_valid(key, session, vehicle, frame, digest, signature):
-            return True
-        return self._history.format == 1 and is_valid_v1(key, session, digest, signature)

@@ -6,6 +6,7 @@ from datetime import UTC, datetime
 
 import numpy as np
 import pytest
+from cryptography.hazmat.primitives.asymmetric.ed25519 import Ed25519PrivateKey
 from typer.testing import CliRunner
 
 from clients.errors import GatewayError
@@ -97,10 +98,12 @@ def test_a_dissensus_with_the_previous_answer_is_a_conflict_with_other_stations(
 
 
 def test_the_key_reported_is_that_of_the_time(events):
-    events[5] = {**events[5], "public_keys": {}}
+    other = show_public_key(Ed25519PrivateKey.from_private_bytes(bytes(31) + b"\x02"))
+    events[5] = {**events[5], "public_keys": {"rsu": other}}
     late = {**events[4], "frame": 5}
     made = misbehaviour.report(seal_all([*events[:7], late]), "rsu", NOW)
-    assert [bool(s["certificate"]) for s in made["report"]["content"]["v2xPduEvidence"]] == [True, False]
+    keys = [stream["certificate"]["ed25519PublicKey"] for stream in made["report"]["content"]["v2xPduEvidence"]]
+    assert keys == [show_public_key(KEY), other]
 
 
 def test_the_time_counts_leap_seconds(lines):

@@ -78,17 +78,27 @@ def test_a_message_that_was_moved_to_another_frame_is_found(events):
     ]
 
 
-def test_signatures_of_the_first_form_count_in_old_logs_only(events):
-    def as_before(name, frame, what=""):
-        content = told(name, frame, what)["digest"]
-        signed = b"\n".join((b"robosac message v1", SESSION.encode(), content.encode()))
-        return {"digest": content, "signature": base64.b64encode(KEY.sign(signed)).decode()}
+def test_what_a_log_says_of_its_own_format_makes_no_rule_laxer(events):
+    invented = {**events[4], "first": {"digest": "ab" * 32}}
+    assert faults(seal_all([*events[:4], invented, *events[5:]])) == [(5, Fault.NO_EVIDENCE)]
+    content = told("rsu", 1, "!")["digest"]
+    no_frame = KEY.sign(b"\n".join((b"robosac message v1", SESSION.encode(), content.encode())))
+    second = {"digest": content, "signature": base64.b64encode(no_frame).decode()}
+    assert faults(seal_all([*events[:4], {**events[4], "second": second}, *events[5:]])) == [(5, Fault.BAD_SIGNATURE)]
 
-    for index, frame in ((1, 0), (2, 1), (6, 5)):
-        events[index] = {**events[index], "messages": {**events[index]["messages"], "rsu": as_before("rsu", frame)}}
-    events[4] = {**events[4], "first": as_before("rsu", 1), "second": as_before("rsu", 1, "!")}
-    assert verify(seal_all(events)) == []
-    assert faults(written(events)) == [(line, Fault.BAD_SIGNATURE) for line in (2, 3, 5, 7)]
+
+def test_records_of_two_formats_in_one_log_are_told(events):
+    whole = [compact(event_on(json.dumps(event).encode())) for event in events]
+    assert faults(seal_all([events[0], *whole[1:]])) == [(2, Fault.MALFORMED)]
+    assert faults(seal_all([*whole[:4], events[4], *whole[5:]])) == [(5, Fault.MALFORMED), (6, Fault.MALFORMED)]
+
+
+def test_a_vehicle_without_a_key_is_not_accused_by_what_passes_for_signatures(events):
+    junk = [{"digest": letter * 64, "signature": base64.b64encode(bytes(64)).decode()} for letter in "ab"]
+    events[4] = {**events[4], "vehicle_id": "car-3", "first": junk[0], "second": junk[1]}
+    assert verify(written(events)) == []
+    with pytest.raises(misbehaviour.NothingToReport):
+        misbehaviour.report(written(events), "car-3", NOW)
 
 
 def test_what_was_promised_is_found_in_the_log(events):

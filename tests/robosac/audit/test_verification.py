@@ -138,7 +138,8 @@ def test_a_seed_that_was_not_committed_to_is_told(events):
 
 
 def test_frames_must_increase(events):
-    assert faults(change(events, 2, frame=0)) == [(3, Fault.FRAME_ORDER), (3, Fault.BAD_SIGNATURE)]
+    unseen = (5, Fault.NO_EVIDENCE)  # the first message of the equivocation in frame 1
+    assert faults(change(events, 2, frame=0)) == [(3, Fault.FRAME_ORDER), (3, Fault.BAD_SIGNATURE), unseen]
     assert faults(change(events, 6, frame=1)) == [(7, Fault.FRAME_ORDER), (7, Fault.BAD_SIGNATURE)]
 
 
@@ -167,6 +168,12 @@ HYPOTHESIS = {"teammates": ["rsu", "car-3"], "jaccard_index": 0.75, "verdict": "
             {"rejected": [{"vehicle_id": "car-2", "reason": "dissensus"}]},
             "car-2 rejected for a dissensus, but in no",
         ),
+        (
+            2,
+            {"rejected": [{"vehicle_id": "car-2", "reason": "dissensus", "p_value": 0.001}]},
+            "car-2 rejected for a dissensus, but in no",
+        ),
+        (5, {"public_keys": {}}, "another key, or none any more, of rsu who stayed"),
         (6, {"rejected": []}, "car-2 neither accepted nor rejected"),
         (6, {"rejected": []}, "car-4 enrolled, but neither accepted nor rejected"),
     ],
@@ -256,6 +263,9 @@ def test_the_sessions_beginning_and_end_must_be_where_they_belong(events):
         (0, "time", "yesterday"),
         (1, "time", "2026-11-21T09:30:00.212"),
         (0, "public_keys", {"rsu": "AAAA"}),
+        (0, "format", 3),
+        (0, "format", True),
+        (0, "defense", {"kind": "static_team", "consensus_threshold": "0.3"}),
         (0, "state", {"trusted": [1]}),
         (1, "seed", "xyz"),
         (1, "source", "dreams"),
@@ -277,7 +287,7 @@ def test_records_that_lack_something_are_told(events, index, name, value):
 
 
 def test_a_finding_says_where_and_what(events):
-    finding, _ = verify(change(events, 2, frame=0))
+    finding, *_ = verify(change(events, 2, frame=0))
     assert str(finding) == "line 3 (seq 3): frame-order: frame 0 after frame 0"
 
 
