@@ -44,6 +44,11 @@ def _decoded(value: Any) -> Any:
     return base64.b64decode(value, validate=True) if isinstance(value, str) else value
 
 
+Count = Annotated[int, Field(ge=0)]
+Milliseconds = Annotated[float, Field(ge=0, le=86_400_000)]
+"""Nothing that a gateway waits for or measures takes more than a day."""
+
+
 class Proof(Typed):
     """Who said what: the digest of a message (`robosac.wire.content_digest`), and its signature where it has one."""
 
@@ -98,9 +103,9 @@ class SessionOpened(_Event):
     defense: dict[str, Any]
     screening: dict[str, MessageBounds] | None = None
     """By tensor: what honest messages hold; None where messages are not tested before they are fused."""
-    latency_budget_ms: float
-    gather_ms: float
-    frame_period_ms: float
+    latency_budget_ms: Milliseconds
+    gather_ms: Milliseconds
+    frame_period_ms: Milliseconds
     public_keys: dict[str, str]
     state: State
     next_seed_commitment: str
@@ -144,16 +149,18 @@ class FrameAnswered(_Event, FrameAnswer):
     """
 
     event: Literal["frame_answered"] = "frame_answered"
+    frame: Count
+    timings_ms: dict[str, Milliseconds]
     seed: str
     ego_pose: Pose
     messages: dict[str, Proof]
-    previous_frame: int | None = None
+    previous_frame: Count | None = None
     out_of_time: bool
     fault: str | None = None
     state: State | None = Field(None, exclude_if=lambda state: state is None)
     state_digest: str | None = Field(None, exclude_if=lambda digest: digest is None)
     trusted: tuple[str, ...] | None = Field(None, exclude_if=lambda names: names is None)
-    unlogged_refusals: dict[str, int] = Field(default_factory=dict)
+    unlogged_refusals: dict[str, Count] = Field(default_factory=dict)
     next_seed_commitment: str
     gateway: str = Field("", exclude_if=lambda name: not name)
 
@@ -209,7 +216,7 @@ class Equivocation(_Event):
 
     event: Literal["equivocation"] = "equivocation"
     vehicle_id: str
-    frame: int
+    frame: Count
     first: Proof
     second: Proof
 

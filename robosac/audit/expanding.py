@@ -9,6 +9,7 @@ from typing import Any, TypeVar
 from robosac.answers import Support
 from robosac.audit import packing
 from robosac.boxes import FloatArray
+from robosac.defenses.sampling import MAX_BUDGET
 
 T = TypeVar("T")
 
@@ -41,7 +42,7 @@ def expanded(record: Mapping[str, Any], but: Collection[str] = ()) -> dict[str, 
     Raises
     ------
     ValueError
-        If a part of it cannot be unpacked.
+        If a part of it cannot be unpacked, or holds more than a gateway's record can.
     """
     written = record.get("format", 1)
     if type(written) is not int or written not in (1, FORMAT):
@@ -50,6 +51,7 @@ def expanded(record: Mapping[str, Any], but: Collection[str] = ()) -> dict[str, 
         return dict(record)
     read = dict(record)
     names = sorted(read["messages"]) if isinstance(read.get("messages"), dict) else []
+    _blaming("messages", packing.check_count, len(names), packing.MOST_VEHICLES)
     if read.get("event") == "frame_answered":
         _fill_in(read)
     for name, unpack in _READERS.items():
@@ -121,10 +123,14 @@ def _read_messages(messages: Any, _: Sequence[str]) -> dict[str, Any]:
 
 
 def _read_hypotheses(hypotheses: Any, names: Sequence[str]) -> list[dict[str, Any]]:
-    return [
-        {"teammates": packing.unpack_names(teammates, names), "jaccard_index": index, "verdict": verdict}
-        for teammates, index, verdict in hypotheses
-    ]
+    packing.check_count(len(hypotheses), MAX_BUDGET)
+    read, named = [], 0
+    for packed, index, verdict in hypotheses:
+        teammates = packing.unpack_names(packed, names)
+        read.append({"teammates": teammates, "jaccard_index": index, "verdict": verdict})
+        named += len(teammates)
+        packing.check_count(named, packing.MOST_NAMES)
+    return read
 
 
 def _read_supports(supports: Any, names: Sequence[str]) -> Any:
@@ -153,6 +159,7 @@ def _read_suspicion(of: Any, names: Sequence[str]) -> dict[str, float] | None:
 def _read_rejected(entries: Any, names: Sequence[str]) -> list[Any]:
     read: list[Any] = []
     for entry in entries:
+        packing.check_count(len(read), packing.MOST_VEHICLES)
         if "vehicles" not in entry:
             read.append(dict(entry))
             continue

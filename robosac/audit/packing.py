@@ -24,6 +24,12 @@ MOST_BYTES = 2**23
 """Of one packed field, unpacked: several times the largest state of 1024 teammates. As Python's values it may take
 sixty times as much.
 """
+MOST_VEHICLES = 1025
+"""Of a frame: a session has at most 1024 teammates."""
+MOST_BOXES = 2**13
+"""Of a frame: several times what a detector that ships can give."""
+MOST_NAMES = 2**20
+"""In all hypotheses of a frame, or beside all its boxes: more than a frame has time for."""
 _BOX_BYTES = 24
 _RAW = -15
 """No header of zlib's, and the largest window."""
@@ -89,11 +95,12 @@ def unpack_boxes(text: Any) -> FloatArray:
     Raises
     ------
     ValueError
-        If the text is something else.
+        If the text is something else, or holds more than `MOST_BOXES`.
     """
     content = inflated(text)
     if len(content) % _BOX_BYTES:
         raise ValueError("does not hold whole boxes")
+    check_count(len(content) // _BOX_BYTES, MOST_BOXES)
     planes = np.frombuffer(content, dtype=np.uint8).reshape(4, 6, -1).transpose(1, 2, 0)
     unsigned = np.ascontiguousarray(planes).view("<u4")[..., 0].astype(np.int64)
     columns = (unsigned >> 1) ^ -(unsigned & 1)
@@ -127,15 +134,21 @@ def unpack_supports(text: Any, names: Sequence[str]) -> list[Support]:
     Raises
     ------
     ValueError
-        If the text is something else.
+        If the text is something else, or holds more than `MOST_BOXES` entries, or `MOST_NAMES` in them.
     """
     content, width = inflated(text), -(-len(names) // 8)
     if len(content) % (1 + 2 * width):
         raise ValueError("does not hold whole entries")
     number = 1 + 2 * width
+    check_count(len(content) // number, MOST_BOXES)
     rows = np.ascontiguousarray(np.frombuffer(content, dtype=np.uint8).reshape(number, -1).T).tobytes()
     among = tuple(names)
-    return [_support(rows[start : start + number], among) for start in range(0, len(rows), number)]
+    supports, named = [], 0
+    for start in range(0, len(rows), number):
+        supports.append(one := _support(rows[start : start + number], among))
+        named += len(one.witnesses) + len(one.deniers)
+        check_count(named, MOST_NAMES)
+    return supports
 
 
 @lru_cache(4096)  # most boxes of a log have the same few witnesses
@@ -201,4 +214,10 @@ def _mask(chosen: Sequence[str], bits: Mapping[str, int]) -> int:
 def _members(mask: int, names: Sequence[str]) -> list[str]:
     if mask < 0 or mask >> len(names):
         raise ValueError("names more vehicles than there are")
-    return [name for place, name in enumerate(names) if mask >> place & 1]
+    return [name for name, bit in zip(names, reversed(f"{mask:b}"), strict=False) if bit == "1"]
+
+
+def check_count(count: int, most: int) -> None:
+    """Raise ValueError if there are more than so many."""
+    if count > most:
+        raise ValueError(f"holds {count}; there are at most {most}")

@@ -103,6 +103,32 @@ def test_what_unpacks_to_too_much_is_refused():
         packing.inflated(packing.deflated(bytes(packing.MOST_BYTES + 1)))
 
 
+@pytest.mark.parametrize(
+    ("name", "value"),
+    [
+        ("messages", {f"car-{n}": packing.short_digest("00" * 32) for n in range(1026)}),
+        ("hypotheses", [["0", 0.5, "no_evidence"]] * 10_001),
+        ("hypotheses", [["1" + "f" * 256, 0.5, "consensus"]] * 1024),
+        ("rejected", [{"reason": "late", "vehicles": "f" * 256}] * 3),
+        ("boxes", packing.deflated(bytes(24 * 8193))),
+        ("support", packing.deflated(bytes(259 * 8193))),
+        ("support", packing.deflated(bytes(520) + 2 * (b"\xff" * 128 * 520 + b"\1" * 520))),
+        ("contradicted", {"boxes": packing.deflated(bytes(24 * 8193)), "support": None}),
+    ],
+)
+def test_more_than_a_frame_can_have_is_told_before_it_is_unpacked(events, name, value):
+    team = {f"car-{n:04}": packing.short_digest("00" * 32) for n in range(1025)}
+    record = {**compact(an_answer(events)), "messages": team, name: value}
+    with pytest.raises(RecordError, match=rf"^{name}: holds \d+; there are at most \d+$"):
+        event_on(json.dumps(record).encode())
+
+
+def test_the_largest_team_reads_back():
+    names = [f"car-{n:04}" for n in range(packing.MOST_VEHICLES)]
+    for chosen in (names, names[::3], names[-1:], []):
+        assert packing.unpack_names(packing.pack_names(chosen, names), names) == chosen
+
+
 @given(st.lists(st.lists(st.floats(-1e6, 1e6), min_size=6, max_size=6), max_size=40))
 def test_boxes_come_back_in_their_units(rows):
     boxes = np.array(rows, dtype=np.float64).reshape(-1, 6)

@@ -275,6 +275,7 @@ def test_the_sessions_beginning_and_end_must_be_where_they_belong(events):
         (1, "messages", {"rsu": {"digest": "0", "signature": "?"}}),
         (1, "rejected", ["rsu"]),
         (1, "out_of_time", 0),
+        (1, "unlogged_refusals", {"?": -1}),
         (5, "public_keys", None),
         (4, "second", None),
     ],
