@@ -10,6 +10,8 @@ from asyncio import TimerHandle, Transport
 
 from uvicorn.protocols.http.httptools_impl import HttpToolsProtocol
 
+from service.arriving.arrival import note_first_byte
+
 HEAD_BYTES = 64 * 1024
 """What of a head is taken before it is whole; `service.arriving.doors` judges it then."""
 HEADERS = 256
@@ -65,6 +67,7 @@ class BoundedHTTP(HttpToolsProtocol):
     def on_message_begin(self) -> None:
         self._in_head = True
         super().on_message_begin()
+        note_first_byte(self.scope["state"])
 
     def on_header(self, name: bytes, value: bytes) -> None:
         super().on_header(name, value)
@@ -84,6 +87,11 @@ class BoundedHTTP(HttpToolsProtocol):
         if self._pieces > PIECES and self._body_bytes < self._pieces * PIECE_BYTES:
             self._refuse("400 Bad Request", f"The pieces of a body must have {PIECE_BYTES} bytes on average.")
         super().on_body(body)
+
+    def on_message_complete(self) -> None:
+        super().on_message_complete()
+        if not self.pipeline:
+            self.flow.resume_reading()  # the next request's first byte is to be seen when it comes
 
     def send_400_response(self, msg: str) -> None:
         if self._refused is None:

@@ -9,7 +9,9 @@ import pytest
 import uvicorn
 
 from clients.hostile import Attack, Target, run_attack
+from service.arriving.arrival import Arrival, arrival_of
 from service.arriving.connections import HEAD_BYTES, HEADERS, PIECES, PIPELINED, BoundedHTTP
+from service.watching.stalls import LoopWatch
 
 GET = b"GET / HTTP/1.1\r\nHost: x\r\n\r\n"
 SLOW = b"GET /slow HTTP/1.1\r\nHost: x\r\n\r\n"
@@ -26,12 +28,13 @@ class Hasty(BoundedHTTP):
 async def application(scope, receive, send):
     if scope["type"] != "http":
         return
-    if scope["path"] == "/slow":
-        await asyncio.sleep(2 * TIMEOUT_S)
+    waited_s = time.perf_counter() - arrival_of(scope)
     if scope["method"] == "POST":
         while (await receive()).get("more_body"):
             pass
-    body = b"ok" if scope["path"] != "/large" else bytes(LARGE)
+    if scope["path"] == "/slow":
+        await asyncio.sleep(2 * TIMEOUT_S)
+    body = {"/large": bytes(LARGE), "/waited": b"%5.3f" % waited_s}.get(scope["path"], b"ok")
     await send({"type": "http.response.start", "status": 200, "headers": [(b"content-length", b"%d" % len(body))]})
     await send({"type": "http.response.body", "body": body})
 
@@ -40,7 +43,7 @@ async def application(scope, receive, send):
 async def port():
     with socket.socket() as listening:
         listening.bind(("127.0.0.1", 0))
-        config = uvicorn.Config(application, http=Hasty, lifespan="off", log_level="error", timeout_keep_alive=60)
+        config = uvicorn.Config(Arrival(application, LoopWatch()), http=Hasty, log_level="error", timeout_keep_alive=60)
         server = uvicorn.Server(config)
         serving = asyncio.create_task(server.serve([listening]))
         while not server.started:
@@ -211,3 +214,42 @@ async def test_a_head_of_any_size_that_is_looked_at_is_whole(port):
     async with connected(port) as (reader, writer):
         writer.write(GET.replace(b"Host: x", b"Host: x\r\nlong: " + b"x" * (HEAD_BYTES - 100)))
         assert b"200" in await reader.readuntil(b"\r\n\r\n")
+
+
+WAITED = GET.replace(b"/", b"/waited", 1)
+LARGER = b"POST /slow HTTP/1.1\r\nHost: x\r\nContent-Length: 1000000\r\n\r\n" + bytes(1_000_000)
+
+
+async def waited(reader):
+    """How long the next request but those that are no concern here waited for the application, seconds."""
+    while (await reader.readuntil(b"\r\n\r\n")).endswith(b"content-length: 2\r\n\r\n"):
+        await reader.readexactly(2)
+    return float(await reader.readexactly(5))
+
+
+async def test_a_request_has_come_when_its_first_byte_has(port):
+    async with connected(port) as (reader, writer):
+        for at in (1, 4, 30):
+            await asyncio.sleep(TIMEOUT_S / 3)  # the time between requests is nobody's
+            writer.write(WAITED[:at])
+            await asyncio.sleep(TIMEOUT_S / 3)
+            writer.write(WAITED[at:])
+            assert await waited(reader) == pytest.approx(TIMEOUT_S / 3, abs=TIMEOUT_S / 4)
+        writer.write(WAITED)
+        assert await waited(reader) < TIMEOUT_S / 4
+        await asyncio.sleep(TIMEOUT_S / 3)
+        writer.write(b"\r\n" + WAITED)
+        assert await waited(reader) < TIMEOUT_S / 4
+
+
+@pytest.mark.parametrize("before", [SLOW, LARGER])
+@pytest.mark.parametrize("at", [0, 9])
+async def test_a_pipelined_request_has_come_while_the_one_before_it_was_in_hand(port, before, at):
+    async with connected(port) as (reader, writer):
+        writer.write(before + WAITED[:at])
+        await asyncio.sleep(TIMEOUT_S / 2)
+        writer.write(WAITED[at:] + WAITED)
+        for slow in (2.0 if at else 1.5, 1.5):
+            assert await waited(reader) == pytest.approx(slow * TIMEOUT_S, abs=TIMEOUT_S / 4)
+        writer.write(WAITED)
+        assert await waited(reader) < TIMEOUT_S / 4
