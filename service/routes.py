@@ -228,7 +228,8 @@ async def post_message(
 ) -> Response:
     """A vehicle's own message. The ego's starts the fusion and is answered with the frame result."""
     limit = gateway.frames.body_limit(caller, whole_frame=False)
-    with gateway.frames.waiting(caller), (room := _room(gateway, caller)).holding(expected_bytes(request, limit)):
+    gateway.frames.check_waiting(caller)
+    with (room := _room(gateway, caller)).holding(expected_bytes(request, limit)):
         body = await _read_body(request, caller, gateway, limit)
         answer = await gateway.frames.post_message(caller, body, arrival_of(request.scope), room)
     return _negotiated(answer, accept, 202) if isinstance(answer, Receipt) else _handed_over(answer, accept, gateway)
@@ -246,7 +247,8 @@ async def post_frame(
 ) -> Response:
     """A whole frame in one request by the ego."""
     limit = gateway.frames.body_limit(caller, whole_frame=True)
-    with gateway.frames.waiting(caller), (room := _room(gateway, caller)).holding(expected_bytes(request, limit)):
+    gateway.frames.check_waiting(caller)
+    with (room := _room(gateway, caller)).holding(expected_bytes(request, limit)):
         body = await _read_body(request, caller, gateway, limit)
         answer = await gateway.frames.post_frame(caller, body, arrival_of(request.scope), room)
     return _handed_over(answer, accept, gateway)
@@ -280,7 +282,8 @@ async def _read_body(request: Request, caller: Caller, gateway: Gateway, limit: 
     """The body of a tensor request, read only as far as the detector's layout allows; a refusal goes on record."""
     try:
         check_type(request, *MSGPACK_TYPES)
-        return await read_bounded(request, limit)
+        async with caller.live.unread[caller.vehicle_id].one_more() as came:
+            return await read_bounded(request, limit, came)
     except Refused as refused:
         await gateway.frames.refuse(caller, refused)
         raise

@@ -6,7 +6,6 @@ import asyncio
 import contextlib
 import time
 from collections.abc import AsyncIterator, Callable
-from contextlib import AbstractContextManager
 from dataclasses import dataclass, field
 from typing import TypeVar
 
@@ -64,7 +63,7 @@ class Frames:
             return Receipt(frame=frame, vehicle_id=caller.vehicle_id, receipt=self.sessions.keys.receipt(record))
         asked = Asked(caller, frame, received, arrived)
         asked.spent("receive", arrived)
-        with room.holding(_expanded_by(asked, body)):
+        with self.admission.waiting(caller.record.session_id), room.holding(_expanded_by(asked, body)):
             return await self._answer(asked, gather=True)
 
     async def post_frame(self, caller: Caller, body: bytes, arrived: float, room: Share) -> Answered:
@@ -76,15 +75,15 @@ class Frames:
             self.metrics.refused(parts.unusable[name].reason.value)
         asked = Asked(caller, frame, parts.ego, arrived, parts.messages, parts.unusable, whole=True)
         asked.spent("receive", arrived)
-        with room.holding(_expanded_by(asked, body)):
+        with self.admission.waiting(caller.record.session_id), room.holding(_expanded_by(asked, body)):
             return await self._answer(asked, gather=False)
 
-    def waiting(self, caller: Caller) -> AbstractContextManager[None]:
-        """Count a request of an ego among its frames that wait, from before its body is read; refuse one too many.
-
-        A teammate's request is not counted.
+    def check_waiting(self, caller: Caller) -> None:
+        """Refuse one frame of an ego too many before its body is read. It counts only once it is read and checked, so
+        that nobody without the ego's key fills its places.
         """
-        return self.admission.waiting(caller.record.session_id) if caller.is_ego else contextlib.nullcontext()
+        if caller.is_ego:
+            self.admission.check_waiting(caller.record.session_id)
 
     def body_limit(self, caller: Caller, *, whole_frame: bool) -> int:
         """Bytes that a message, or a whole frame, of a session's detector may have."""

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import asyncio
 import math
+from collections.abc import Callable
 
 from fastapi import Request
 from starlette.datastructures import Headers
@@ -36,8 +37,9 @@ def expected_bytes(request: Request, limit: int) -> int:
     return announced if 0 < announced <= limit else 0 if announced > limit else limit
 
 
-async def read_bounded(request: Request, limit: int) -> bytes:
-    """The body, never more than ``limit`` bytes of it; what is announced as more is not read at all.
+async def read_bounded(request: Request, limit: int, came: Callable[[], None] = lambda: None) -> bytes:
+    """The body, never more than ``limit`` bytes of it; what is announced as more is not read at all. ``came`` is called
+    at each piece.
 
     Raises
     ------
@@ -49,6 +51,7 @@ async def read_bounded(request: Request, limit: int) -> bytes:
     body = bytearray()
     try:
         async for chunk in request.stream():
+            came()
             body += chunk
             if len(body) > limit:
                 raise too_large(limit)

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import asyncio
 import time
-from collections import Counter
+from collections import Counter, defaultdict
 from collections.abc import Mapping
 from dataclasses import dataclass, field
 
@@ -16,6 +16,7 @@ from service.errors import TokenReplaced
 from service.keeping.record import SessionRecord
 from service.sessions.gathering import Gathering
 from service.sessions.motion import Motion
+from service.sessions.unread import Unread
 
 REFUSALS_LOGGED = 16
 """Refused messages of one vehicle between two frames that get a record each; the others are counted."""
@@ -79,6 +80,8 @@ class LiveSession:
     equivocations: Counter[str] = field(default_factory=Counter)
     renewals: Counter[str] = field(default_factory=Counter)
     team_changes: int = 0
+    unread: defaultdict[str, Unread] = field(default_factory=lambda: defaultdict(Unread))
+    """Bodies that are not whole yet, by vehicle."""
     settling: asyncio.Task[None] | None = None
     """A decision that nobody waits for any more, and of which it is not known yet whether it is kept."""
     held: bool = False
