@@ -2,6 +2,9 @@
 
 from __future__ import annotations
 
+import time
+from collections import deque
+
 import structlog
 
 from service.keeping.store import Store
@@ -9,13 +12,32 @@ from service.sessions.identity import LEEWAY_S
 
 logger = structlog.stdlib.get_logger(__name__)
 
+MOST_STEPS = 1024
+
 
 class Clock:
-    """The clock of this gateway, as compared with the one that all gateways on a database share."""
+    """The clock of this gateway, as compared with the one that all gateways on a database share, and with itself."""
 
     def __init__(self, store: Store) -> None:
         self._store = store
         self._was_right = True
+        self._offset_s = time.time() - time.monotonic()
+        self._steps: deque[tuple[float, float]] = deque(maxlen=MOST_STEPS)
+
+    def stepped_s(self, within_s: float) -> float:
+        """By how many seconds the clock was set forward in the last so many; the log tells of each time.
+
+        What was written before may look older by as much. A step is seen by comparison with the last call.
+        """
+        now, offset_s = time.monotonic(), time.time() - time.monotonic()
+        step_s, self._offset_s = offset_s - self._offset_s, offset_s
+        if step_s > LEEWAY_S:
+            self._steps.append((now, step_s))
+            logger.warning(
+                f"the clock was set forward by {step_s:.0f} s: "
+                "no log is purged and no idle session is ended for looking older by that"
+            )
+        return sum(step_s for seen_at, step_s in self._steps if seen_at >= now - within_s)
 
     async def is_right(self) -> bool:
         """Whether it is within `LEEWAY_S` of the database's; the log tells of a change."""

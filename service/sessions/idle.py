@@ -7,6 +7,7 @@ from collections.abc import Mapping
 from dataclasses import dataclass
 
 from service.keeping.store import Store
+from service.sessions.clock import Clock
 from service.sessions.live import LiveSession
 
 SWEEP_EVERY_S = 30.0
@@ -24,6 +25,7 @@ class Idle:
     store: Store
     live: Mapping[str, LiveSession]
     idle_s: float
+    clock: Clock
 
     @property
     def every_s(self) -> float:
@@ -41,7 +43,8 @@ class Idle:
 
     def long_ago(self) -> float:
         """The moment since which a session must have been used, as the store knows it, to go on (Unix time)."""
-        return time.time() - self.idle_s - 2 * self.every_s
+        unused_s = self.idle_s + 2 * self.every_s
+        return time.time() - unused_s - self.clock.stepped_s(unused_s)
 
     def is_unused_here(self, session_id: str) -> bool:
         """Whether nobody has used a session here for too long."""

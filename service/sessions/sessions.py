@@ -63,8 +63,8 @@ class Sessions:
 
     def __post_init__(self) -> None:
         self._live: dict[str, LiveSession] = {}
-        self._idle = Idle(self.store, self._live, self.settings.session_idle_s)
         self._clock = Clock(self.store)
+        self._idle = Idle(self.store, self._live, self.settings.session_idle_s, self._clock)
         self._standing: set[str] = set()
         try:
             self.defenses = known(self.settings.extra_defenses)
@@ -180,7 +180,8 @@ class Sessions:
     async def sweep(self) -> None:
         """Purge old logs, end the sessions that nobody has used for too long, and let go of those that are over here.
 
-        Nothing is purged or ended while this machine's clock is wrong: others may be using it.
+        Nothing is purged or ended while this machine's clock is wrong: others may be using it. Nor is anything for
+        looking older than it is, as the clock was set forward.
         What fails for one session, or in one step, keeps nothing else from being done.
         """
         with _going_on("there may be no room for the lines of the next days"):
@@ -190,7 +191,8 @@ class Sessions:
             is_right = await self._clock.is_right()
         with _going_on("logs could not be purged"):
             if is_right:
-                await self.store.purge(time.time() - self.settings.audit_retention_s)
+                kept_s = self.settings.audit_retention_s
+                await self.store.purge(time.time() - kept_s - self._clock.stepped_s(kept_s))
         with _going_on("idle sessions could not be ended"):
             unused = await self._idle.unused()  # which tells the store of what is used here, too
             await self._each(unused if is_right else [], self._expire)

@@ -1,6 +1,8 @@
-"""A gateway whose clock is not the database's."""
+"""A gateway whose clock is not the database's, or is set while it runs."""
 
+import asyncio
 import time
+from types import SimpleNamespace
 
 import pytest
 
@@ -23,5 +25,31 @@ async def test_a_gateway_whose_clock_is_wrong_ends_and_purges_nothing(skew_s, sa
         assert (await store.get(unused.session_id)).ended_at is None
         assert len(await store.audit(over.session_id, 0)) == 2
         assert caplog.text.count(said) == 1
+        await sweep()
+        await asyncio.sleep(0.02)
+        await sweep()
+        assert await store.audit(over.session_id, 0) == []
+
+
+async def test_what_was_written_before_the_clock_was_set_right_is_no_older_for_it(url, monkeypatch, caplog):
+    day_s = 86400
+    later_s, behind_s = [0.0], [20 * 365 * day_s]
+    right, running = time.time, time.monotonic
+    monkeypatch.setattr(time, "time", lambda: right() + later_s[0] - behind_s[0])
+    clock = SimpleNamespace(monotonic=lambda: running() + later_s[0], time=time.time)
+    monkeypatch.setattr("service.sessions.clock.time", clock)
+    async with serve(database_url=url, session_idle_s=day_s, audit_retention_s=7 * day_s) as served:
+        store, sweep = served.gateway.store, served.gateway.sessions.sweep
+        monkeypatch.setattr(store, "ahead_s", lambda: asyncio.sleep(0, 0.0))
+        over, unused = [await served.open() for _ in range(2)]
+        await served.ego(over).close()
+        served.gateway.sessions._forget(unused.session_id)  # as if this process had just started
+        behind_s[0] = 0
+        for later_s[0], lines, ended in ((0.0, 2, False), (0.5 * day_s, 2, False), (2 * day_s, 2, True)):
+            await sweep()
+            assert len(await store.audit(over.session_id, 0)) == lines
+            assert ((await store.get(unused.session_id)).ended_at is not None) is ended
+        assert caplog.text.count("set forward by 630720000 s") == 1
+        later_s[0] = 7.5 * day_s
         await sweep()
         assert await store.audit(over.session_id, 0) == []
