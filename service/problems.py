@@ -65,7 +65,7 @@ ANSWERS: Mapping[Kind, tuple[int, Mapping[str, str]]] = {
     Kind.IMPOSSIBLE_DEFENSE: (422, {}),
     Kind.UNKNOWN_DETECTOR: (422, {}),
     Kind.TOO_MANY_TEAMMATES: (422, {}),
-    Kind.TOO_MANY_RENEWALS: (429, {"Retry-After": "1"}),
+    Kind.TOO_MANY_RENEWALS: (429, {"Retry-After": "60"}),
     Kind.TOO_MANY_CHANGES: (429, {"Retry-After": "1"}),
     Kind.TOO_MANY_PROOFS: (429, {"Retry-After": "60"}),
     Kind.INTERNAL_ERROR: (500, {}),

@@ -127,7 +127,6 @@ class _Write:
     def _remember(self) -> None:
         """What the next frame is judged by."""
         asked, live = self.asked, self.asked.caller.live
-        live.renewals.clear()
         live.equivocations.clear()
         live.team_changes = 0
         live.session.remember(self.result)

@@ -4,9 +4,10 @@ from __future__ import annotations
 
 import asyncio
 import time
-from collections import Counter, defaultdict
+from collections import Counter, defaultdict, deque
 from collections.abc import Mapping
 from dataclasses import dataclass, field
+from functools import partial
 
 from robosac.audit.events import Proof
 from robosac.defenses import DefenseSettings
@@ -18,6 +19,8 @@ from service.sessions.gathering import Gathering
 from service.sessions.motion import Motion
 from service.sessions.unread import Unread
 
+RENEWALS = 16
+"""Tokens that a vehicle may take in a while, see `service.sessions.teams`."""
 REFUSALS_LOGGED = 16
 """Refused messages of one vehicle between two frames that get a record each; the others are counted."""
 EQUIVOCATIONS_LOGGED = 4
@@ -78,7 +81,10 @@ class LiveSession:
     last_used: float = field(default_factory=time.monotonic)
     refusals: Refusals = field(default_factory=Refusals)
     equivocations: Counter[str] = field(default_factory=Counter)
-    renewals: Counter[str] = field(default_factory=Counter)
+    renewals: defaultdict[str, deque[float]] = field(
+        default_factory=lambda: defaultdict(partial(deque, maxlen=RENEWALS))
+    )
+    """When each vehicle took its latest tokens here (`time.monotonic`)."""
     team_changes: int = 0
     unread: defaultdict[str, Unread] = field(default_factory=lambda: defaultdict(Unread))
     """Bodies that are not whole yet, by vehicle."""

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import asyncio
+import time
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
 
@@ -16,12 +17,14 @@ from service.keeping.record import SessionRecord
 from service.keeping.store import Store
 from service.schemas import ChangedTeam, RenewedToken
 from service.sessions.identity import Tokens
-from service.sessions.live import Caller
+from service.sessions.live import RENEWALS, Caller
 from service.sessions.sessions import Sessions
 from service.settings import Settings
 
-MAX_RENEWALS = 16
-"""Tokens that a vehicle may take between two frames: each leaves a record."""
+RENEWALS_WITHIN_S = 3600.0
+"""In so long a vehicle may take `RENEWALS` tokens, or in a token's lifetime if that is shorter: each leaves a record,
+and its ego's log must not be filled.
+"""
 MAX_CHANGES = 128
 """Changes of a team between two frames: each leaves a record with all that the defence remembers."""
 
@@ -74,10 +77,10 @@ class Teams:
         async with caller.live.lock:  # else a team that changes meanwhile would bring the old token back
             record = await self.sessions.current(caller)
             caller.check_token(record)
-            if caller.live.renewals[vehicle] >= MAX_RENEWALS:
-                detail = f"a vehicle may have {MAX_RENEWALS} tokens between two frames"
-                raise Refused(Kind.TOO_MANY_RENEWALS, detail)
-            caller.live.renewals[vehicle] += 1
+            taken, within_s = caller.live.renewals[vehicle], min(RENEWALS_WITHIN_S, self.settings.token_ttl_s)
+            if len(taken) == RENEWALS and time.monotonic() - taken[0] < within_s:
+                raise Refused(Kind.TOO_MANY_RENEWALS, f"a vehicle may have {RENEWALS} tokens in {within_s:g} s")
+            taken.append(time.monotonic())
             token = self.tokens.issue(record.session_id, vehicle, is_ego=caller.is_ego)
             event = TokenRenewed(vehicle_id=vehicle, expires_at=token.expires_at)
             kept = await self.store.renew_token(record.session_id, record.token_ids[vehicle], token.token_id, event)

@@ -162,7 +162,7 @@ async def test_what_the_ego_asked_with_a_token_that_is_replaced_meanwhile_is_not
     assert (await served.post(session, "frames", good_frame(0))).status_code == 200
 
 
-async def test_renewals_are_bounded_between_two_frames(served, ego_message, benign):
+async def test_renewals_are_bounded_however_many_frames_there_are(served, ego_message, benign, monkeypatch):
     session = await served.open()
     unit, ego = served.teammate(session, "rsu"), served.ego(session)
     for _ in range(16):
@@ -171,6 +171,10 @@ async def test_renewals_are_bounded_between_two_frames(served, ego_message, beni
         await unit.renew()
     assert (caught.value.status, caught.value.type) == (429, "urn:robosac:problem:too-many-renewals")
     await ego.post_frame(0, ego_message, benign)
+    with pytest.raises(InvalidRequest):
+        await unit.renew()
+    await ego.renew()
+    monkeypatch.setattr(teams, "RENEWALS_WITHIN_S", 0.0)
     await unit.renew()
 
 
