@@ -113,8 +113,9 @@ def create_app(
     )
     app.state.gateway = gateway
     problems.install(app)
-    parties = Parties(gateway.api_keys, gateway.viewer_tokens, gateway.store.seen)
-    app.add_middleware(GivesWay, line=Line(lambda: gateway.admission.busy), party_of=parties)
+    parties = Parties(gateway.api_keys, gateway.viewer_tokens, gateway.store.seen, tokens.signed)
+    line = Line(lambda: gateway.admission.busy)
+    app.add_middleware(GivesWay, line=line, party_of=parties, is_vehicle=parties.is_vehicle)
     app.add_middleware(HangingUp)
     app.add_middleware(BodyLimit, limit=settings.max_body_bytes, timeout_s=settings.body_timeout_s)
     app.add_middleware(Door, check=capacity_check(gateway.admission, gateway.sessions.in_use))

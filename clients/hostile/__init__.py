@@ -43,6 +43,8 @@ class Attack(StrEnum):
     """Heads of requests that never end, most of them sent very slowly."""
     SMALL = "small bad messages"
     """A teammate sends messages that are none, as fast as it can."""
+    STRANGER = "strangers' messages"
+    """Messages and frames for the honest session, and for none, with tokens that are none."""
     OPENING = "sessions in a loop"
     """Sessions are opened and closed."""
     OPENINGS = "large openings"
@@ -82,6 +84,7 @@ _PLAYED: dict[Attack, Callable[[Attacker], Awaitable[object]]] = {
     Attack.BODIES: connections.flood,
     Attack.HEADS: connections.heads,
     Attack.SMALL: requests.small_messages,
+    Attack.STRANGER: requests.strangers,
     Attack.OPENING: requests.opening,
     Attack.OPENINGS: requests.large_openings,
     Attack.TEAM: requests.joining,

@@ -28,6 +28,17 @@ async def small_messages(attacker: Attacker) -> None:
     await attacker.again_and_again(AT_A_TIME, one)
 
 
+async def strangers(attacker: Attacker) -> None:
+    """Messages and frames of nobody."""
+
+    async def one() -> None:
+        for session_id in (attacker.target.session_id, "0" * 32):
+            for what in ("messages", "frames"):
+                await attacker.post(session_id, what, "x" * 40, b"x")
+
+    await attacker.again_and_again(AT_A_TIME, one)
+
+
 async def opening(attacker: Attacker) -> None:
     """Sessions, opened and closed."""
 

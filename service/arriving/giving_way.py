@@ -21,7 +21,8 @@ TURN_S = 0.25
 """After which a request that still waits for its client, or the database, holds up no other."""
 _LOOK_S = 0.004
 """How often it is looked whether frames are in hand."""
-_NEVER_WAIT = re.compile(r"/healthz|/v1/live/.*|/v1/sessions/[^/]+/(frames|messages|standby)")
+_NEVER_WAIT = re.compile(r"/healthz|/v1/live/.*")
+_OF_VEHICLES = re.compile(r"/v1/sessions/([^/]+)/(?:frames|messages|standby)")
 
 
 Party = tuple[str, ...]
@@ -130,18 +131,35 @@ class Line:
 
 
 class GivesWay:
-    """Middleware that lets requests other than frames and messages in by turns: few at a time, and seldom while frames
-    are in hand. So nobody's openings, logs, pages or mistakes take the time that frames need. Parties have the same
-    number of turns (`service.arriving.parties`). An answer in parts gives way after each.
+    """Middleware that lets requests other than vehicles' frames and messages in by turns: few at a time, and seldom
+    while frames are in hand. So nobody's openings, logs, pages or mistakes take the time that frames need, and no
+    stranger's frames. Parties have the same number of turns (`service.arriving.parties`). An answer in parts gives way
+    after each.
+
+    Parameters
+    ----------
+    app : ASGI app
+    line : Line
+    party_of : callable
+        Of a request.
+    is_vehicle : callable
+        Whether a request shows a token that was made for the session with this id. No database may be asked for it.
     """
 
-    def __init__(self, app: ASGIApp, line: Line, party_of: Callable[[Scope], Party]) -> None:
+    def __init__(
+        self,
+        app: ASGIApp,
+        line: Line,
+        party_of: Callable[[Scope], Party],
+        is_vehicle: Callable[[Scope, str], bool],
+    ) -> None:
         self._app = app
         self._line = line
         self._party_of = party_of
+        self._is_vehicle = is_vehicle
 
     async def __call__(self, scope: Scope, receive: Receive, send: Send) -> None:
-        if scope["type"] != "http" or _NEVER_WAIT.fullmatch(path_of(scope)):
+        if scope["type"] != "http" or self._never_waits(scope):
             await self._app(scope, receive, send)
             return
         party = self._party_of(scope)
@@ -160,3 +178,8 @@ class GivesWay:
             await self._app(scope, receive, in_parts)
         finally:
             turn.end()
+
+    def _never_waits(self, scope: Scope) -> bool:
+        path = path_of(scope)
+        found = _OF_VEHICLES.fullmatch(path)
+        return self._is_vehicle(scope, found[1]) if found else _NEVER_WAIT.fullmatch(path) is not None

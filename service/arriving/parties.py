@@ -10,7 +10,7 @@ from starlette.types import Scope
 
 from service.arriving.giving_way import Party
 from service.keeping.record import SessionRecord
-from service.sessions.identity import ApiKeys, claimed
+from service.sessions.identity import ApiKeys, Claimed, claimed
 from service.sessions.viewers import ViewerTokens
 
 
@@ -24,20 +24,33 @@ class Parties:
     viewer_tokens : ViewerTokens
     seen : callable
         Gives a session by its id, as it is remembered here, or None.
+    signed : callable
+        As `service.sessions.identity.Tokens.signed`.
     """
 
     def __init__(
-        self, api_keys: ApiKeys, viewer_tokens: ViewerTokens, seen: Callable[[str], SessionRecord | None]
+        self,
+        api_keys: ApiKeys,
+        viewer_tokens: ViewerTokens,
+        seen: Callable[[str], SessionRecord | None],
+        signed: Callable[[str, str], bool],
     ) -> None:
         self._api_keys = api_keys
         self._viewer_tokens = viewer_tokens
         self._seen = seen
+        self._signed = signed
 
     def __call__(self, scope: Scope) -> Party:
         """The party of a request."""
-        credential = Headers(scope=scope).get("authorization", "").partition(" ")[2].strip()
+        credential = _credential(scope)
         known = self._known(credential) if credential else None
         return known or (f"address {_place((scope.get('client') or ('',))[0])}", "")
+
+    def is_vehicle(self, scope: Scope, session_id: str) -> bool:
+        """Whether a request shows a token of a session, one that counts or one that this gateway signed."""
+        credential = _credential(scope)
+        record = self._session_of(claimed(credential))
+        return (record is not None and record.session_id == session_id) or self._signed(session_id, credential)
 
     def _known(self, credential: str) -> Party | None:
         key_id = self._api_keys.id_of(credential)
@@ -46,11 +59,20 @@ class Parties:
         if self._viewer_tokens.has(credential):
             return "viewers", credential
         named = claimed(credential)
+        record = self._session_of(named)
+        return None if named is None or record is None else (f"key {record.key_id}", named.token_id)
+
+    def _session_of(self, named: Claimed | None) -> SessionRecord | None:
+        """The session in which a token counts, as it is remembered here."""
         record = None if named is None else self._seen(named.session_id)
         # The id of a token that counts is a secret that only the token tells: no signature needs to be verified here.
         if named is None or record is None or record.token_ids.get(named.vehicle_id) != named.token_id:
             return None
-        return f"key {record.key_id}", named.token_id
+        return record
+
+
+def _credential(scope: Scope) -> str:
+    return Headers(scope=scope).get("authorization", "").partition(" ")[2].strip()
 
 
 def _place(address: str) -> str:

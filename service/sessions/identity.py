@@ -210,6 +210,11 @@ class Tokens:
             raise TokenRefused("the token has expired", vehicle, Kind.TOKEN_EXPIRED)
         return vehicle
 
+    def signed(self, session_id: str, text: str) -> bool:
+        """Whether this gateway made a token for a session. It may count no more: the session's record tells."""
+        claims = self._claims(text)
+        return claims is not None and claims["sid"] == session_id
+
     def _claims(self, text: str | None) -> Mapping[str, Any] | None:
         """What a token says, expired or not; None unless it is one that this gateway signed."""
         if not text or len(text) > TOKEN_BYTES:

@@ -1,4 +1,4 @@
-"""Requests other than frames and messages are let in by turns."""
+"""Requests other than vehicles' frames and messages are let in by turns."""
 
 import asyncio
 import contextlib
@@ -7,6 +7,7 @@ import time
 import pytest
 from starlette.responses import PlainTextResponse, StreamingResponse
 
+from robosac import wire
 from service.arriving import giving_way
 from service.arriving.giving_way import AT_A_TIME, EVERY_S, GivesWay, Line
 from service.arriving.parties import Parties
@@ -29,7 +30,7 @@ class Requests:
     def __init__(self, line, app=None):
         self.begun = []
         self.let = asyncio.Event()
-        self._app = GivesWay(app or self._answer, line, lambda scope: scope["party"])
+        self._app = GivesWay(app or self._answer, line, lambda scope: scope["party"], lambda _, sid: sid == "own")
 
     async def _answer(self, scope, receive, send):
         self.begun.append(scope["path"])
@@ -45,6 +46,10 @@ class Requests:
 
     async def _drop(self, message):
         pass
+
+
+def parties_of(gateway):
+    return Parties(gateway.api_keys, gateway.viewer_tokens, gateway.store.seen, gateway.sessions.tokens.signed)
 
 
 async def settled():
@@ -81,7 +86,7 @@ async def test_only_credentials_that_count_make_a_party():
         api_key=KEY, api_keys=f"{KEY},{OTHER_KEY}", viewer_tokens="v" * 20, token_secrets=SECRET
     ) as served:
         gateway, session, other = served.gateway, await served.open(), await served.open()
-        parties = Parties(gateway.api_keys, gateway.viewer_tokens, gateway.store.seen)
+        parties = parties_of(gateway)
 
         def party(credential, address="192.0.2.1", scheme="Bearer"):
             headers = [(b"authorization", f"{scheme} {credential}".encode("latin-1"))] if credential else []
@@ -97,6 +102,12 @@ async def test_only_credentials_that_count_make_a_party():
         assert len({party(token) for token in [*tokens, KEY]}) == len(tokens) + 1
         assert party(tokens[0], scheme="DPoP") == party(tokens[0])
         assert len({party(credential)[0] for credential in (None, KEY, OTHER_KEY, "v" * 20)}) == 4
+        request = {"headers": [(b"authorization", f"Bearer {session.ego_token}".encode())]}
+        assert parties.is_vehicle(request, session.session_id)
+        assert not parties.is_vehicle(request, other.session_id)
+        gateway.store._seen.forget(session.session_id)
+        assert parties.is_vehicle(request, session.session_id)
+        assert not parties.is_vehicle(request, other.session_id)
         renewed = await served.teammate(session, "rsu").renew()
         assert party(session.teammate_tokens["rsu"]) == party(None)
         assert party(renewed.token)[0] == party(KEY)[0]
@@ -116,20 +127,34 @@ async def test_only_credentials_that_count_make_a_party():
 )
 async def test_strangers_are_told_apart_by_what_nobody_has_many_of(one, other, same):
     async with serve(api_keys=KEY) as served:
-        parties = Parties(served.gateway.api_keys, served.gateway.viewer_tokens, served.gateway.store.seen)
+        parties = parties_of(served.gateway)
         first, second = (parties({"type": "http", "headers": [], "client": (address, 1)}) for address in (one, other))
         assert (first == second) is same
 
 
-@pytest.mark.parametrize("path", ["/healthz", "/v1/sessions/abc/frames", "/v1/sessions/abc/messages", "/v1/live/abc"])
-async def test_frames_and_what_lasts_wait_for_nobody(path):
+@pytest.mark.parametrize(
+    ("path", "waits"),
+    [
+        ("/healthz", False),
+        ("/v1/sessions/own/frames", False),
+        ("/v1/sessions/own/messages", False),
+        ("/v1/sessions/own/standby", False),
+        ("/v1/live/abc", False),
+        ("/v1/sessions/own", True),
+        ("/v1/sessions/another/frames", True),
+        ("/v1/sessions/another/messages", True),
+        ("/v1/sessions/another/standby", True),
+    ],
+)
+async def test_frames_of_vehicles_and_what_lasts_wait_for_nobody(path, waits):
     requests, frames = Requests(line := Line(Frames())), Frames()
     others = [requests.ask("/slow") for _ in range(5)]
     await settled()
     line._busy, frames.in_hand = frames, True
     asked = requests.ask(path)
     await settled()
-    assert path in requests.begun
+    assert (path in requests.begun) is not waits
+    line._busy.in_hand = False
     requests.let.set()
     await asyncio.gather(asked, *others)
 
@@ -199,6 +224,24 @@ async def test_an_answer_in_parts_gives_way_after_each():
     await asyncio.wait_for(requests.ask("/page"), 1)
     reading.set()
     await asyncio.gather(*logs)
+
+
+async def test_strangers_with_frames_and_messages_wait_as_others_do_and_vehicles_do_not(messages):
+    async with serve(token_secrets=SECRET) as served:
+        session, other = await served.open(), await served.open()
+        strange = ["x", forged(session.ego_token, "z" * 32), forged(session.ego_token, sid="x"), other.ego_token]
+        with served.gateway.admission.frame("", "another", 1e9, 1.0):
+            began = time.monotonic()
+            for what in ("messages", "frames"):
+                posts = [served.post(session, what, b"x", credential) for credential in strange]
+                assert [answer.status_code for answer in await asyncio.gather(*posts)] == [401] * len(strange)
+            assert time.monotonic() - began >= 6 * EVERY_S
+            began = time.monotonic()
+            body = wire.pack_message(0, "rsu", messages["rsu"])
+            for status in (202, *[409] * 12):
+                answer = await served.post(session, "messages", body, session.teammate_tokens["rsu"])
+                assert answer.status_code == status
+            assert time.monotonic() - began < 12 * EVERY_S
 
 
 async def test_a_gateway_answers_pages_while_frames_are_in_hand(messages, benign):
