@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Mapping
-from dataclasses import replace
+from typing import Any
 
 from robosac.attacks.adaptive import Erase, Invent, InventSteady, Shift
 from robosac.attacks.base import Attack, IterativeAttack
@@ -66,12 +66,14 @@ def load_campaign(spec: str) -> Campaign:
         If there is no such attack or behaviour, or they don't go together.
     """
     attack, *behaviours = spec.split(SEPARATOR)
-    campaign = Campaign(None if attack == HONEST else load(attack))
+    chosen: dict[str, Any] = {}
     for name in behaviours:
         if name not in BEHAVIOURS:
             raise ValueError(f"unknown behaviour {name!r}; known: {', '.join(BEHAVIOURS)}")
-        campaign = replace(campaign, **BEHAVIOURS[name])
-    return campaign
+        if other := [field for field, value in BEHAVIOURS[name].items() if chosen.get(field, value) != value]:
+            raise ValueError(f"{spec}: {name} does not go with a behaviour before it: both set the {other[0]}")
+        chosen.update(BEHAVIOURS[name])
+    return Campaign(None if attack == HONEST else load(attack), **chosen)
 
 
 __all__ = [

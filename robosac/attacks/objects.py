@@ -202,7 +202,7 @@ class _Erased:
 class _Dimmed(_Erased):
     def __call__(self, logits: torch.Tensor, boxes: torch.Tensor) -> torch.Tensor:
         shows = logits[self._showed | (_apart(boxes.detach(), self._box) <= NEAR_M)]
-        return _excess(shows, FAINT) + functional.relu(FAINT - shows.max())
+        return _excess(shows, FAINT) + (functional.relu(FAINT - shows.max()) if len(shows) else 0.0)
 
 
 class _Moved:

@@ -30,7 +30,7 @@ class Lie:
     Raises
     ------
     ValueError
-        If there is no such kind, or a box is not five finite numbers, or has no size.
+        If there is no such kind, the number is no integer, or a box is not five finite numbers, or has no size.
     """
 
     kind: LieKind
@@ -46,6 +46,8 @@ class Lie:
     def __post_init__(self) -> None:
         if self.kind not in get_args(LieKind):
             raise ValueError(f"no lie is of kind {self.kind!r}; the kinds are {', '.join(get_args(LieKind))}")
+        if not isinstance(self.number, int | np.integer):
+            raise ValueError(f"the number of a lie must be an integer, got {self.number!r:.100}")
         for name, box in (("box", self.box), ("truth", self.truth)):
             if box is not None or name == "box":
                 _check_box(f"{name} of a lie", box)

@@ -5,7 +5,7 @@ from __future__ import annotations
 from collections.abc import Callable, Iterable, Mapping
 from typing import Any
 
-from robosac.answers import Distrust, Reason, RejectedTeammate, Source
+from robosac.answers import Distrust, Reason, RejectedTeammate, Source, Standing
 from robosac.audit.events import (
     AccessRefused,
     DetectorChanged,
@@ -104,6 +104,9 @@ def _answered(event: FrameAnswered) -> str:
         parts.append(f"left out: {', '.join(why)}")
     if event.contradicted:
         parts.append(f"{_number(len(event.contradicted), 'box', 'boxes')} contradicted and left out")
+    kept = sum(support.status is Standing.CONTRADICTED for support in event.support or ())
+    if kept:
+        parts.append(f"{_number(kept, 'box', 'boxes')} contradicted and kept in")
     if event.degraded_by is not None:
         parts.append(f"cut short by {'the deadline' if event.degraded_by == 'deadline' else 'a fault inside'}")
     if not event.deadline_met:

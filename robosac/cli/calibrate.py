@@ -107,7 +107,7 @@ def run(  # the options of a command line
         return
     with blaming("--attackers", ValueError):
         recipe = Recipe(
-            attacks=tuple(attack or _DEFAULTS.attacks),
+            attacks=tuple(dict.fromkeys(attack or _DEFAULTS.attacks)),
             attackers=tuple(attackers or _DEFAULTS.attackers),
             scenes=scenes,
             stretches_per_scene=stretches,

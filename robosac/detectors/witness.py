@@ -150,7 +150,7 @@ class Witness:
         if kept.get("weights_digest") != info.weights_digest:
             raise WeightsError(
                 f"{path.name} belongs to weights with the digest {kept.get('weights_digest')!s:.12}..., not to "
-                f"{info.name} with {info.weights_digest:.12}...: calibrate again"
+                f"{info.name} with {info.weights_digest:.12}...: make it anew (robosac witness)"
             )
         layout = Layout.of(info, float(kept["scale"]))
         network = WitnessNetwork(layout.channels, layout.upsampling)

@@ -91,7 +91,7 @@ def test_the_ego_alone_is_told_with_every_outcome(detector, ego_message, benign)
 
 def test_a_witness_of_other_weights_is_refused(copied):
     info = EmbeddedDetector(copied).info
-    with pytest.raises(WeightsError, match="calibrate again"):
+    with pytest.raises(WeightsError, match=r"make it anew \(robosac witness\)"):
         witness_of(replace(info, weights_digest="0" * 64))
     assert witness_of(info) is not None  # not remembered as refused
 

@@ -229,7 +229,8 @@ async def test_an_answer_in_parts_gives_way_after_each():
 async def test_strangers_with_frames_and_messages_wait_as_others_do_and_vehicles_do_not(messages):
     async with serve(token_secrets=SECRET) as served:
         session, other = await served.open(), await served.open()
-        strange = ["x", forged(session.ego_token, "z" * 32), forged(session.ego_token, sid="x"), other.ego_token]
+        made_up = forged(session.ego_token, "z" * 32, jti="0" * 32)
+        strange = ["x", made_up, forged(session.ego_token, sid="x"), other.ego_token]
         with served.gateway.admission.frame("", "another", 1e9, 1.0):
             began = time.monotonic()
             for what in ("messages", "frames"):

@@ -22,6 +22,9 @@ async def stalled(served, session, number, what="messages", token=None):
         await asyncio.sleep(3600.0)
 
     tasks = [asyncio.create_task(served.post(session, what, body(), token)) for _ in range(number)]
+    async with asyncio.timeout(30.0):
+        while sum(task.done() for task in tasks) < number - BODIES:
+            await asyncio.sleep(0.02)
     await asyncio.sleep(0.2)
     yield tasks
     for task in tasks:

@@ -158,6 +158,9 @@ def test_campaigns_by_name():
         ("nonesuch@asleep", "no attack 'nonesuch'"),
         ("pgd@nonesuch", "unknown behaviour 'nonesuch'; known: asleep"),
         ("noise@framing", "only an attack that optimises"),
+        ("pgd@framing@covering", "covering does not go with a behaviour before it: both set the alibi"),
+        ("shift@soft@soft3", "soft3 does not go with .* both set the softness"),
+        ("erase@asleep@flicker", "flicker does not go with .* both set the schedule"),
         ("honest@covering", "only an attack that optimises can have an alibi, not honest"),
     ],
 )

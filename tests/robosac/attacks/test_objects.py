@@ -10,6 +10,7 @@ from robosac.attacks import (
     GhostBeside,
     GhostDriving,
     Ghosts,
+    Lie,
     Past,
     Remove,
     Situation,
@@ -98,6 +99,20 @@ def test_a_dimmed_car_is_hardly_shown_and_the_other_stays(surface):
     dimmed, other = (first, second) if lie.box[0] < 10 else (second, first)
     assert float(dimmed) == pytest.approx(FAINT, abs=0.5)
     assert float(other) > 2.0
+
+
+def test_a_car_that_no_box_shows_can_be_dimmed_no_further(surface):
+    class Far(OnObjects):
+        name = "far"
+
+        def lies(self, scope, rng):
+            return [Lie("dimmed", car(900.0, 900.0))]
+
+    met = Situation(truth=street(surface))
+    before, _ = surface.perceive(surface.messages)
+    logits, _ = strike(Far(steps=2), surface, met)
+    assert met.lies
+    np.testing.assert_allclose(logits, before.detach(), atol=1.0)
 
 
 def test_a_car_jumps_ahead(surface):

@@ -149,6 +149,7 @@ BOX = np.array([10.0, 5.0, 4.6, 1.9, 0.0])
         (("ghost", BOX.tolist()), r"^box of a lie must be .*, got \[10.0"),
         (("ghost", BOX * [1, 1, -1, 1, 1]), "finite, length and width positive, got"),
         (("ghost", BOX * np.nan), "finite, length and width positive, got"),
+        (("ghost", BOX, [1]), r"the number of a lie must be an integer, got \[1\]"),
         (("moved", BOX, 0, BOX[None]), r"^truth of a lie must be .* got one of shape \(1, 5\)"),
     ],
 )

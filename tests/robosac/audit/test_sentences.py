@@ -57,6 +57,13 @@ def test_a_frame_is_told_with_who_was_left_out_and_why(events):
     )
 
 
+def test_contradicted_boxes_that_a_session_keeps_in_are_told(events):
+    answered = next(event for event in events if event["event"] == "frame_answered")
+    boxes = [[0.0, 0.0, 4.0, 2.0, 0.0, 0.9]] * 2
+    support = [{"status": status, "witnesses": [], "deniers": []} for status in ("contradicted", "confirmed")]
+    assert "; 1 box contradicted and kept in" in told(answered, boxes=boxes, support=support, contradicted=[])
+
+
 @pytest.mark.parametrize(
     ("kind", "changes", "said"),
     [

@@ -174,7 +174,7 @@ def test_turns_are_taken_by_one_at_a_time(detector):
 def test_a_pretence_is_no_schedule():
     assert acts("honest@false-pose", ["rsu"], 1) == [("honest@false-pose", ("rsu",))]
     assert acts("pgd@covering@asleep", ["b", "a"], 11)[9:] == [("honest", ()), ("pgd@covering", ("a", "b"))]
-    assert acts("erase@asleep@flicker", ["a"], 3)[1] == ("erase", ("a",))
+    assert acts("erase@flicker", ["a"], 3)[1] == ("erase", ("a",))
     assert acts("erase", [], 1) == [("honest", ())]
 
 
