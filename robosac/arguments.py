@@ -33,12 +33,17 @@ def check_session(team: object, defense: object, saved: object, rng: object, scr
     check_team(team)
     if defense is not None:
         check_defense(defense)
-    if saved is not None and not (isinstance(saved, Mapping) and isinstance(saved.get("state"), Mapping)):
+    if saved is not None and not _is_saved(saved):
         raise TypeError(f"saved must be what Session.save gave, got {saved!r:.100}")
     if rng is not None:
         check_rng(rng)
     if not isinstance(screening, Screening | None) and screening != "calibrated":
         raise TypeError(f'screening must be a Screening, None or "calibrated", got {screening!r}')
+
+
+def _is_saved(saved: object) -> bool:
+    parts = (("defense", str), ("state", Mapping), ("previous", Mapping | None))
+    return isinstance(saved, Mapping) and all(isinstance(saved.get(name), kind) for name, kind in parts)
 
 
 def check_team(team: object) -> None:

@@ -59,9 +59,12 @@ class PreviousAnswer:
 
     @classmethod
     def from_json(cls, fields: Mapping[str, Any]) -> PreviousAnswer:
-        """What `as_json` gave."""
-        boxes = np.array(fields["boxes"], dtype=np.float64).reshape(-1, 6)
-        return cls(int(fields["frame"]), boxes, np.array(fields["motion"], dtype=np.float64).reshape(-1, 2))
+        """What `as_json` gave; `ValueError` for anything else."""
+        try:
+            boxes = np.array(fields["boxes"], dtype=np.float64).reshape(-1, 6)
+            return cls(int(fields["frame"]), boxes, np.array(fields["motion"], dtype=np.float64).reshape(-1, 2))
+        except (KeyError, TypeError, ValueError) as error:
+            raise ValueError(f"no previous answer: {type(error).__name__}: {error}") from error
 
     def expected_at(self, pose: FloatArray) -> FloatArray:
         """The boxes (n, 6) one frame later, in the frame of the ego at ``pose``: each moved as it moved before."""

@@ -72,7 +72,7 @@ class Session:
     Raises
     ------
     TypeError, ValueError
-        If an argument is none of these, or a teammate is named twice.
+        If an argument is none of these, a teammate is named twice, or another defence saved what is to go on.
 
     Attributes
     ----------
@@ -113,6 +113,8 @@ class Session:
         self.detector = detector
         self.screening = screening_for(detector.info) if screening == "calibrated" else screening
         self.defense = defense or _default(detector)
+        if saved is not None and saved["defense"] != self.defense.kind:
+            raise ValueError(f"saved by a session of the defence {saved['defense']}, this one has {self.defense.kind}")
         self._rng = rng or np.random.default_rng()
         self.state: State = first_state(self.defense, team) if saved is None else saved["state"]
         before = None if saved is None else saved.get("previous")
@@ -204,7 +206,8 @@ class Session:
 
         The generator of the draws is not part of it: whoever knew it could foresee them.
         """
-        return {"state": dict(self.state), "previous": None if self.previous is None else self.previous.as_json()}
+        previous = None if self.previous is None else self.previous.as_json()
+        return {"defense": self.defense.kind, "state": dict(self.state), "previous": previous}
 
 
 def _default(detector: Preparer) -> Defense:

@@ -116,6 +116,9 @@ def test_a_frame_that_is_no_integer_is_refused_and_spoils_no_later_one(detector,
     json.dumps(session.save())
 
 
+SAVED = {"defense": "sample_consensus", "state": {}, "previous": None}
+
+
 def test_a_session_names_what_it_cannot_be_made_of():
     for wrong, kind, told in (
         ({"team": None}, TypeError, "team must be a sequence of ids"),
@@ -124,6 +127,9 @@ def test_a_session_names_what_it_cannot_be_made_of():
         ({"defense": "none"}, TypeError, "defense must be a defence, and str lacks"),
         ({"saved": {}}, TypeError, "saved must be what Session.save gave, got {}"),
         ({"saved": "state"}, TypeError, "saved must be what Session.save gave, got 'state'"),
+        ({"saved": SAVED | {"previous": 5}}, TypeError, "saved must be what Session.save gave"),
+        ({"saved": SAVED | {"previous": {"frame": 1}}}, ValueError, "no previous answer: KeyError: 'boxes'"),
+        ({"saved": SAVED | {"defense": "a2cp"}}, ValueError, "saved by a session of the defence a2cp, this one has"),
         ({"rng": 7}, TypeError, r"rng must be a numpy.random.Generator"),
         ({"screening": "none"}, TypeError, "screening must be a Screening"),
     ):
@@ -235,6 +241,6 @@ def test_a_session_says_what_is_wrong_with_what_a_defence_remembers_at_first(fir
     ):
         with pytest.raises(DomainError, match=f"^{why}$"):
             begin()
-    session = robosac.Session(FakeDetector(), ["a"], Own(first=first), saved={"state": {}})
+    session = robosac.Session(FakeDetector(), ["a"], Own(first=first), saved={"defense": "own", "state": {}})
     with pytest.raises(DomainError, match=f"^{why.replace('initial_state', 'change_team')}$"):
         session.change_team(["b"])
