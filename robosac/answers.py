@@ -45,7 +45,8 @@ class Reason(StrEnum):
     """Why a teammate was left out of an answer.
 
     ``not_sampled`` also stands where a teammate was in tested hypotheses but no verdict was reached, because ego and
-    fusion were both empty. For ``distrusted``, `Distrust` says why.
+    fusion were both empty, or where only consensus was: the answer is of others, such as those suspected less. For
+    ``distrusted``, `Distrust` says why.
     """
 
     DISSENSUS = "dissensus"

@@ -42,7 +42,7 @@ def check_session(team: object, defense: object, saved: object, rng: object, scr
 
 
 def _is_saved(saved: object) -> bool:
-    parts = (("defense", str), ("state", Mapping), ("previous", Mapping | None))
+    parts = (("defense", str | None), ("state", Mapping), ("previous", Mapping | None))
     return isinstance(saved, Mapping) and all(isinstance(saved.get(name), kind) for name, kind in parts)
 
 

@@ -113,8 +113,9 @@ class Session:
         self.detector = detector
         self.screening = screening_for(detector.info) if screening == "calibrated" else screening
         self.defense = defense or _default(detector)
-        if saved is not None and saved["defense"] != self.defense.kind:
-            raise ValueError(f"saved by a session of the defence {saved['defense']}, this one has {self.defense.kind}")
+        kind = None if saved is None else saved.get("defense")  # a log tells it elsewhere
+        if kind not in (None, self.defense.kind):
+            raise ValueError(f"saved by a session of the defence {kind}, this one has {self.defense.kind}")
         self._rng = rng or np.random.default_rng()
         self.state: State = first_state(self.defense, team) if saved is None else saved["state"]
         before = None if saved is None else saved.get("previous")

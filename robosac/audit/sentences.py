@@ -22,7 +22,7 @@ from robosac.audit.events import (
 
 REASONS: Mapping[Reason, str] = {
     Reason.DISSENSUS: "in dissensus",
-    Reason.NOT_SAMPLED: "not tested",
+    Reason.NOT_SAMPLED: "no test speaks against it",
     Reason.DISTRUSTED: "distrusted",
     Reason.MISSING: "no message came",
     Reason.LATE: "too late",
