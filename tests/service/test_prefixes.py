@@ -45,12 +45,12 @@ async def test_a_frame_beyond_capacity_is_refused_from_its_head():
     assert asked == ["abc"]
 
 
-async def test_frames_wait_for_nobody():
+async def test_frames_of_a_vehicle_wait_for_nobody():
     requests, frames = Requests(line := Line(Frames())), Frames()
     others = [requests.ask("/slow") for _ in range(5)]
     await settled()
     line._busy, frames.in_hand = frames, True
-    asked = requests.ask(path := f"{PREFIX}/v1/sessions/abc/frames", root_path=PREFIX)
+    asked = requests.ask(path := f"{PREFIX}/v1/sessions/own/frames", root_path=PREFIX)
     await settled()
     assert path in requests.begun
     requests.let.set()
