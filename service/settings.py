@@ -129,7 +129,10 @@ class Settings(BaseSettings):
     )
     max_range_m: float = Field(300.0, gt=0, le=1e6, description="A teammate farther from the ego is left out.")
     keep_frames: int = Field(
-        0, ge=0, le=10_000, description="Latest frames of a session whose messages are kept, to replay decisions."
+        0,
+        ge=0,
+        le=10_000,
+        description="Latest frames of a session, by number, whose messages are kept, to replay decisions.",
     )
     record: Path | None = Field(None, description="Folder that sessions are recorded to; without one, none is.")
     record_sessions: Literal["all", "asked"] = Field(
