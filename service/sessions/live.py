@@ -105,7 +105,11 @@ class LiveSession:
             known = [one for one in record.teammates if self._is_who_it_was(one, record)]
             self.gathering.change_team(known)
             self.gathering.change_team(record.teammates)
-            self.motion.forget_all_but((record.ego_id, *record.teammates))
+            here = {record.ego_id, *record.teammates}
+            self.motion.forget_all_but(here)
+            for of_vehicles in (self.renewals, self.unread):
+                for gone in of_vehicles.keys() - here:
+                    del of_vehicles[gone]
             self.team, self.public_keys, self.token_ids = record.teammates, record.public_keys, record.token_ids
         if record.last_frame is not None and record.last_frame > self.gathering.closed:
             self.gathering.close(record.last_frame)

@@ -178,3 +178,16 @@ async def test_nothing_is_remembered_of_where_those_were_who_left(served, messag
     for name in TEAM[1:]:
         await ego.dismiss(name)
     assert set(live.motion._last) == {EGO, TEAM[0]}
+
+
+async def test_nothing_is_remembered_of_who_has_left(served, messages):
+    session = await served.open()
+    unit = served.teammate(session, "rsu")
+    await unit.renew()
+    await unit.send(0, messages["rsu"])
+    live = (await served.gateway.sessions.authenticate(session.session_id, session.ego_token)).live
+    assert "rsu" in live.renewals
+    assert "rsu" in live.unread
+    await served.ego(session).dismiss("rsu")
+    assert "rsu" not in live.renewals
+    assert "rsu" not in live.unread
