@@ -9,7 +9,7 @@ from __future__ import annotations
 import logging
 from collections.abc import Collection, Generator, Iterable, Iterator, Mapping, Sequence
 from contextlib import contextmanager
-from dataclasses import dataclass, field, fields
+from dataclasses import dataclass, field, fields, replace
 from functools import partial
 from typing import Any, TypeVar
 
@@ -44,7 +44,7 @@ from robosac.result import FusionResult
 from robosac.screening import Screened, Screening, joined, separated
 from robosac.steps import Steps, finished
 from robosac.testimony import Testimony
-from robosac.verified import check_asked, check_decided, first_state
+from robosac.verified import check_asked, check_decided, check_objects, first_state
 
 __all__ = ["FrameRun", "FusionResult", "UnverifiedAnswer", "fuse"]
 
@@ -167,6 +167,7 @@ class FrameRun:
             answered = yield from self._assemble(self._prepare({}), decision)
         boxes = answered["boxes"]
         decided = {part.name: getattr(decision, part.name) for part in fields(Decision)}
+        answered["judge"] = None
         answered["rejected"] = {**decision.rejected, **refused}
         answered["state"] = joined(decision.state, screened.memory)
         return FusionResult(
@@ -237,8 +238,14 @@ class FrameRun:
     def _assemble(self, passes: Passes, decision: Decision) -> Steps[dict[str, Any]]:
         """The fields of the result that hold boxes, and whose they are; judged ones are checked by now."""
         if decision.objects is None:
-            return {"boxes": (yield from self._decode(passes, decision.accepted))}
-        objects, boxes = best_first(decision.objects, self.boxes)
+            found = yield from self._decode(passes, decision.accepted)
+            if decision.judge is None or self.testimony is None:
+                return {"boxes": found}
+            with self._spending("consensus"):
+                objects, contradicted = decision.judge(found, self.testimony)
+            decision = replace(decision, objects=objects, contradicted=contradicted)
+            check_objects(self.defense, decision, self.boxes)
+        objects, boxes = best_first(decision.objects or (), self.boxes)
         contradicted, left_out = best_first(decision.contradicted, self.boxes)
         return {"objects": objects, "boxes": boxes, "contradicted": contradicted, "contradicted_boxes": left_out}
 

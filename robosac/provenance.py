@@ -12,7 +12,6 @@ from robosac.defenses import EGO, Decision, Hypothesis, JudgedBox
 
 Decoded = Mapping[Hypothesis, FloatArray]
 """By subset, as it was proposed: the boxes (n, 6) that were decoded of it in this frame."""
-Judged = tuple[JudgedBox, ...]
 
 
 class UnverifiedAnswer(Exception):
@@ -21,7 +20,7 @@ class UnverifiedAnswer(Exception):
     """
 
 
-def unfounded(decision: Decision, team: Sequence[str], decoded: Decoded) -> Iterator[str]:
+def unfounded(decision: Decision, decoded: Decoded) -> Iterator[str]:
     """Why judged boxes cannot be answered with; nothing if all of them can.
 
     A box has to come from the accepted subset or a part of it, the ego alone among them, that was decoded in this
@@ -30,8 +29,7 @@ def unfounded(decision: Decision, team: Sequence[str], decoded: Decoded) -> Iter
     Parameters
     ----------
     decision : Decision
-    team : sequence of str
-        Teammates that are in the frame.
+        It accepts or rejects every teammate of the frame.
     decoded : mapping of subset to (n, 6) ndarray
     """
     if decision.objects is None:
@@ -39,7 +37,7 @@ def unfounded(decision: Decision, team: Sequence[str], decoded: Decoded) -> Iter
             yield "leaves boxes out, but judged none of those it answers with"
         return
     judged = (*decision.objects, *decision.contradicted)
-    present, accepted, taken = {EGO, *team}, set(decision.accepted), set()
+    present, accepted, taken = {EGO, *decision.accepted, *decision.rejected}, set(decision.accepted), set()
     for box in judged:
         subset = tuple(box.subset)
         if not accepted.issuperset(subset):
@@ -56,7 +54,7 @@ def unfounded(decision: Decision, team: Sequence[str], decoded: Decoded) -> Iter
         taken.add((subset, box.index))
 
 
-def best_first(judged: Judged, decoded: Decoded) -> tuple[Judged, FloatArray]:
+def best_first(judged: Sequence[JudgedBox], decoded: Decoded) -> tuple[tuple[JudgedBox, ...], FloatArray]:
     """Judged boxes by descending score, and their rows (n, 6); those of equal score stay in order."""
     if not judged:
         return (), np.zeros((0, 6))

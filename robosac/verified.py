@@ -63,6 +63,12 @@ def check_asked(defense: Defense, batch: Sequence[Hypothesis], team: Sequence[st
             raise ValueError(f"{defense.kind}: {what}")
 
 
+def check_objects(defense: Defense, decision: Decision, decoded: Decoded) -> None:
+    """Refuse boxes that are not the defence's to answer with: `robosac.provenance.UnverifiedAnswer`."""
+    if doubt := next(unfounded(decision, decoded), None):
+        raise UnverifiedAnswer(f"{defense.kind} {doubt}")
+
+
 def check_decided(
     defense: Defense,
     decision: Decision,
@@ -107,8 +113,7 @@ def check_decided(
         raise UnverifiedAnswer(f"{defense.kind} neither accepted nor rejected some of {team}")
     if not trusted.union(*verified).issuperset(decision.trusted):
         raise UnverifiedAnswer(f"{defense.kind} trusts {list(decision.trusted)} without a consensus")
-    if doubt := next(unfounded(decision, team, decoded), None):
-        raise UnverifiedAnswer(f"{defense.kind} {doubt}")
+    check_objects(defense, decision, decoded)
     if defense.kind not in shipped():  # those that ship are known to keep JSON, and theirs may be long
         rfc8785.dumps(dict(decision.state))
         if doubt := next((name for name, why in decision.rejected.items() if not by_text(why.evidence)), None):

@@ -156,6 +156,10 @@ class Difference:
     """Gives by what happened there, such as ``lost``, the places (n, 2): ego frame, metres. Only pictures call it."""
 
 
+Judged = tuple[tuple[JudgedBox, ...], tuple[JudgedBox, ...]]
+"""Boxes of an answer, and those that are left out of it because they are contradicted."""
+
+
 @dataclass(frozen=True)
 class Decision:
     """What a defence concludes about a frame."""
@@ -179,6 +183,11 @@ class Decision:
     """
     contradicted: tuple[JudgedBox, ...] = ()
     """Boxes that are left out of ``objects`` and told apart from them."""
+    judge: Callable[[FloatArray, Testimony], Judged] | None = field(default=None, compare=False, repr=False)
+    """From a defence that judges boxes, but has not seen those of the accepted subset: gives ``objects`` and
+    ``contradicted`` by all boxes (n, 6) of that subset, ego frame, and the frame's testimony. It is asked where there
+    is testimony.
+    """
     differences: tuple[Difference, ...] = field(default=(), compare=False, repr=False)
     """What was found by comparing fusions, from a defence that compares them box by box. For whoever looks on: it is
     neither answered nor kept.

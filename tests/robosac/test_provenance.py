@@ -2,6 +2,7 @@
 
 import logging
 from dataclasses import replace
+from typing import ClassVar
 
 import numpy as np
 import pytest
@@ -19,6 +20,7 @@ from robosac.defenses import (
     Support,
 )
 from robosac.fusion import fuse
+from robosac.testimony import LAYERS, Testimony
 from tests.robosac.fusing import NOISE, SEEN, FakeDetector, run
 from tests.robosac.judging import Judging, alone, confirmed, repaired
 
@@ -153,6 +155,40 @@ def test_what_was_not_decoded_cannot_be_judged_even_of_the_trusted(caplog):
     state = {"trusted": ["a", "c"], "frames_since_check": 0}
     with caplog.at_level(logging.CRITICAL):
         assert "were not fused" in run(FakeDetector(), Trusting(), state=state).fault
+
+
+class Later(StaticTeam):
+    """Judges boxes of those it trusts once they are decoded."""
+
+    def __init__(self, objects):
+        super().__init__()
+        object.__setattr__(self, "objects", objects)
+
+    asks_witnesses: ClassVar[bool] = True
+
+    def converse(self, team, state, rng):
+        decision = yield from super().converse(team, state, rng)
+        return replace(decision, judge=lambda boxes, testimony: (self.objects, ()))
+
+
+class Speaking(FakeDetector):
+    """Has testimony of whoever is there, in which nothing is said."""
+
+    def testify(self, ego, teammates):
+        agents, size = (EGO, *teammates), (4, 4)
+        maps, over_ego = np.zeros((len(agents), LAYERS, *size)), np.zeros((len(agents), *size))
+        return Testimony(agents, maps, np.tile(np.eye(3), (len(agents), 1, 1)), over_ego, 32.0)
+
+
+def test_what_was_not_decoded_as_a_test_may_be_judged_later(caplog):
+    state = {"trusted": ["a", "c"], "frames_since_check": 0}
+    both = ("a", "c")
+    result = run(Speaking(), Later((judged(both, 3), judged(both, 1, alone("a")))), state=state)
+    assert (result.fault, result.accepted, result.judge, len(result.boxes)) == (None, both, None, 2)
+    assert sorted(box.index for box in result.objects) == [1, 3]
+    assert run(FakeDetector(), Later(()), state=state).objects is None  # there is no testimony
+    with caplog.at_level(logging.CRITICAL):
+        assert "judges box 9" in run(Speaking(), Later((judged(both, 9),)), state=state).fault
 
 
 def test_the_embedded_detector_end_to_end(detector, ego_message, benign):

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Mapping, Sequence
+from functools import partial
 from typing import Any
 
 import numpy as np
@@ -140,8 +141,9 @@ class JudgedFrame:
         ratio = sum(suspicion.values()) / len(suspicion) if suspicion else None
         state = remember(self._known.posterior, memory, trusted, named)
         objects, contradicted = inspection.judged(accepted) or (None, ())
+        judge = partial(inspection.judged_alone, accepted)
         differences = (*self._evidence.differences, *inspection.differences)
-        return Decision(accepted, source, rejected, ratio, state, suspicion, objects, contradicted, differences)
+        return Decision(accepted, source, rejected, ratio, state, suspicion, objects, contradicted, judge, differences)
 
     def _is_attacker(self, name: str, suspicion: float, naming_bound: float) -> bool:
         """Whether a teammate is to be named. It is suspected, and lied about objects too often where the ego is steady;

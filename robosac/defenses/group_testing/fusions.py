@@ -81,14 +81,17 @@ class Fusions:
         if outcome.testimony is None or outcome.boxes is None:
             return None
         if self.hearing is None:
-            self._testimony = outcome.testimony
-            silent = self.known.memory.ego_is_late
-            self.hearing = Hearing(outcome.testimony.silenced(EGO) if silent else outcome.testimony, self.unheard)
+            self._testimony, self.hearing = outcome.testimony, self.hear(outcome.testimony)
             self._alone, self.number = outcome.alone, outcome.frame
         if outcome.pose is not None:
             self.pose = outcome.pose
         shown = self.shown[outcome.teammates] = Shown(outcome.teammates, outcome.boxes, self.hearing)
         return shown
+
+    def hear(self, testimony: Testimony) -> Hearing:
+        """Testimony of the frame, without that of an ego whose own message is late."""
+        silent = self.known.memory.ego_is_late
+        return Hearing(testimony.silenced(EGO) if silent else testimony, self.unheard)
 
     def heard(self) -> Hearing:
         """What all messages say."""

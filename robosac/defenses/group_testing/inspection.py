@@ -16,8 +16,9 @@ from robosac.defenses.group_testing.findings import Findings, one_out
 from robosac.defenses.group_testing.lies import AUDIT_FRAMES
 from robosac.defenses.group_testing.objects import Lie, Shown
 from robosac.defenses.group_testing.posterior import EXACT
-from robosac.defenses.group_testing.standing import Judged, judge
-from robosac.defenses.protocol import Difference, Hypothesis, Outcome
+from robosac.defenses.group_testing.standing import judge
+from robosac.defenses.protocol import Difference, Hypothesis, Judged, Outcome
+from robosac.testimony import Testimony
 
 SUSPECT = 0.5
 """Who is suspected more than this, and not named, is asked again each frame, so as to be cleared or named."""
@@ -108,17 +109,25 @@ class Inspection:
                 found.lies.audited.pop(name, None)
 
     def judged(self, answer: Hypothesis) -> Judged | None:
-        """How each box of an answer stands; None where nothing is known of objects."""
-        if answer not in self._found.shown:
-            return None
+        """How each box of an answer stands; None where it was not decoded, or nothing is known of objects."""
         found = self._found
+        shown = found.shown.get(answer) if answer else found.of_ego
+        if shown is None:
+            return None
         shapes = [
             (index, found.shown[without], at)
             for name, without in one_out(answer, found.shown).items()
             for index, at, _ in found.reshaped(answer, without, (name,))
         ]
-        objects, contradicted = judge(found.shown[answer], list(found.shown.values()), shapes)
-        return ((*objects, *contradicted), ()) if self._keep_contradicted else (objects, contradicted)
+        return self._kept(judge(shown, list(found.shown.values()), shapes))
+
+    def judged_alone(self, answer: Hypothesis, boxes: FloatArray, testimony: Testimony) -> Judged:
+        """How each box (n, 6) of an answer stands that was not decoded as a test: by testimony alone."""
+        return self._kept(judge(Shown(answer, boxes, self._found.hear(testimony)), ()))
+
+    def _kept(self, judged: Judged) -> Judged:
+        objects, contradicted = judged
+        return ((*objects, *contradicted), ()) if self._keep_contradicted else judged
 
     def _again(self, answer: Hypothesis) -> list[Hypothesis]:
         """What is to be decoded to ask those again that are neither in the answer nor named: of those only in doubt,

@@ -13,7 +13,7 @@ from robosac.boxes import BoolArray, FloatArray, IntArray, pairwise_iou
 from robosac.defenses.group_testing.claims import DENIES, LEANS, NEARLY_SUPPORTS, SUPPORTS, two_witnesses
 from robosac.defenses.group_testing.differences import AWAY_EFFECT, carried, gone, gone_alone
 from robosac.defenses.group_testing.objects import SHOWN_SCORE, Shown
-from robosac.defenses.protocol import Hypothesis, JudgedBox
+from robosac.defenses.protocol import Hypothesis, Judged, JudgedBox
 
 SAME_M = 2.5
 """A box of another fusion, centred so near, stands for the same vehicle."""
@@ -23,8 +23,6 @@ OVERLAP_IOU = 0.1
 """No two vehicles overlap so much."""
 Repair = tuple[Shown, int]
 """A box of another fusion."""
-Judged = tuple[tuple[JudgedBox, ...], tuple[JudgedBox, ...]]
-"""Boxes of an answer, and those that are contradicted."""
 
 
 def judge(answer: Shown, decoded: Sequence[Shown], reshaped: Sequence[tuple[int, Shown, int]] = ()) -> Judged:
