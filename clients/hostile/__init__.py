@@ -6,22 +6,21 @@ They run in a process of their own, so that the honest ego's clock does not wait
 from __future__ import annotations
 
 import asyncio
-import sqlite3
 import time
 from collections import Counter
-from collections.abc import Awaitable, Callable
-from contextlib import closing
+from collections.abc import Awaitable, Callable, Mapping
+from contextlib import AbstractContextManager
 from enum import StrEnum
 
 import httpx
 
-from clients.hostile import connections, requests, sessions
-from clients.hostile.attacker import STRANGERS, Attacker, Target, strange_frame
+from clients.hostile import connections, faults, forging, requests, sessions, stolen
+from clients.hostile.attacker import BROKEN, STRANGERS, Attacker, Target, strange_frame
 
-__all__ = ["LOCKED", "STRANGERS", "Attack", "Target", "run_attack", "strange_frame"]
+__all__ = ["BROKEN", "FAULTS", "FAULTY", "STRANGERS", "Attack", "Target", "run_attack", "strange_frame"]
 
-LOCKED = 0.5
-"""Part of the time for which the database is locked; the rest shows how the gateway recovers."""
+FAULTY = 0.5
+"""Part of the time for which a fault lasts; the rest shows how the gateway recovers."""
 
 
 class Attack(StrEnum):
@@ -71,8 +70,16 @@ class Attack(StrEnum):
     """Heads of many short lines."""
     LISTS = "lists in a header"
     """Good messages with an `Accept` of thousands of parts."""
+    STOLEN = "stolen tokens"
+    """Tokens of vehicles that registered keys, without the keys."""
+    FORGED = "forged logs"
+    """An operator rewrites a session's log in seven ways, and seals it anew."""
     DATABASE = "locked database"
     """Another process holds the database's write lock."""
+    DISK = "full disk"
+    """No file of the gateway may grow."""
+    STOPPED = "stopped process"
+    """The gateway's process stands still."""
 
 
 _PLAYED: dict[Attack, Callable[[Attacker], Awaitable[object]]] = {
@@ -98,13 +105,23 @@ _PLAYED: dict[Attack, Callable[[Attacker], Awaitable[object]]] = {
     Attack.CHUNKS: connections.chunks,
     Attack.HEADERS: connections.headers,
     Attack.LISTS: sessions.long_accepts,
+    Attack.STOLEN: stolen.tokens,
+    Attack.FORGED: forging.logs,
 }
+FAULTS: Mapping[Attack, Callable[[Target], AbstractContextManager[None]]] = {
+    Attack.DATABASE: faults.locked_database,
+    Attack.DISK: faults.full_disk,
+    Attack.STOPPED: faults.stopped_process,
+}
+"""Attacks during which no frame can be answered in time: what counts is what is said then, and what comes after."""
 
 
 def run_attack(attack: Attack, target: Target, seconds: float) -> Counter[str]:
     """Attack for a time; what was answered, by status."""
-    if attack is Attack.DATABASE:
-        return _lock(target, LOCKED * seconds)
+    if attack in FAULTS:
+        with FAULTS[attack](target):
+            time.sleep(FAULTY * seconds)
+        return Counter()
     return asyncio.run(_attack(attack, target, seconds))
 
 
@@ -118,12 +135,3 @@ async def _attack(attack: Attack, target: Target, seconds: float) -> Counter[str
         except TimeoutError:
             pass
     return answers
-
-
-def _lock(target: Target, seconds: float) -> Counter[str]:
-    """Hold the lock with which the gateway would write."""
-    with closing(sqlite3.connect(target.database, isolation_level=None, timeout=10.0)) as connection:
-        connection.execute("BEGIN IMMEDIATE")
-        time.sleep(seconds)
-        connection.execute("ROLLBACK")
-    return Counter()

@@ -5,7 +5,7 @@ from __future__ import annotations
 import asyncio
 import json
 from collections import Counter
-from collections.abc import Awaitable, Callable, Iterable
+from collections.abc import Awaitable, Callable, Iterable, Mapping
 from dataclasses import dataclass
 from functools import cached_property
 from typing import Any
@@ -16,10 +16,13 @@ import numpy as np
 
 from clients.client import MSGPACK
 from robosac import wire
+from robosac.detectors import Message
 
 STRANGERS = 12
 PAUSE_S = 0.05
 """After what failed."""
+BROKEN = "broken: "
+"""How the name of an answer begins that nobody should have been given."""
 
 
 @dataclass(frozen=True)
@@ -29,6 +32,7 @@ class Target:
     url: str
     key: str
     database: str
+    pid: int
     strange: bytes
     """A whole frame of teammates with nothing in common with the ego (`strange_frame`)."""
     frame: bytes
@@ -55,6 +59,15 @@ def strange_frame(body: bytes) -> bytes:
             tensors[name] = {**tensor, "data": rng.permutation(values).tobytes()}
         teammates[f"stranger-{number}"] = {**honest, "tensors": tensors}
     return wire.pack({**frame, "teammates": teammates})
+
+
+def message_of(fields: Mapping[str, Any]) -> Message:
+    """A vehicle's part of an unpacked frame."""
+    tensors = {
+        name: np.frombuffer(tensor["data"], tensor["dtype"]).reshape(tensor["shape"])
+        for name, tensor in fields["tensors"].items()
+    }
+    return Message(np.array(fields["pose"], dtype=float).reshape(4, 4), tensors)
 
 
 def bearer(credential: str) -> dict[str, str]:

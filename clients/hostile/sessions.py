@@ -8,7 +8,7 @@ import msgpack
 import numpy as np
 
 from clients.client import MSGPACK
-from clients.hostile.attacker import PAUSE_S, Attacker, bearer
+from clients.hostile.attacker import PAUSE_S, Attacker, bearer, message_of
 from robosac import wire
 from robosac.detectors import Message
 
@@ -83,9 +83,8 @@ async def long_accepts(attacker: Attacker) -> None:
 
 def _nothing(attacker: Attacker) -> Message:
     """A message in which there is nothing, as the honest ego sends them."""
-    fields = attacker.frame["ego"]
-    tensors = {name: np.zeros(each["shape"], each["dtype"]) for name, each in fields["tensors"].items()}
-    return Message(np.array(fields["pose"]).reshape(4, 4), tensors)
+    honest = message_of(attacker.frame["ego"])
+    return Message(honest.pose, {name: np.zeros_like(each) for name, each in honest.tensors.items()})
 
 
 async def _frames(attacker: Attacker, fields: dict[str, object], number: int, options: dict[str, object]) -> None:

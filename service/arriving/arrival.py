@@ -40,11 +40,13 @@ class Arrival:
         await self._app(scope, receive, send)
 
 
-def note_first_byte(state: MutableMapping[str, Any]) -> None:
-    """Note that the first byte of a request is seen now, in its own copy of the lifespan's state."""
+def note_first_byte(state: MutableMapping[str, Any], waited_s: float = 0.0) -> None:
+    """Note that the first byte of a request is seen now, in its own copy of the lifespan's state, and for how long it
+    has waited at least.
+    """
     arrived = state.get(_CLOCK)
     if arrived is not None:
-        state[_FIRST_BYTE] = arrived()
+        state[_FIRST_BYTE] = min(arrived(), time.perf_counter() - waited_s) if waited_s else arrived()
 
 
 def arrival_of(scope: Scope) -> float:

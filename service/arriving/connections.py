@@ -11,6 +11,7 @@ from asyncio import TimerHandle, Transport
 from uvicorn.protocols.http.httptools_impl import HttpToolsProtocol
 
 from service.arriving.arrival import note_first_byte
+from service.arriving.waiting import waited_s
 
 HEAD_BYTES = 64 * 1024
 """What of a head is taken before it is whole; `service.arriving.doors` judges it then."""
@@ -38,6 +39,7 @@ class BoundedHTTP(HttpToolsProtocol):
     unread_timeout_s = 30.0
     """How long a client may take nothing of what waits for it. To close a connection would wait for it for ever."""
 
+    _waited_s = 0.0
     _deadline: TimerHandle | None = None
     _in_head = False
     _head_ended = False
@@ -48,6 +50,7 @@ class BoundedHTTP(HttpToolsProtocol):
     _unread: TimerHandle | None = None
 
     def connection_made(self, transport: Transport) -> None:  # type: ignore[override]
+        self._waited_s = waited_s(transport)
         super().connection_made(transport)
         self._arm()
 
@@ -67,7 +70,8 @@ class BoundedHTTP(HttpToolsProtocol):
     def on_message_begin(self) -> None:
         self._in_head = True
         super().on_message_begin()
-        note_first_byte(self.scope["state"])
+        note_first_byte(self.scope["state"], self._waited_s)
+        self._waited_s = 0.0
 
     def on_header(self, name: bytes, value: bytes) -> None:
         super().on_header(name, value)

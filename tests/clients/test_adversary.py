@@ -1,51 +1,65 @@
+import asyncio
+import contextlib
 import json
 import math
 import subprocess
 import sys
+from collections import Counter
 
+import httpx
 import msgpack
 import pytest
 
 from clients.adversary import RECOVERED_WITHIN, Result, Seen
-from clients.hostile import STRANGERS, Attack, strange_frame
+from clients.hostile import BROKEN, STRANGERS, Attack, Target, forging, stolen, strange_frame
+from clients.hostile.attacker import Attacker
+from clients.hostile.forging import FORGERIES, NAMED
 from clients.load_test import EGO, TEAM
 from robosac import wire
+from robosac.audit import Fault, Receipts
 from robosac.session import Session
 
 
-def test_two_attacks_are_played_and_told(tmp_path):
+def test_attacks_are_played_and_told(tmp_path):
     """As a command, since its attacker is a process of its own."""
-    attacks = [Attack.LONG, Attack.DATABASE]
+    attacks = [Attack.LONG, Attack.DATABASE, Attack.FORGED, Attack.DISK]
     only = [word for attack in attacks for word in ("--only", attack.value)]
     command = [sys.executable, "-m", "clients.adversary", "--seconds", "2", "--out", str(tmp_path), *only]
-    done = subprocess.run([*command, "--budget-ms", "1000"], check=False, capture_output=True, text=True)
+    command += ["--budget-ms", "1000", "--at-least", "0.8"]
+    done = subprocess.run(command, check=False, capture_output=True, text=True)
     assert done.returncode == 0, done.stdout + done.stderr
     for attack in attacks:
         assert attack.value in done.stdout
-    long, locked = json.loads((tmp_path / "adversary.json").read_text())
-    for part in (long["before"], long["during"], locked["before"]):
+    results = long, locked, forged, full = json.loads((tmp_path / "adversary.json").read_text())
+    for part in (long["before"], long["during"], locked["before"], forged["during"]):
         assert part["frames"] == 10
         assert part["tested"] >= 8
-    assert locked["during"]["frames"] == 10
-    assert locked["recovered_after"] <= RECOVERED_WITHIN
-    for result in (long, locked):
+    for faulty in (locked, full):
+        assert faulty["during"]["frames"] == 10
+        assert faulty["recovered_after"] <= RECOVERED_WITHIN
+    assert sorted(forged["attacker"]) == sorted(
+        f"{NAMED}{what}" for what in (*FORGERIES, "the true log", "a byte added")
+    )
+    for result in results:
         assert result["before"]["belied"] == result["during"]["belied"] == 0
+        assert result["broken"] == []
         assert 50 < result["memory_mib"] < 4000
 
 
 @pytest.mark.parametrize(
-    ("belied", "recovered", "attack", "held"),
+    ("belied", "recovered", "attack", "answers", "held"),
     [
-        (0, 0, Attack.DATABASE, True),
-        (0, RECOVERED_WITHIN + 1, Attack.DATABASE, False),
-        (0, None, Attack.DATABASE, False),
-        (0, None, Attack.LONG, True),
-        (1, 0, Attack.LONG, False),
+        (0, 0, Attack.DATABASE, {}, True),
+        (0, RECOVERED_WITHIN + 1, Attack.DATABASE, {}, False),
+        (0, None, Attack.DISK, {}, False),
+        (0, None, Attack.LONG, {"200": 1}, True),
+        (1, 0, Attack.LONG, {}, False),
+        (0, None, Attack.STOLEN, {"401": 3, f"{BROKEN}POST /token": 1}, False),
     ],
 )
-def test_what_does_not_hold_is_told(belied, recovered, attack, held):
+def test_what_does_not_hold_is_told(belied, recovered, attack, answers, held):
     during = Seen(200.0, frames=10, belied=belied)
-    assert Result(attack, Seen(200.0), during, {}, math.nan, recovered).held is held
+    assert Result(attack, Seen(200.0), during, answers, math.nan, recovered).held is held
 
 
 def test_frames_until_one_is_good_are_counted_in_the_order_in_which_they_were_due():
@@ -70,3 +84,32 @@ def test_a_strange_frame_contradicts_the_ego_and_passes_what_is_looked_at_before
     answer = Session(detector, list(team)).answer(0, messages[EGO], team)
     assert len(answer.rejected) > STRANGERS // 2  # some may agree with the ego by chance
     assert answer.sampling_steps > 0
+
+
+async def test_a_gateway_that_takes_stolen_tokens_is_told(messages):
+    """One that says yes to all."""
+    opened = {"session_id": "5e55", "ego_token": "a", "teammate_tokens": {"mate": "b"}, "teammates": []}
+    body = wire.pack_frame(0, messages[EGO], {name: messages[name] for name in TEAM})
+    target = Target("http://gateway", "", "", 0, b"", body)
+
+    async def take(request):
+        await asyncio.sleep(0.001)
+        return httpx.Response(200, json=opened)
+
+    answers = Counter()
+    async with httpx.AsyncClient(base_url=target.url, transport=httpx.MockTransport(take)) as http:
+        with contextlib.suppress(TimeoutError):
+            async with asyncio.timeout(2.0):
+                await stolen.tokens(Attacker(http, target, answers))
+    broken = {told.removeprefix(BROKEN) for told in answers if told.startswith(BROKEN)}
+    changes = {"POST /token", "POST /teammates", "DELETE /teammates/mate", "DELETE /", "POST /messages", "POST /frames"}
+    assert {told.partition(" by ")[0] for told in broken} == {*changes, "another team"}
+
+
+def test_forgeries_that_nobody_names_are_told(monkeypatch):
+    lines = [json.dumps({"event": "frame_answered", "seq": 1, "session_id": "5e55", "frame": 0}).encode()]
+    monkeypatch.setattr(forging, "verify", lambda lines, receipts: [])
+    monkeypatch.setattr(forging, "FORGERIES", {"nothing": (lambda log: log, Fault.BROKEN_PROMISE)})
+    answers = Counter()
+    forging.hold(answers, lines, Receipts())
+    assert set(answers) == {f"{NAMED}the true log", f"{BROKEN}a byte added", f"{BROKEN}nothing"}

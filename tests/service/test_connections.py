@@ -203,7 +203,7 @@ async def test_the_bodies_before_it_do_not_count_for_a_head(port):
 
 
 async def test_the_adversary_is_hung_up_on(port):
-    target = Target(f"http://127.0.0.1:{port}", "", "", b"", b"")
+    target = Target(f"http://127.0.0.1:{port}", "", "", 0, b"", b"")
     answers = await asyncio.to_thread(run_attack, Attack.HEADS, target, 3 * TIMEOUT_S)
     slow = [answers[how] for how in ("408", "hung up", "ConnectionResetError")]  # its next byte may cut the answer off
     assert sum(slow) > 0

@@ -4,6 +4,7 @@ import asyncio
 import contextlib
 import http.client
 import json
+import socket
 import threading
 import time
 
@@ -11,6 +12,7 @@ import pytest
 import uvicorn
 
 from service.app import create_app
+from service.arriving.connections import BoundedHTTP
 from service.settings import Settings
 from service.watching.stalls import ROUNDS, STALL_S, TICK_S, LoopWatch
 from tests.service.conftest import EGO, MSGPACK, TEAM
@@ -68,8 +70,9 @@ async def test_two_stalls_with_a_breath_between_are_one(clock_and_watch):
 class InThread:
     """A gateway served by uvicorn on an event loop of its own, which tests can stall."""
 
-    def __init__(self, loop):
-        config = uvicorn.Config(create_app(Settings(database_url="sqlite://")), port=0, loop=loop, log_level="warning")
+    def __init__(self, loop, http="auto"):
+        app = create_app(Settings(database_url="sqlite://"))
+        config = uvicorn.Config(app, port=0, loop=loop, http=http, log_level="warning")
         self.server = uvicorn.Server(config)
         self.thread = threading.Thread(target=self._run, args=(config,))
 
@@ -97,10 +100,11 @@ class InThread:
             return response.status, response.read()
 
 
+@pytest.mark.parametrize(("http", "before"), [("auto", 0), (BoundedHTTP, 40)])  # uvloop accepts one a round
 @pytest.mark.parametrize("loop", ["asyncio", "uvloop"])
-def test_a_frame_that_waited_for_a_stalled_loop_is_late(loop, good_frame):
+def test_a_frame_that_waited_for_a_stalled_loop_is_late(loop, http, before, good_frame):
     opening = {"ego_id": EGO, "teammates": list(TEAM), "latency_budget_ms": 1000, "gather_ms": 0}
-    with InThread(loop) as gateway:
+    with InThread(loop, http) as gateway, contextlib.ExitStack() as stack:
         status, answer = gateway.post("/v1/sessions", json.dumps(opening), **{"Content-Type": "application/json"})
         assert status == 201
         session = json.loads(answer)
@@ -111,6 +115,8 @@ def test_a_frame_that_waited_for_a_stalled_loop_is_late(loop, good_frame):
             if frame == 2:
                 gateway.loop.call_soon_threadsafe(time.sleep, 1.6)
                 time.sleep(0.1)  # the loop is in it
+                for _ in range(before):
+                    stack.enter_context(socket.create_connection(("127.0.0.1", gateway.port)))
             began = time.perf_counter()
             status, answer = gateway.post(path, good_frame(frame), **headers)
             took_s = time.perf_counter() - began
