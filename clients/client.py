@@ -75,6 +75,14 @@ class OpenedSession:
     defense: Mapping[str, Any]
     receipt: LogReceipt | None = None
 
+    @property
+    def lacks_witness(self) -> bool:
+        """Whether the defence is to judge single objects, and the gateway says that the detector has no witness for it
+        (``objects_judged`` of its ``calibration``).
+        """
+        calibration = self.detector.get("calibration") or {}
+        return self.defense.get("judge_objects") is True and calibration.get("objects_judged") is False
+
 
 @dataclass(frozen=True)
 class _Keys:

@@ -175,7 +175,7 @@ async def _run_scene(options: FleetOptions, fleet: Fleet, summary: FleetSummary,
             opened.append(vehicles[ego_id])
             if session.detector["weights_digest"] != fleet.detector.info.weights_digest:
                 raise ValueError(f"the gateway's {fleet.detector.info.name} has other weights than the fleet's")
-            summary.defense = session.defense
+            summary.defense, summary.lacks_witness = session.defense, session.lacks_witness
             for vehicle in vehicles.values():
                 vehicle.enrol(ego_id, session)
         start = time.monotonic()

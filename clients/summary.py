@@ -18,6 +18,7 @@ from clients.simulation import EgoFrame
 from clients.standing import Standings
 from robosac.answers import FrameAnswer
 from robosac.boxes import FloatArray
+from robosac.calibrated import without_witness
 from robosac.consensus import at_least
 from robosac.detectors import Detector
 from robosac.evaluation import AveragePrecision
@@ -74,6 +75,8 @@ class FleetSummary:
     names: bool = False
     defense: Mapping[str, Any] | None = None
     """As the gateway took it on."""
+    lacks_witness: bool = False
+    """As `clients.client.OpenedSession.lacks_witness`."""
     lies: Lies = field(default_factory=Lies)
     standings: Standings = field(default_factory=Standings)
     example: Example | None = None
@@ -152,6 +155,7 @@ class FleetSummary:
         return {
             "frames": self.frames,
             "defense": self.defense,
+            "lacks_witness": self.lacks_witness,
             "average_precision": {name: {"ap50": ap.at(0.5), "ap70": ap.at(0.7)} for name, ap in self.ap.items()},
             "clean_share": self.clean_share,
             "answers_with_attacker": self.with_attacker,
@@ -195,6 +199,8 @@ class FleetSummary:
             error_m = self.defense.get("pose_error_m")
             expecting = "" if error_m is None else f", expecting positions to be wrong by {error_m:g} m"
             console.print(f"Defence: {self.defense['kind']}{expecting}.")
+        if self.lacks_witness:
+            console.print(f"{without_witness(self.detector.info.name)}.", markup=False)
         latency, steps = values["latency_ms"], values["sampling_steps"]
         sources = ", ".join(f"{count} {source.replace('_', ' ')}" for source, count in self.sources.most_common())
         console.print(

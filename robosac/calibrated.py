@@ -82,6 +82,11 @@ def witness_of(info: DetectorInfo) -> Witness | None:
     return _open(info.witness, info.witness.stat().st_mtime_ns, info)
 
 
+def without_witness(name: str) -> str:
+    """In one line, what group testing goes without on the detector of that name, which has no witness."""
+    return f"{name} has no witness, so group testing judges no single objects with it: robosac witness makes one"
+
+
 @lru_cache(maxsize=16)
 def _digest(*files: tuple[Path, int]) -> str:  # with the times of their last changes
     return hashlib.sha256(b"".join(path.read_bytes() for path, _ in files)).hexdigest()

@@ -58,7 +58,12 @@ _DETECTOR = {
     "precision": "float32",
     "device": "cpu",
     "consensus_score": 0.3,
-    "calibration": {"kinds": ["pgd", "erase", "open"], "pose_errors_m": [0.0, 0.2], "digest": _HASH},
+    "calibration": {
+        "kinds": ["pgd", "erase", "open"],
+        "pose_errors_m": [0.0, 0.2],
+        "digest": _HASH,
+        "objects_judged": True,
+    },
 }
 EXAMPLES: Mapping[type[BaseModel], dict[str, Any]] = {
     SessionRequest: {

@@ -4,7 +4,6 @@ from __future__ import annotations
 
 import asyncio
 import contextlib
-import logging
 import math
 import threading
 import time
@@ -15,10 +14,11 @@ from functools import partial
 from typing import TypeVar
 
 import numpy as np
+import structlog
 import torch
 
 from robosac.ahead import Ahead
-from robosac.calibrated import calibration_fault
+from robosac.calibrated import calibration_fault, without_witness
 from robosac.deadline import Deadline
 from robosac.defenses import EGO
 from robosac.detectors import Detector, Message, Preparer, available, load
@@ -30,7 +30,7 @@ from service.errors import Kind, Refused
 from service.jobs import TOGETHER, Decided, Job, waiting, with_company
 from service.turns import Turns, Work
 
-logger = logging.getLogger(__name__)
+logger = structlog.stdlib.get_logger(__name__)
 
 T = TypeVar("T")
 
@@ -130,7 +130,9 @@ class Engine:
         for name, detector in self._detectors.items():
             await self._submit(partial(warm_up, detector))
             if fault := await self._submit(partial(calibration_fault, detector.info)):
-                logger.warning("sessions of %s with group_testing are refused: %s", name, fault)
+                logger.warning("group testing is refused", detector=name, why=fault)
+            elif detector.info.calibration is not None and detector.info.witness is None:
+                logger.warning("single objects are not judged", detector=name, why=without_witness(name))
         self.ready = True
 
     def check_ready(self) -> None:
@@ -239,7 +241,7 @@ class Engine:
         try:
             together(coming, TOGETHER)
         except Exception:  # each then makes its own, and whatever is wrong shows there
-            logger.warning("passes of %d frames could not be made together", len(jobs), exc_info=True)
+            logger.warning("passes could not be made together", frames=len(jobs), exc_info=True)
         with self._lock:
             for job, made in zip(jobs, coming, strict=True):
                 self._turns.charge(job.work, made.spent_s)

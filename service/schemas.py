@@ -167,17 +167,22 @@ class CalibrationEntry(BaseModel):
 
     kinds: list[str] = Field(description="attacks that it was observed under")
     pose_errors_m: list[float] = Field(description="errors of the teammates' positions that it was observed with")
-    digest: str = Field(description="SHA-256 of the calibration file")
+    digest: str = Field(description="SHA-256 of the calibration and the witness together")
+    objects_judged: bool = Field(description="whether it has a witness, so that single objects are judged")
 
     @classmethod
     def of(cls, info: DetectorInfo) -> CalibrationEntry | None:
         """The entry; None if the detector has no calibration, or one that cannot be used."""
         try:
-            levels = calibration_of(info).levels
+            calibration = calibration_of(info)
         except CalibrationError:
             return None
-        errors = [level.pose_error_m for level in levels]
-        return cls(kinds=list(levels[0].kinds), pose_errors_m=errors, digest=calibration_digest(info) or "")
+        return cls(
+            kinds=list(calibration.levels[0].kinds),
+            pose_errors_m=[level.pose_error_m for level in calibration.levels],
+            digest=calibration_digest(info) or "",
+            objects_judged=calibration.witnessed,
+        )
 
 
 class DetectorEntry(_Shown):

@@ -13,6 +13,7 @@ from rich.console import Console
 from rich.table import Table
 
 from robosac.attacks import ATTACKS
+from robosac.calibrated import without_witness
 from robosac.calibration import Recipe, ReliabilityBin, TooFewVerdicts, calibrate
 from robosac.calibration.making import load_attacks
 from robosac.calibration.messages import add, held, measure
@@ -130,7 +131,7 @@ def run(  # the options of a command line
         _print(console, error_m, bins)
     console.print(f"{out}: {calibration.detector}, weights {calibration.weights_digest:.12}...")
     if chosen.info.witness is None:
-        console.print("Single objects can be judged, too, once robosac witness has made NAME.witness.safetensors.")
+        console.print(f"{without_witness(chosen.info.name)}.", markup=False)
 
 
 def _measure_messages(detector: Encoder, scenes: Sequence[Scene], out: Path, made_by: str, console: Console) -> None:

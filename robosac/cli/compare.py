@@ -16,6 +16,7 @@ from robosac import defenses
 from robosac.attacks import KIND as ATTACKS
 from robosac.attacks import AttackError, lacking, load_campaign
 from robosac.budget import DomainError
+from robosac.calibrated import without_witness
 from robosac.cli.blame import blaming, check_known, failing, listed
 from robosac.cli.options import (
     WORLD_HELP,
@@ -44,6 +45,7 @@ from robosac.evaluation.comparison import (
     built,
     compare_plans,
     kept,
+    lacks_witness,
     write_comparison,
     write_worlds,
 )
@@ -119,6 +121,8 @@ def run(  # the options of a command line
     possible, impossible = _possible(extent, chosen, asked=bool(setting))
     for why in (*left_out, *impossible):
         console.print(f"Left out: {why}")
+    if lacks_witness(columns):
+        console.print(f"{without_witness(chosen.info.name)}.", markup=False)
     extent = replace(extent, settings=possible)
     what = (chosen, columns, extent, seed, recordings, pose_error, live)
     code = code_of(ATTACKS, DETECTORS, SOURCES)

@@ -308,6 +308,19 @@ def test_the_summary_tells_what_was_refused_first(refused, said, detector):
     assert "1 answer was lost: the database took longer" in console.file.getvalue()
 
 
+@pytest.mark.parametrize("lacks", [False, True])
+def test_the_summary_tells_that_no_objects_are_judged(lacks, detector):
+    (frame,) = Fleet(IntersectionScene(3), detector, 1, 0, PGD(steps=1), seed=0).sense(0)
+    result = fuse(detector, Halving(), frame.message, frame.sent, rng=np.random.default_rng(0))
+    summary = FleetSummary(detector, lacks_witness=lacks)
+    summary.add(frame, result.answer(0, {}, {"total": 1.0}, frame.ego_id), 10.0)
+    console = Console(file=io.StringIO(), width=200)
+    summary.print(console)
+    told = "intersection-mean has no witness, so group testing judges no single objects with it: robosac witness"
+    assert (told in console.file.getvalue()) is lacks
+    assert summary.as_dict()["lacks_witness"] is lacks
+
+
 class Silent(Halving):
     kind: Literal["silent"] = "silent"
 

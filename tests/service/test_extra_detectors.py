@@ -74,13 +74,32 @@ async def test_a_calibration_that_cannot_be_used_is_told_at_the_start(tmp_path, 
         if text is not None:
             calibration.write_text(text)
         async with serve(extra_detectors=str(own)) as served:
-            (said,) = [r.getMessage() for r in caplog.records if r.name == "service.engine"]
+            (said,) = [r.msg for r in caplog.records if r.name == "service.engine"]
             body = {"ego_id": "a", "teammates": ["b"], "defense": {"kind": "group_testing"}}
             refused = await served.http.post("/v1/sessions", json=body)
         assert why in refused.json()["detail"]
         assert str(tmp_path) not in refused.text
-        assert said.startswith("sessions of intersection-mean with group_testing are refused: ")
-        assert why in said
+        assert (said["event"], said["detector"]) == ("group testing is refused", "intersection-mean")
+        assert why in said["why"]
+
+
+async def test_a_detector_without_a_witness_is_told_of(tmp_path, caplog):
+    own = tmp_path / "own.safetensors"
+    for path in (SHIPPED_WEIGHTS, SHIPPED_WEIGHTS.with_suffix(".calibration.json")):
+        shutil.copy(path, own.with_suffix("".join(path.suffixes)))
+    for extra, judged in (((), True), ((str(own),), False)):
+        caplog.clear()
+        async with serve(extra_detectors=extra) as served:
+            said = [r.msg for r in caplog.records if r.name == "service.engine"]
+            (entry,) = await served.client.detectors()
+            session, other = await served.open(), await served.open(defense={"kind": "sample_consensus"})
+            unasked = await served.open(defense={"kind": "group_testing", "judge_objects": False})
+        assert entry["calibration"]["objects_judged"] is judged
+        assert [each.lacks_witness for each in (session, other, unasked)] == [not judged, False, False]
+        assert [(event["event"], event["detector"]) for event in said] == (
+            [] if judged else [("single objects are not judged", "intersection-mean")]
+        )
+        assert all("robosac witness makes one" in event["why"] for event in said)
 
 
 def test_several_extra_detectors_are_separated_by_commas(monkeypatch):

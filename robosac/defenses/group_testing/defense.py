@@ -173,6 +173,11 @@ class GroupTesting:
         return self.model.lie is not None
 
     @property
+    def lacks_witness(self) -> bool:
+        """Whether objects are to be judged, and the detector has no witness for it."""
+        return self.settings.judge_objects and not self.asks_witnesses
+
+    @property
     def consensus_threshold(self) -> float:
         """Jaccard index from which on a subset may be answered without trust."""
         return self.settings.consensus_threshold

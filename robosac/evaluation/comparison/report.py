@@ -6,7 +6,7 @@ from collections.abc import Sequence
 from importlib.metadata import version
 from pathlib import Path
 
-from robosac.calibrated import calibration_digest
+from robosac.calibrated import calibration_digest, without_witness
 from robosac.evaluation.comparison.pictures import draw_passes, draw_precision
 from robosac.evaluation.comparison.playing import Plan
 from robosac.evaluation.comparison.rows import (
@@ -18,6 +18,7 @@ from robosac.evaluation.comparison.rows import (
     Row,
     StandingFigures,
 )
+from robosac.evaluation.comparison.settings import lacks_witness
 from robosac.evaluation.comparison.tables import sections
 from robosac.evaluation.report import Table, write_csv, write_report
 
@@ -68,7 +69,8 @@ def made_by(plan: Plan) -> str:
     """What made the figures besides the command, for whoever cites them."""
     info, calibration = plan.detector.info, calibration_digest(plan.detector.info)
     digests = f"weights {info.weights_digest:.12}" + (f" and calibration {calibration:.12}" if calibration else "")
-    return f"Made by robosac {version('robosac')} with seed {plan.seed}; {info.name}: {digests}."
+    made = f"Made by robosac {version('robosac')} with seed {plan.seed}; {info.name}: {digests}."
+    return f"{made} {without_witness(info.name)}." if lacks_witness(plan.defenses) else made
 
 
 def _flat(row: Row) -> dict[str, object]:

@@ -52,6 +52,11 @@ def built(defenses: Mapping[str, DefenseSettings], detector: Detector) -> tuple[
     return made, left_out
 
 
+def lacks_witness(defenses: Mapping[str, Defense]) -> bool:
+    """Whether any of these defences is to judge single objects, and the detector has no witness for it."""
+    return any(getattr(each, "lacks_witness", False) for each in defenses.values())
+
+
 @dataclass(frozen=True)
 class Setting:
     """What a team is up against."""

@@ -1,9 +1,13 @@
+import shutil
 from dataclasses import replace
 
 import numpy as np
 import pytest
+from typer.testing import CliRunner
 
+from robosac.cli import app
 from robosac.defenses import OneByOne, SampleConsensus
+from robosac.detectors.embedded import SHIPPED_WEIGHTS
 from robosac.evaluation.comparison import Extent, Plan, Setting, compare_defenses
 from robosac.evaluation.comparison.playing import play_scene
 from robosac.evaluation.playing import FaultyDefense
@@ -51,3 +55,17 @@ def test_only_live_defences_are_timed(plan):
     assert one_by_one.milliseconds > 0.0
     recorded = compare_defenses(replace(plan, extent=live.extent))
     assert [row.milliseconds for row in recorded] == [None] * 4
+
+
+@pytest.mark.parametrize("column", ["group_testing", "one_by_one"])
+def test_it_is_said_that_no_objects_are_judged(column, tmp_path):
+    weights = tmp_path / "own.safetensors"
+    for path in (SHIPPED_WEIGHTS, SHIPPED_WEIGHTS.with_suffix(".calibration.json")):
+        shutil.copy(path, weights.with_suffix("".join(path.suffixes)))
+    short = ["--setting", "honest:0", "--scenes", "1", "--frames", "6", "--live"]
+    arguments = ["compare", "--detector", str(weights), "--only", column, *short, "--out", str(tmp_path / "out")]
+    result = CliRunner().invoke(app, arguments, env={"COLUMNS": "200"})
+    assert result.exit_code == 0, result.output
+    told = "intersection-mean has no witness, so group testing judges no single objects with it: robosac witness makes"
+    told_in = told in result.output, told in (tmp_path / "out" / "comparison.md").read_text()
+    assert told_in == ((column == "group_testing"),) * 2
