@@ -19,6 +19,7 @@ from tests.robosac.audit.conftest import KEY, SESSION, head, proof, seal_all
 from tests.service.conftest import serve
 
 NOW = datetime(2025, 1, 1, tzinfo=UTC)
+HARMLESS = ("not_sampled", "missing", "late", "malformed", "stale", "unauthenticated", "replayed")
 
 
 def observations(made):
@@ -97,6 +98,116 @@ def test_a_dissensus_with_the_previous_answer_is_a_conflict_with_other_stations(
     assert [found[2] for found in observations(made)] == [4, 4]
 
 
+def rejecting(event, reason, **fields):
+    (entry,) = [entry for entry in event["rejected"] if entry["vehicle_id"] == "car-2"]
+    others = [other for other in event["rejected"] if other is not entry]
+    return {**event, "rejected": [*others, {"vehicle_id": "car-2", "reason": reason, **fields}]}
+
+
+@pytest.mark.parametrize(
+    ("reason", "fields", "target", "detector_class", "told"),
+    [
+        (
+            "implausible",
+            {"tensor": "features", "largest": 90.0, "rms": None, "most_largest": 20.0, "most_rms": 2.0},
+            "message",
+            1,
+            {"tensor": "features", "largest": 90.0, "rms": None, "mostLargest": 20.0, "mostRms": 2.0},
+        ),
+        (
+            "repeated",
+            {"of_frame": 1, "moved_m": 8.5, "correlation": 1.0},
+            "message",
+            2,
+            {"ofFrame": 1, "movedM": 8.5, "correlation": 1.0},
+        ),
+        ("copied", {"of": "rsu", "of_frame": 1}, "message", 5, {"of": "rsu", "ofFrame": 1}),
+        (
+            "distrusted",
+            {"distrust": "named", "suspicion": 0.99, "evidence": [{"test": "objects"}], "misplaced_m": 1.0},
+            "perception",
+            5,
+            {"suspicion": 0.99, "evidence": [{"test": "objects"}]},
+        ),
+    ],
+)
+def test_what_else_accuses_is_reported_with_its_evidence(events, reason, fields, target, detector_class, told):
+    events[6] = rejecting(events[6], reason, **fields)
+    made = misbehaviour.report(seal_all(events), "car-2", NOW)
+    kind = "named" if reason == "distrusted" else reason
+    assert set(observations(made)) == {("perception", "dissensus", 4, 0), (target, kind, detector_class, 5)}
+    content = made["report"]["content"]
+    seen = content["observations"][-1]["observations"][-1]
+    assert seen["obs"] == {"frame": 5, **told}
+    stream = content["v2xPduEvidence"][seen["v2xPduEvidenceIndex"]]
+    frames = [1, 5] if reason == "repeated" else [5]
+    assert [(pdu["frame"], pdu["digest"]) for pdu in stream["v2xPdus"]] == [
+        (frame, proof("car-2", frame).digest) for frame in frames
+    ]
+    assert stream["subjectPduIndex"] == len(frames) - 1
+    decision, log = content["nonV2xPduEvidence"][-2:]
+    assert (decision["evidence"]["seq"], decision["evidence"]["rejected"]["car-2"]) == (7, reason)
+    assert log["evidence"]["seq"] == [2, 7]
+    assert made["observationLocation"]["frame"] == 5
+
+
+def test_who_is_named_when_its_message_is_refused_is_reported_for_both(events):
+    events[6] = rejecting(events[6], "implausible", tensor="features", distrust="named")
+    made = misbehaviour.report(seal_all(events), "car-2", NOW)
+    assert [found[:2] for found in observations(made) if found[3] == 5] == [
+        ("perception", "named"), ("message", "implausible")
+    ]  # fmt: skip
+    assert len([e for e in made["report"]["content"]["nonV2xPduEvidence"] if e["id"] == "decision"]) == 2
+
+
+@pytest.mark.parametrize(
+    ("reason", "fields"),
+    [
+        *((reason, {}) for reason in HARMLESS),
+        ("not_sampled", {"suspicion": 0.9, "misplaced_m": 2.0}),
+        ("distrusted", {"distrust": "untrusted"}),
+        ("distrusted", {"distrust": "equivocation"}),
+    ],
+)
+def test_what_accuses_nobody_is_not_reported(events, reason, fields):
+    events[1], events[6] = (rejecting(events[i], reason, **fields) for i in (1, 6))
+    with pytest.raises(misbehaviour.NothingToReport, match="car-2"):
+        misbehaviour.report(seal_all(events), "car-2", NOW)
+
+
+async def test_what_a_gateway_refuses_and_names_is_reported(messages):
+    loud = {name: tensor * 1000 for name, tensor in messages["car-2"].tensors.items()}
+    async with serve() as served:
+        session = await served.open(defense={"kind": "group_testing"})
+        ego = served.ego(session)
+        others = {name: message for name, message in messages.items() if name != "car-1"}
+        for frame in range(3):
+            await ego.post_frame(frame, messages["car-1"], {**others, "car-2": Message(messages["car-2"].pose, loud)})
+        lines = [line.encode() for line in await ego.audit_lines()]
+    assert verify(lines) == []
+    made = misbehaviour.report(lines, "car-2", NOW)
+    assert observations(made) == [
+        *(("message", "implausible", 1, frame) for frame in range(3)), ("perception", "named", 5, 2)
+    ]  # fmt: skip
+    obs = made["report"]["content"]["observations"][0]["observations"][0]["obs"]
+    assert obs["largest"] > obs["mostLargest"]
+
+
+async def test_who_is_named_by_a_gateway_is_reported(ego_message, attacked):
+    async with serve() as served:
+        session = await served.open(defense={"kind": "group_testing"})
+        ego = served.ego(session)
+        answers = [await ego.post_frame(frame, ego_message, attacked) for frame in range(4)]
+        lines = [line.encode() for line in await ego.audit_lines()]
+    assert answers[-1].named == ("car-2",)
+    made = misbehaviour.report(lines, "car-2", NOW)
+    named = [found["obs"] for target in made["report"]["content"]["observations"]
+             for found in target["observations"] if found["obsId"] == "named"]  # fmt: skip
+    assert [obs["frame"] for obs in named] == [answer.frame for answer in answers if answer.named]
+    assert named[0]["evidence"]
+    assert named[0]["suspicion"] > 0.5
+
+
 def test_the_key_reported_is_that_of_the_time(events):
     other = show_public_key(Ed25519PrivateKey.from_private_bytes(bytes(31) + b"\x02"))
     events[5] = {**events[5], "public_keys": {"rsu": other}}
@@ -142,7 +253,7 @@ def test_the_command_writes_a_report_from_a_sound_log_only(lines, tmp_path):
     assert printed == fields
     code, said = run(log, "--vehicle", "car-3")
     assert code == 1
-    assert "neither a dissensus nor an equivocation of car-3" in said
+    assert "nothing to report of car-3: no dissensus, no naming as an attacker" in said
     code, said = run(log, "--vehicle", "car-9")
     assert code == 2
     assert "car-9 was never in the session; these were: car-1, car-2, rsu, car-3, car-4" in said
