@@ -6,6 +6,7 @@ import math
 import time
 from collections.abc import Callable, Collection, Iterator
 from contextlib import contextmanager
+from numbers import Integral, Real
 
 SAFETY = 1.2
 """A pass is begun only if this multiple of the dearest one so far still fits."""
@@ -24,6 +25,11 @@ class Deadline:
         How many may be tested, however much time there is.
     clock : callable
         Monotonic, seconds.
+
+    Raises
+    ------
+    TypeError, ValueError
+        If ``at`` is no time, ``reserve_s`` is no finite number from 0 on, or ``hypotheses`` no whole number from 0 on.
     """
 
     def __init__(
@@ -33,6 +39,17 @@ class Deadline:
         clock: Callable[[], float] = time.perf_counter,
         hypotheses: int | None = None,
     ) -> None:
+        for name, seconds in (("at", at), ("reserve_s", reserve_s)):
+            if isinstance(seconds, bool) or not isinstance(seconds, Real):
+                raise TypeError(f"{name} must be a number of seconds, got {seconds!r}")
+        if math.isnan(at):
+            raise ValueError("at must be a time or infinite, got nan")
+        if not 0 <= reserve_s < math.inf:
+            raise ValueError(f"reserve_s must be at least 0 and finite, got {reserve_s}")
+        if hypotheses is not None and (isinstance(hypotheses, bool) or not isinstance(hypotheses, Integral)):
+            raise TypeError(f"hypotheses must be a whole number or None, got {hypotheses!r}")
+        if hypotheses is not None and hypotheses < 0:
+            raise ValueError(f"hypotheses must be at least 0, got {hypotheses}")
         self.clock = clock
         self._end = at - reserve_s
         self._dearest_s = self._paused_s = 0.0

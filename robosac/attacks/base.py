@@ -72,11 +72,12 @@ class Attack(ABC):
         for parameter in fields(self):
             name, value = parameter.name, getattr(self, parameter.name)
             kind = getattr(parameter.type, "__name__", parameter.type)  # a text where annotations are not evaluated
-            if kind == "int" and not isinstance(value, Integral):
+            is_number = isinstance(value, Real) and not isinstance(value, bool)
+            if kind == "int" and not (is_number and isinstance(value, Integral)):
                 raise ValueError(f"{name} must be a whole number, got {value!r}")
-            if kind == "float" and not isinstance(value, Real):
+            if kind == "float" and not is_number:
                 raise ValueError(f"{name} must be a number, got {value!r}")
-            if isinstance(value, Real) and not 0 < float(value) < math.inf:
+            if is_number and not 0 < float(value) < math.inf:
                 raise ValueError(f"{name} must be positive and finite, got {value}")
 
     @abstractmethod

@@ -106,7 +106,9 @@ def split_precision(name: str) -> tuple[str, Precision]:
 
 
 def in_precision(info: DetectorInfo, precision: Precision) -> DetectorInfo:
-    """The face of the same detector in another precision."""
+    """The face of the same detector in another precision; `ValueError` for what is none."""
+    if precision not in get_args(Precision):
+        raise ValueError(f"precision must be one of {', '.join(get_args(Precision))}, got {precision!r}")
     plain, _ = split_precision(info.name)
     return replace(info, name=plain if precision == "float32" else f"{plain}@{precision}", precision=precision)
 
@@ -251,7 +253,13 @@ class Precise(Protocol):
     """What can decode in more than one precision."""
 
     def in_precision(self, precision: Precision) -> Self:
-        """The same detector in another precision; it shares the weights."""
+        """The same detector in another precision; it shares the weights.
+
+        Raises
+        ------
+        ValueError
+            If that is no precision.
+        """
 
 
 @runtime_checkable

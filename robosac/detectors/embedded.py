@@ -102,9 +102,9 @@ class EmbeddedDetector(MapFusionDetector):
     def in_precision(self, precision: Precision) -> Self:
         """As `robosac.detectors.base.Precise.in_precision`; messages stay as they are."""
         other = copy(self)
+        other.info = in_precision(self.info, precision)
         other._dtype = getattr(torch, precision)
         other._narrow = deepcopy(self._network).to(other._dtype)
-        other.info = in_precision(self.info, precision)
         other.place()
         return other
 

@@ -9,6 +9,7 @@ from __future__ import annotations
 import os
 from pathlib import Path
 from traceback import extract_tb
+from typing import get_args
 
 from robosac.detectors.base import (
     DEFAULT_DETECTOR,
@@ -18,6 +19,7 @@ from robosac.detectors.base import (
     Joining,
     Placeable,
     Precise,
+    Precision,
     PreparedFrame,
     Preparer,
     blank,
@@ -113,12 +115,17 @@ def _load(detector: str) -> Detector:
     plain, precision = split_precision(detector)
     there = os.path.exists(detector)  # noqa: PTH110 (Path raises for a long name)
     if plain != detector and not there:
+        if split_precision(plain)[0] != plain and not os.path.exists(plain):  # noqa: PTH110 (as above)
+            raise ValueError(f"{detector} names more than one precision")
         loaded = _load(plain)
         if not isinstance(loaded, Precise):
             raise ValueError(f"{plain} cannot decode in {precision}: it has no method in_precision")
         return loaded.in_precision(precision)
     if detector not in DETECTORS.shipped and there:
         return _open_weights(Path(detector))
+    whole, _, last = detector.rpartition("@")
+    if whole in DETECTORS.shipped or whole.endswith(".safetensors"):
+        raise ValueError(f"{detector}: the precision must be one of {', '.join(get_args(Precision))}, got {last!r}")
     if detector.endswith(".safetensors") or "/" in detector:
         raise WeightsError(f"there is no file {detector}")
     made = DETECTORS.make(detector)

@@ -1,7 +1,7 @@
 """Mistakes of a caller are told by the argument's name, and not answered as faults."""
 
 import json
-from dataclasses import replace
+from dataclasses import dataclass, replace
 from typing import Any, Literal
 
 import numpy as np
@@ -11,6 +11,7 @@ import torch
 import robosac
 from robosac.audit import verify
 from robosac.budget import DomainError
+from robosac.deadline import Deadline
 from robosac.defenses import Halving, SampleConsensus, build
 from robosac.detectors import Message
 from robosac.detectors.v2xsim.voxels import occupancy as v2xsim_occupancy
@@ -175,6 +176,8 @@ def test_an_attack_names_the_parameter_that_cannot_be():
     for wrong, told in (
         ({"epsilon": "x"}, "epsilon must be a number, got 'x'"),
         ({"epsilon": None}, "epsilon must be a number"),
+        ({"epsilon": True}, "epsilon must be a number, got True"),
+        ({"steps": True}, "steps must be a whole number, got True"),
         ({"epsilon": float("inf")}, "epsilon must be positive and finite"),
         ({"epsilon": float("nan")}, "epsilon must be positive and finite"),
         ({"steps": 1.5}, r"steps must be a whole number, got 1\.5"),
@@ -184,6 +187,55 @@ def test_an_attack_names_the_parameter_that_cannot_be():
         with pytest.raises(ValueError, match=f"^{told}"):
             robosac.PGD(**wrong)
     assert robosac.PGD(epsilon=1, steps=np.int64(3)).steps == 3
+
+
+def test_an_attack_may_have_a_parameter_that_is_no_number():
+    @dataclass(frozen=True)
+    class Own(robosac.PGD):
+        loud: bool = False
+
+    assert Own().loud is False
+
+
+@pytest.mark.parametrize(
+    ("name", "told"),
+    [
+        ("intersection-mean@foo", "intersection-mean@foo: the precision must be one of float32, .*, got 'foo'"),
+        ("nowhere/own.safetensors@foo", ".*: the precision must be one of float32, bfloat16, float16, got 'foo'"),
+        ("intersection-mean@bfloat16@float16", "intersection-mean@bfloat16@float16 names more than one precision"),
+        ("nowhere/@own.safetensors", "there is no file nowhere/@own.safetensors"),
+    ],
+)
+def test_a_precision_that_cannot_be_is_told(name, told):
+    with pytest.raises(ValueError, match=f"^{told}$"):
+        robosac.load_detector(name)
+
+
+@pytest.mark.parametrize("precision", ["float64", "foo", None, 16])
+def test_a_detector_decodes_in_no_precision_that_is_not_checked(precision, detector):
+    told = f"precision must be one of float32, bfloat16, float16, got {precision!r}"
+    with pytest.raises(ValueError, match=f"^{told}$"):
+        detector.in_precision(precision)
+
+
+@pytest.mark.parametrize(
+    ("wrong", "error", "told"),
+    [
+        ({"at": float("nan")}, ValueError, "at must be a time or infinite, got nan"),
+        ({"at": "soon"}, TypeError, "at must be a number of seconds, got 'soon'"),
+        ({"at": None}, TypeError, "at must be a number of seconds, got None"),
+        ({"reserve_s": float("nan")}, ValueError, "reserve_s must be at least 0 and finite, got nan"),
+        ({"reserve_s": float("inf")}, ValueError, "reserve_s must be at least 0 and finite, got inf"),
+        ({"reserve_s": -0.1}, ValueError, "reserve_s must be at least 0 and finite, got -0.1"),
+        ({"reserve_s": True}, TypeError, "reserve_s must be a number of seconds, got True"),
+        ({"hypotheses": -1}, ValueError, "hypotheses must be at least 0, got -1"),
+        ({"hypotheses": 1.5}, TypeError, r"hypotheses must be a whole number or None, got 1\.5"),
+        ({"hypotheses": True}, TypeError, "hypotheses must be a whole number or None, got True"),
+    ],
+)
+def test_a_deadline_names_the_argument_that_cannot_be(wrong, error, told):
+    with pytest.raises(error, match=f"^{told}$"):
+        Deadline(**wrong)
 
 
 def test_a_scene_names_the_number_that_cannot_be():
