@@ -21,6 +21,7 @@ from clients.load_test import prepare
 
 REPORT = "crash_test.json"
 PREPARED_FRAMES = 4
+DATABASES = ("sqlite", "postgresql", "postgresql+asyncpg")
 
 
 def show(console: Console, sessions: int, kills: Sequence[Kill]) -> None:
@@ -40,6 +41,17 @@ def show(console: Console, sessions: int, kills: Sequence[Kill]) -> None:
             console.print(f"kill {number} ({kill.incident.value}): {complaint}", style="red", markup=False)
 
 
+def checked_database(url: str | None) -> str | None:
+    """The URL of a database that gateways take, as an option has it. It is not shown, as it may hold a password."""
+    if url is not None:
+        kind, found, _ = url.partition("://")
+        if not found:
+            raise typer.BadParameter("not a database URL")
+        if kind not in DATABASES:
+            raise typer.BadParameter(f"a database must be one of {', '.join(DATABASES)}, not {kind}")
+    return url
+
+
 def main(
     kills: Annotated[int, typer.Option(min=1, help="Rounds; each ends with a kill.")] = 21,
     sessions: Annotated[int, typer.Option(min=1, help="Sessions, with one defence after another.")] = 5,
@@ -47,7 +59,9 @@ def main(
     incidents: Annotated[
         list[Incident] | None, typer.Option("--incident", help="What happens in the rounds; by default all in turn.")
     ] = None,
-    database_url: Annotated[str | None, typer.Option(help="By default SQLite in a temporary folder.")] = None,
+    database_url: Annotated[
+        str | None, typer.Option(callback=checked_database, help="By default SQLite in a temporary folder.")
+    ] = None,
     out: trial.Out = None,
     force: trial.Force = False,
 ) -> None:

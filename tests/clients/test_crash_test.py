@@ -105,6 +105,22 @@ def test_a_damaged_file_is_found_out(tmp_path):
     assert "could not be backed up" in complaint
 
 
+@pytest.mark.parametrize(
+    ("url", "told"),
+    [
+        ("mysql://u:secret@x/y", "a database must be one of sqlite, postgresql, postgresql+asyncpg, not mysql"),
+        ("secret", "not a database URL"),
+    ],
+)
+def test_a_database_that_no_gateway_takes_is_refused(url, told):
+    app = typer.Typer()
+    app.command()(main)
+    result = CliRunner().invoke(app, ["--database-url", url], env={"COLUMNS": "200"})
+    assert result.exit_code == 2
+    assert told in result.output
+    assert "secret" not in result.output
+
+
 def test_only_a_sqlite_file_is_backed_up(tmp_path):
     assert sqlite.path_of("sqlite:////data/robosac.db?timeout=3") == Path("/data/robosac.db")
     url = "postgresql://nobody@/x"
