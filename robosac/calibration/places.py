@@ -6,7 +6,7 @@ from dataclasses import dataclass
 
 import numpy as np
 
-from robosac.boxes import FloatArray, pairwise_iou
+from robosac.boxes import BoolArray, FloatArray, pairwise_iou
 from robosac.scenes import View
 
 STANDARD = (4.5, 1.9, 1.55)
@@ -47,6 +47,11 @@ class Places:
     """(n,): returns that would have come from a car there."""
     box: FloatArray
     """(n, 5): the vehicle; zeros where there is none."""
+
+    @property
+    def observed_vehicles(self) -> BoolArray:
+        """Which of them (n,) are vehicles that were observed."""
+        return (self.vehicle > 0) & (self.hits >= OBSERVED_HITS)
 
 
 def places(view: View, truth: FloatArray, half_extent_m: float, rng: np.random.Generator) -> Places:

@@ -85,7 +85,13 @@ def training_scenes(source: SceneSource, count: int) -> Sequence[Scene]:
 def lessons(
     detector: Encoder, layout: Layout, scenes: Sequence[Scene], recipe: WitnessRecipe, tick: Callable[[], None]
 ) -> list[Lesson]:
-    """Encode scans and draw places. ``tick`` is called after each frame."""
+    """Encode scans and draw places. ``tick`` is called after each frame.
+
+    Raises
+    ------
+    robosac.scenes.SceneError
+        If no vehicle was observed in any scan: nothing could be learned from them, nor checked.
+    """
     rng = np.random.default_rng([recipe.seed, _PLACES])
     learned = []
     for scene in scenes:
@@ -97,6 +103,8 @@ def lessons(
                 known = places(view, frame.truth(agent)[:, :5], layout.half_extent_m, rng)
                 learned.append(Lesson(sent, float(view.pose[2, 3]), known))
             tick()
+    if not any(each.places.observed_vehicles.any() for each in learned):
+        raise SceneError(f"no vehicle has {OBSERVED_HITS} returns in any of {len(learned)} scans: a witness needs some")
     return learned
 
 
@@ -184,7 +192,7 @@ def _loss(
         which.append(np.full(len(known.at), number))
         vehicle.append(known.vehicle)
         weight.append(weights[(known.hits >= OBSERVED_HITS).astype(int), known.vehicle.astype(int)])
-        seen = known.box[(known.vehicle > 0) & (known.hits >= OBSERVED_HITS)]
+        seen = known.box[known.observed_vehicles]
         aside = rng.uniform(-1, 1, (len(seen), 2)) * SIGHTED_M
         cos, sin = np.cos(seen[:, 4]), np.sin(seen[:, 4])
         x = seen[:, 0] + aside[:, 0] * cos - aside[:, 1] * sin

@@ -42,7 +42,7 @@ def check(witness: Witness, held_out: Sequence[Lesson]) -> WitnessCheck:
             maps = witness.read(witness.layout.scaled(lesson.map[None].float()), [lesson.height_m]).half().numpy()
         testimony = as_testimony(("",), maps, np.eye(3)[None], witness.layout.half_extent_m)
         said.append(testimony.likelihood(lesson.places.at)[0])
-        box = lesson.places.box[(lesson.places.vehicle > 0) & (lesson.places.hits >= OBSERVED_HITS)]
+        box = lesson.places.box[lesson.places.observed_vehicles]
         d = testimony.sighting(box[:, :2]).centre[0] - box[:, :2]
         cos, sin = np.cos(box[:, 4]), np.sin(box[:, 4])
         off.append(np.stack([d[:, 0] * cos + d[:, 1] * sin, d[:, 1] * cos - d[:, 0] * sin], axis=1))

@@ -1,10 +1,12 @@
 """A witness learns a world in which everything observed is plain to see."""
 
 from dataclasses import replace
+from types import SimpleNamespace
 
 import numpy as np
 import pytest
 import torch
+from typer.testing import CliRunner
 
 from robosac.calibration.places import OBSERVED_HITS, Places
 from robosac.calibration.witness import (
@@ -17,10 +19,13 @@ from robosac.calibration.witness import (
     usual_size,
 )
 from robosac.calibration.witness_check import check
+from robosac.cli import app
 from robosac.detectors import DetectorInfo, Message, TensorSpec, load
 from robosac.detectors.witness import Witness
 from robosac.detectors.witness_network import Layout, WitnessNetwork
 from robosac.scenes import IntersectionScene, SceneError, View
+from robosac.scenes.base import SceneAround
+from robosac.scenes.intersection import Synthetic
 
 CELLS, HALF_EXTENT_M = 12, 12.0  # cells of 2 m
 RECIPE = WitnessRecipe(epochs=15, batch=8, learning_rate=1e-2, seed=1)
@@ -157,6 +162,31 @@ def test_lessons_are_all_agents_messages_and_what_is_there(detector):
     }
     scaled = torch.stack([here.scaled(each.map.float()) for each in learned])
     assert 0.5 < float(scaled.pow(2).mean().sqrt()) < 2.0
+
+
+class Blind(Synthetic):
+    """Scenes in which no scan has a return."""
+
+    name = "blind"
+
+    def training_scenes(self):
+        return [BlindScene(scene) for scene in super().training_scenes()]
+
+
+class BlindScene(SceneAround):
+    def frame(self, index):
+        frame = self.scene.frame(index)
+        views = {name: replace(view, points=view.points[:0]) for name, view in frame.views.items()}
+        return SimpleNamespace(index=index, views=views, truth=frame.truth)
+
+
+def test_scans_without_returns_make_no_witness(tmp_path):
+    out, data = tmp_path / "x.safetensors", f"{__name__}:Blind"
+    short = ["--scenes", "1", "--check-scenes", "1", "--frames", "1", "--epochs", "1"]
+    result = CliRunner().invoke(app, ["witness", "--out", str(out), "--data", data, *short], env={"COLUMNS": "200"})
+    assert result.exit_code == 2, result.output
+    assert "Invalid value for --data: no vehicle has 6 returns in any of 6 scans: a witness needs some" in result.output
+    assert not out.exists()
 
 
 @pytest.mark.parametrize(
