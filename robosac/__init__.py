@@ -29,8 +29,10 @@ if TYPE_CHECKING:
     from robosac.fusion import FusionResult, fuse
     from robosac.scenes import IntersectionScene
     from robosac.session import Session
+
+    __version__: str
 else:
-    __getattr__, __dir__ = lazily(
+    _find, __dir__ = lazily(
         __name__,
         {
             "FusionResult": "robosac.fusion:FusionResult",
@@ -43,5 +45,13 @@ else:
             "load_detector": "robosac.detectors:load",
         },
     )
+
+    def __getattr__(name: str) -> object:
+        if name != "__version__":
+            return _find(name)
+        from importlib import metadata  # noqa: PLC0415 (it takes longer than all of this)
+
+        return metadata.version(__name__)
+
 
 __all__ = ["PGD", "FusionResult", "IntersectionScene", "Message", "SampleConsensus", "Session", "fuse", "load_detector"]

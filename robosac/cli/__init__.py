@@ -2,17 +2,17 @@
 
 from __future__ import annotations
 
-from importlib import metadata
 from typing import Annotated
 
 import typer
 
+import robosac
 from robosac.cli.commands import Commands
 
 
 def _show_version(wanted: bool) -> None:
     if wanted:
-        typer.echo(metadata.version("robosac"))
+        typer.echo(robosac.__version__)
         raise typer.Exit
 
 

@@ -1,9 +1,12 @@
 import subprocess
 import sys
 from importlib import import_module
+from importlib.metadata import version
 from pkgutil import iter_modules
 
 import pytest
+
+import robosac
 
 HEAVY = ("torch", "scipy", "matplotlib")
 
@@ -47,6 +50,10 @@ again = [name for name in package.__all__ if name not in vars(package)]
 assert not again, again
 """
     subprocess.run([sys.executable, "-c", code], check=True)
+
+
+def test_the_version_is_that_of_the_installation():
+    assert robosac.__version__ == version("robosac")
 
 
 @pytest.mark.parametrize("package", ["robosac", "robosac.detectors"])
