@@ -117,6 +117,8 @@ class Attack(ABC):
 class IterativeAttack(Attack):
     """Descend an objective for a number of steps, staying within the bound.
 
+    The bound holds around the messages that `around` gives.
+
     1. ``variables = start()``.
     2. Repeat ``steps`` times: the optimiser moves the variables along ``normalise(gradient of objective)``; then
        ``variables = project(variables)``.
@@ -164,7 +166,7 @@ class IterativeAttack(Attack):
         warm : bool
             Whether to begin with the variables that the frame before ended with, and to keep those of this frame.
         """
-        clean = of_attackers(surface.messages, attackers)
+        clean = self.around(surface, attackers, situation)
         if not clean or not self.prepare(surface, clean, rng, situation):
             return {}
         harm = self.aim(surface, clean, situation)
@@ -184,7 +186,7 @@ class IterativeAttack(Attack):
 
     def descend(self, aim: Aim, start: Tensors, clean: Tensors) -> Tensors:
         """The loop: from these variables to such at which the aim is small, the messages within the bound around these
-        benign ones.
+        clean ones.
         """
         variables = {name: v.requires_grad_(True) for name, v in start.items()}
         optimiser = self.optimiser(list(variables.values()))
@@ -201,6 +203,15 @@ class IterativeAttack(Attack):
                 for variable in variables.values():
                     variable.copy_(self.project(variable))
         return variables
+
+    def around(
+        self,
+        surface: AttackSurface,
+        attackers: Collection[str],
+        situation: Situation,  # noqa: ARG002
+    ) -> dict[str, torch.Tensor]:
+        """What perturbations are added to; by default the attackers' benign messages. Who is missing is honest."""
+        return of_attackers(surface.messages, attackers)
 
     def prepare(
         self,

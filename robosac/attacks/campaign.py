@@ -117,8 +117,9 @@ class Campaign:
             raise ValueError(f"only an attack that optimises can be soft, not {self.name}")
         if self.words is not None and not self.softness:
             raise ValueError("only an attack that is soft pays for words")
-        if self.bound != 1.0 and (self.attack is None or not self.attack.bounded):
-            raise ValueError(f"only an attack with a bound can have another one, not {self.name}")
+        if self.bound != 1.0 and not self._bounded:
+            unless = " unless it has an alibi or is soft" if isinstance(self.attack, IterativeAttack) else ""
+            raise ValueError(f"only an attack with a bound can have another one, not {self.name}{unless}")
         if self.alibi is not None and not isinstance(self.attack, IterativeAttack):
             raise ValueError(f"only an attack that optimises can have an alibi, not {self.name}")
 
@@ -131,6 +132,14 @@ class Campaign:
     def name(self) -> str:
         """The attack's."""
         return self.attack.name if self.attack is not None else HONEST
+
+    @property
+    def _pretends(self) -> bool:
+        return bool(self.softness) or self.alibi is not None
+
+    @property
+    def _bounded(self) -> bool:
+        return self.attack is not None and (self.attack.bounded or self._pretends)
 
     @property
     def epsilon(self) -> float:
@@ -151,7 +160,7 @@ class Campaign:
     def needs(self) -> tuple[str, ...]:
         """What the attack, its alibi and penalties call of an attack surface; see `Attack.needs`."""
         needs = self.attack.needs if self.attack is not None else ()
-        return (*needs, *SHOWN) if self.alibi is not None or self.softness else needs
+        return (*needs, *SHOWN) if self._pretends else needs
 
     def messages(
         self,
@@ -219,7 +228,7 @@ class Campaign:
         if self.attack is None:
             return {}
         attack = self.attack if self.bound == 1.0 else replace(self.attack, epsilon=self.epsilon)
-        if not isinstance(attack, IterativeAttack) or not (self.softness or self.alibi):
+        if not isinstance(attack, IterativeAttack) or not self._pretends:
             return attack.run(surface, acting, rng, situation)
         terms = keeping(self.alibi, surface, acting) if self.alibi is not None else []
         if self.softness:

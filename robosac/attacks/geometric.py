@@ -32,10 +32,11 @@ class Perception:
     """Of the same shape and six more, as `robosac.detectors.base.GeometricSurface.perceive` gives it."""
 
     @classmethod
-    def of(cls, surface: AttackSurface, team: Collection[str]) -> Perception:
-        """Of the benign messages of these teammates."""
+    def of(cls, surface: AttackSurface, team: Collection[str], sent: Tensors | None = None) -> Perception:
+        """Of these teammates' messages: those that are sent, of all others the benign ones."""
+        met = {**surface.messages, **(sent or {})}
         with torch.no_grad():
-            logits, geometry = geometric(surface).perceive({name: surface.messages[name] for name in team})
+            logits, geometry = geometric(surface).perceive({name: met[name] for name in team})
         return cls(torch.sigmoid(logits), geometry)
 
 

@@ -1,4 +1,7 @@
-"""Replays: true maps of another time, place or sender. They optimise nothing, and keep to no bound."""
+"""Replays: true maps of another time, place or sender.
+
+They optimise nothing, and keep to no bound, unless they have something to pretend (`robosac.attacks.campaign`).
+"""
 
 from __future__ import annotations
 
@@ -10,7 +13,8 @@ from typing import ClassVar
 import numpy as np
 import torch
 
-from robosac.attacks.base import Attack
+from robosac.attacks.base import Aim, IterativeAttack
+from robosac.attacks.geometric import Perception, unnoticed
 from robosac.attacks.returned import of_attackers
 from robosac.attacks.situation import Situation
 from robosac.detectors.base import AttackSurface, Message
@@ -18,6 +22,7 @@ from robosac.detectors.base import AttackSurface, Message
 STALE_S = 1.0
 """Age of the map that `Stale` sends, seconds."""
 _FIRST = "first"
+_REPLAYED = "replayed"
 
 
 @dataclass(frozen=True)
@@ -36,14 +41,21 @@ class Heard:
 
 
 @dataclass(frozen=True)
-class Replay(Attack):
+class Replay(IterativeAttack):
     """Each attacker sends a map that is not of this frame and view, under its own present pose.
 
-    An attacker that has none to send is honest. ``epsilon`` bounds nothing here.
+    An attacker that has none to send is honest. By itself a replay is that map, and the parameters say nothing. With an
+    alibi or penalties (`robosac.attacks.Campaign`) it is optimised for them, within ``epsilon`` of that map. What it
+    minimises besides is how far the fusion of the whole team is from the one with that map (`unnoticed`). So its harm
+    stays.
     """
 
+    needs: ClassVar[tuple[str, ...]] = ()
     remembers: ClassVar[bool] = True
     bounded: ClassVar[bool] = False
+
+    steps: int = 30
+    step_size: float = 0.04
 
     @abstractmethod
     def replayed(self, name: str, heard: Heard) -> torch.Tensor | None:
@@ -57,12 +69,30 @@ class Replay(Attack):
         situation: Situation | None = None,
     ) -> dict[str, torch.Tensor]:
         """Look each attacker's map up."""
-        heard, sent = Heard(surface.messages, attackers, situation or Situation()), {}
+        return self.around(surface, attackers, situation or Situation())
+
+    def around(
+        self, surface: AttackSurface, attackers: Collection[str], situation: Situation
+    ) -> dict[str, torch.Tensor]:
+        """The maps themselves."""
+        heard, sent = Heard(surface.messages, attackers, situation), {}
         for name, own in of_attackers(surface.messages, attackers).items():
             found = self.replayed(name, heard)
             if found is not None and found.shape == own.shape and not torch.equal(found, own):
                 sent[name] = found
         return sent
+
+    def aim(self, surface: AttackSurface, attackers: Collection[str], situation: Situation) -> Aim:
+        """The fusion of the whole team as it is under the replays."""
+        maps = self.around(surface, attackers, situation)
+        (shown,) = situation.once(_REPLAYED, lambda: (Perception.of(surface, surface.messages, maps),))
+        return lambda sent, delta: unnoticed(surface, surface.messages, sent, shown)  # noqa: ARG005
+
+
+def replayed(situation: Situation) -> tuple[Perception, ...]:
+    """What the ego makes of all messages while they hold replays as they are; nothing if the attack is none."""
+    shown: tuple[Perception, ...] = situation.once(_REPLAYED, tuple)
+    return shown
 
 
 @dataclass(frozen=True)

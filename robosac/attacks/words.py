@@ -17,6 +17,7 @@ from robosac.attacks.base import Tensors
 from robosac.attacks.hearing import Heard, Hearing, NoWitness
 from robosac.attacks.objects import View
 from robosac.attacks.penalties import peaks
+from robosac.attacks.replays import replayed
 from robosac.attacks.situation import Lie, Situation
 from robosac.boxes import FloatArray
 from robosac.detectors.base import AttackSurface
@@ -70,10 +71,13 @@ class Speech:
     def of(
         cls, situation: Situation, surface: AttackSurface, attackers: Iterable[str], spoken: Sequence[Spoken]
     ) -> Speech:
-        """That these boxes are spoken of so, and all others honestly: true vehicles, and what ego or team show."""
+        """That these boxes are spoken of so, and all others honestly: true vehicles, and what ego or team show, that
+        with replays among them.
+        """
         hearing, view = hearing_in(situation), View.of(surface, situation)
         boxes = np.array([box[:5] for box, _ in spoken]).reshape(-1, 5)
-        shown = [peaks(torch.logit(seen.scores, eps=1e-6), seen.geometry)[:, :5] for seen in (view.ego, view.honest)]
+        seen = (view.ego, view.honest, *replayed(situation))
+        shown = [peaks(torch.logit(each.scores, eps=1e-6), each.geometry)[:, :5] for each in seen]
         vehicles, others = situation.truth[:, :5], np.vstack(shown)
         kept_boxes = [vehicles[_apart(vehicles, boxes) > SAME_M], others[_apart(others, boxes) > APART_M]]
         kept = torch.from_numpy(np.vstack(kept_boxes)).float()

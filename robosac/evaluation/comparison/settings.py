@@ -115,6 +115,11 @@ FULL = Extent(
         dim:1 jump:1 turn:1 stretch:1 ghost-beside:1
         frozen:1 stale:1 elsewhere:1 copy:1 shift@soft:1 shift@soft:2 shift@soft3:1 erase@soft3:1
         ghost-hidden:1 ghost-framing@vouching:1 deny:1 ghost@denying:1 remove@denying:1 ghost@vouching:2
+        displace@soft:1 displace@denying:1 displace@denying:2 displace@denying@double:1 displace@denying@double:2
+        frozen@soft:1 frozen@denying:1 frozen@denying:2 frozen@denying@double:1 frozen@denying@double:2
+        stale@soft:1 stale@denying:1 stale@denying:2 stale@denying@double:1 stale@denying@double:2
+        elsewhere@soft:1 elsewhere@denying:1 elsewhere@denying:2 elsewhere@denying@double:1 elsewhere@denying@double:2
+        copy@soft:1 copy@denying:1 copy@denying:2 copy@denying@double:1 copy@denying@double:2
     """),
     scenes=40,
     frames=25,

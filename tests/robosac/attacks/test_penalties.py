@@ -152,9 +152,8 @@ def test_twice_the_bound(detector, messages):
     ("spec", "complaint"),
     [
         ("noise@soft", "can be soft, not noise"),
-        ("frozen@soft3", "can be soft, not frozen"),
         ("honest@double", "with a bound can have another one, not honest"),
-        ("copy@double", "with a bound can have another one, not copy"),
+        ("copy@double", "with a bound can have another one, not copy unless it has an alibi or is soft"),
     ],
 )
 def test_who_cannot_be_soft_or_stronger_is_told(spec, complaint):

@@ -173,8 +173,8 @@ def test_a_campaign_with_words_is_soft_and_says_what_it_lacks(detector):
     assert not load_campaign("shift@soft").hears
     with pytest.raises(ValueError, match="soft pays for words"):
         Campaign(PGD(), words=words.denying)
-    with pytest.raises(ValueError, match="can be soft, not frozen"):
-        load_campaign("frozen@denying")
+    with pytest.raises(ValueError, match="can be soft, not noise"):
+        load_campaign("noise@denying")
     with pytest.raises(NoWitness, match="robosac witness"):
         words.denying(Situation(), Linear(), {})
     assert lacking(campaign, detector) is None

@@ -238,6 +238,12 @@ def test_all_settings_can_be_made_and_attackers_leave_somebody_honest():
     assert set(QUICK.settings) <= set(FULL.settings)
 
 
+@pytest.mark.parametrize("attack", ["displace", "frozen", "stale", "elsewhere", "copy"])
+def test_a_full_comparison_plays_attacks_that_pretend_by_one_and_two_at_one_and_two_bounds(attack):
+    pretending = {Setting(f"{attack}@denying{bound}", attackers) for bound in ("", "@double") for attackers in (1, 2)}
+    assert {Setting(attack, 1), Setting(f"{attack}@soft", 1), *pretending} <= set(FULL.settings)
+
+
 def test_the_command(tmp_path):
     short = ["--setting", "honest:0", "--scenes", "1", "--frames", "6"]
     only = ["--only", "halving", "--only", "no defence"]
