@@ -48,9 +48,7 @@ CLOCK_MS = 5.0
 YIELDS = 5
 """By how much the attack's process is nicer than the ego's, with which it shares a core."""
 RECOVERED_WITHIN = 2
-"""Frames after a fault of the store by which an answer has to be tested and in time again."""
-
-
+"""Frames after a fault by which an answer has to be tested and in time again."""
 _sent_at: ContextVar[float] = ContextVar("sent_at")
 
 
