@@ -20,7 +20,7 @@ from robosac.answers import Reason, Source, Verdict
 from robosac.arguments import check_deadline, check_defense, check_frame, check_rng
 from robosac.boxes import FloatArray, pose_fault
 from robosac.calibrated import witness_of
-from robosac.consensus import at_least, compare
+from robosac.consensus import at_least, compare, overlaps
 from robosac.deadline import Deadline
 from robosac.defenses import (
     EGO,
@@ -131,6 +131,7 @@ class FrameRun:
     unread: tuple[str, ...] = ()
     out_of_time: bool = False
     fault: str | None = None
+    _overlaps: dict[Hypothesis, tuple[FloatArray, FloatArray]] = field(default_factory=dict)
 
     def answer(
         self, teammates: Mapping[str, Message], rng: np.random.Generator, state: State | None
@@ -261,12 +262,26 @@ class FrameRun:
             with self._spending("consensus"):
                 said = self.testimony if self.defense.reference is Reference.EGO else None
                 known = None if said is None else partial(said.known_to, EGO)
-                comparison = compare(reference, self._confident(boxes), self.defense.consensus_threshold, known)
+                confident, iou = self._beside(reference, subset, boxes, passes.ahead)
+                comparison = compare(reference, confident, self.defense.consensus_threshold, known, iou)
             index, verdict = comparison.jaccard_index, comparison.verdict
             seen = (boxes, reference, self.ego.pose, self.frame, self.testimony, self.boxes.get(()))
             tested.append(Outcome(subset, index, verdict, *seen))
             self.outcomes.append(tested[-1])
         return tested
+
+    def _beside(
+        self, reference: FloatArray, subset: Hypothesis, boxes: FloatArray, ahead: Mapping[Hypothesis, FloatArray]
+    ) -> tuple[FloatArray, FloatArray]:
+        """A subset's confident boxes, and their IoU with the reference's, which is the same all through the frame.
+
+        It is found with that of all that was decoded with the subset: they are likely to be asked for.
+        """
+        if subset not in self._overlaps:
+            of = {subset: boxes} | {other: ahead[other] for other in ahead if other not in self._overlaps}
+            confident = [self._confident(each) for each in of.values()]
+            self._overlaps |= zip(of, zip(confident, overlaps(reference, confident), strict=True), strict=True)
+        return self._overlaps[subset]
 
     def _reference(self, passes: Passes, likely: Iterable[Hypothesis]) -> Steps[FloatArray]:
         before = self.previous

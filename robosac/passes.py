@@ -61,6 +61,11 @@ class Passes:
             self._boxes[subset] = self._ahead.pop(subset)
         return self._boxes[subset]
 
+    @property
+    def ahead(self) -> Mapping[Hypothesis, FloatArray]:
+        """What is decoded, and was not asked for so far."""
+        return self._ahead
+
     def coming(self, subset: Hypothesis, likely: Iterable[Hypothesis] = ()) -> Pass | None:
         """The pass that `decode` would make; None if it would make none, or it cannot be made with those of others."""
         prepared = self._prepared

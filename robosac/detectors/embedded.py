@@ -110,6 +110,7 @@ class EmbeddedDetector(MapFusionDetector):
 
     def place(self) -> None:
         """As `MapFusionDetector.place`."""
+        super().place()
         self._placed = FastDecoder(self._narrow).to(self.device)
         self._found = Recorded(self._found_there)
 

@@ -28,7 +28,7 @@ from robosac.detectors.base import (
 )
 from robosac.detectors.declared import check_info
 from robosac.detectors.device import CPU, as_device
-from robosac.detectors.recorded import MOST
+from robosac.detectors.recorded import EACH, MOST
 from robosac.detectors.weights_file import WeightsError, read_weights
 from robosac.faults import describe
 from robosac.plugins import Kind, classes
@@ -90,6 +90,8 @@ def warm_up(detector: Preparer) -> None:
             check_boxes(prepared.detect())
             check_boxes(prepared.detect(["a", "b"]))
             if isinstance(prepared, Batching) and prepared.worth > 1:
+                for size in (*range(1, EACH + 1), MOST):
+                    detector.prepare(ego, {str(i): teammate for i in range(size)})
                 _warm_up_batches(prepared, detector.prepare(ego, {"a": teammate, "b": teammate}))
     except DetectorError as error:
         raise DetectorError(f"{detector.info.name}: {error}") from error

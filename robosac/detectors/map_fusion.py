@@ -17,7 +17,8 @@ import torch
 
 from robosac.boxes import FloatArray
 from robosac.detectors.base import DetectorInfo, Message
-from robosac.detectors.device import CPU, as_device, by_cell, on_device, stacked
+from robosac.detectors.device import CPU, as_device, by_cell, gone_up, on_device, stacked
+from robosac.detectors.recorded import Recorded, Tensors
 from robosac.detectors.warp import corners, gathered, sampling_matrices, warp
 from robosac.testimony import planar
 
@@ -82,9 +83,9 @@ class MapFusionDetector(ABC):
         ``contexts`` are those of their frames, n of them. It is on the detector's device, and without gradients.
         """
 
-    @abstractmethod
     def place(self) -> None:
-        """Put what `context` and `find` need onto the detector's device."""
+        """Put what `laid`, `context` and `find` need onto the detector's device."""
+        self._laid = Recorded(self._laid_there)
 
     def on_device(self, device: str, worth: int | None = None) -> Self:
         """As `robosac.detectors.base.Placeable.on_device`.
@@ -120,9 +121,13 @@ class MapFusionDetector(ABC):
     def laid(self, ego: Message, teammates: Sequence[Message]) -> Iterator[torch.Tensor]:
         """Maps (C, H, W) of teammates as they lie in the ego's frame."""
         if self.device != CPU:
-            maps = by_cell(_features(teammates), self.device)
-            return iter(warp(maps, self.matrices(ego, teammates).to(self.device)) / self.gain)
+            sent = gone_up(_features(teammates), self.device)
+            (laid,) = self._laid(sent, self.matrices(ego, teammates).to(self.device))
+            return iter(laid.clone())
         return self._laid_here(ego, teammates)
+
+    def _laid_there(self, sent: torch.Tensor, matrices: torch.Tensor) -> Tensors:
+        return (warp(sent.float().contiguous(memory_format=torch.channels_last), matrices) / self.gain,)
 
     def _laid_here(self, ego: Message, teammates: Sequence[Message]) -> Iterator[torch.Tensor]:
         height, width = teammates[0].tensors[FEATURES].shape[1:]

@@ -36,7 +36,7 @@ class Recorded:
     def __call__(self, *given: torch.Tensor) -> Tensors:
         """What the function returns."""
         count = len(given[0])
-        if not _can_record(given[0].device) or count > MOST:
+        if not can_record(given[0].device) or count > MOST:
             return self._function(*given)
         size = count if count <= EACH else 1 << (count - 1).bit_length()
         rows = [1 if len(each) < count else size for each in given]
@@ -70,5 +70,6 @@ class Recorded:
         return graph, taken, returned
 
 
-def _can_record(device: torch.device) -> bool:
+def can_record(device: torch.device) -> bool:
+    """Whether a device is one of NVIDIA's."""
     return device.type == "cuda"

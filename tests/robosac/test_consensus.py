@@ -3,7 +3,7 @@ import pytest
 
 from robosac.answers import Verdict
 from robosac.boxes import pairwise_iou
-from robosac.consensus import at_least, compare, match
+from robosac.consensus import at_least, compare, match, overlaps
 from tests.conftest import GOLDEN
 from tests.robosac.rectangles import from_corners
 
@@ -110,3 +110,16 @@ def test_of_what_the_reference_cannot_know_it_is_no_judge(knows, index, verdict)
     away = ROW[2:] + [0.0, 30.0, 0.0, 0.0, 0.0]
     assert compare(ROW[:2], away, known=known).verdict == "dissensus"
     assert compare(ROW, ROW[:2], known=known).verdict == "dissensus"  # nor does it forget what it sees itself
+
+
+def test_overlaps_found_together_are_those_of_each_candidate():
+    rng = np.random.default_rng(0)
+    candidates = [ROW[:size] + rng.normal(0.0, 0.6, (size, 5)) for size in (3, 0, 10, 1)]
+    for candidate, iou in zip(candidates, overlaps(ROW, candidates), strict=True):
+        np.testing.assert_array_equal(iou, pairwise_iou(ROW, candidate))
+        assert compare(ROW, candidate, iou=iou) == compare(ROW, candidate)
+    assert [each.shape for each in overlaps(EMPTY, candidates)] == [(0, 3), (0, 0), (0, 10), (0, 1)]
+
+
+def test_an_overlap_that_is_known_is_not_computed_again():
+    assert compare(ROW, ROW, iou=np.zeros((10, 10))).matched == 0

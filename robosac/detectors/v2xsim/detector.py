@@ -141,6 +141,7 @@ class V2XSimDetector(MapFusionDetector):
 
     def place(self) -> None:
         """As `MapFusionDetector.place`."""
+        super().place()
         self._fast = FastDecoder(self._network, self.info.precision, self.device)
         self._begun, self._found = Recorded(self._begun_there), Recorded(self._found_there)
 

@@ -18,6 +18,7 @@ from torch.nn import functional
 
 from robosac.detectors.base import Precision
 from robosac.detectors.device import CPU
+from robosac.detectors.recorded import can_record
 from robosac.detectors.v2xsim.network import ANCHORS, CODE, Conv, V2XSimNetwork, channels_last
 
 Context = tuple[torch.Tensor, ...]
@@ -71,11 +72,11 @@ class FastDecoder:
         maps, levels = channels_last(grid.to(self._dtype)), []
         for level in self._encoder:
             for conv in level:
-                maps = conv(maps).relu_()
+                maps = _rectified(conv, maps)
             levels.append(maps)
         deepest = channels_last(features.to(self._dtype))
         for conv in self._deepest:
-            deepest = conv(deepest).relu_()
+            deepest = _rectified(conv, deepest)
         skips = (skip(level) for skip, level in zip(self._skips[1:], reversed(levels), strict=True))
         return self._ups[0](deepest), *skips
 
@@ -99,11 +100,19 @@ class FastDecoder:
         for i, skip in enumerate(skips, 1):
             maps = self._join(i, self._ups[i](maps), skip)
         hidden, classes = self._classes
-        logits = classes(hidden(maps).relu_()).permute(0, 2, 3, 1).reshape(len(fused), -1).float()
+        logits = classes(_rectified(hidden, maps)).permute(0, 2, 3, 1).reshape(len(fused), -1).float()
         return logits, Codes(maps.permute(0, 2, 3, 1), self._codes_hidden, self._codes)
 
     def _join(self, i: int, below: torch.Tensor, skip: torch.Tensor) -> torch.Tensor:
-        return self._seconds[i](below.add_(skip).relu_() if i else (below + skip).relu_()).relu_()
+        return _rectified(self._seconds[i], below.add_(skip).relu_() if i else (below + skip).relu_())
+
+
+def _rectified(conv: Conv, maps: torch.Tensor) -> torch.Tensor:
+    """What of a convolution is above zero; NVIDIA's accelerators find it in one go."""
+    if not can_record(maps.device):
+        return conv(maps).relu_()
+    stride, padding = conv.stride, conv.weight.shape[-1] // 2
+    return torch.cudnn_convolution_relu(maps, conv.weight, conv.bias, (stride,) * 2, (padding,) * 2, (1, 1), 1)
 
 
 def of_all(contexts: Sequence[Context]) -> Context:

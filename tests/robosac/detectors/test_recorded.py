@@ -29,7 +29,7 @@ def made(monkeypatch):
         graph = Playing(self._function, taken)
         return graph, taken, graph.returned
 
-    monkeypatch.setattr(recorded, "_can_record", lambda device: True)
+    monkeypatch.setattr(recorded, "can_record", lambda device: True)
     monkeypatch.setattr(Recorded, "_record", record)
     return rows
 
