@@ -301,6 +301,8 @@ def _handed_over(answered: Answered, accept: str | None, gateway: Gateway) -> Re
     if answer.deadline_met and not answered.in_time:
         answer = answered.now()
         response = _negotiated(answer, accept)
+    if answered.answer.deadline_met and not answer.deadline_met:
+        answered.asked.caller.live.late.append(answer.frame)
     gateway.frames.deciding.tell(answered, answer)
     gateway.recorder.note(answered, answer)
     return response

@@ -45,6 +45,7 @@ def _decoded(value: Any) -> Any:
 
 
 Count = Annotated[int, Field(ge=0)]
+Frames = tuple[Count, ...]
 Milliseconds = Annotated[float, Field(ge=0, le=86_400_000)]
 """Nothing that a gateway waits for or measures takes more than a day."""
 
@@ -142,7 +143,8 @@ class FrameAnswered(_Event, FrameAnswer):
     ``seed`` is that of the frame's draws, committed to in an earlier record. ``messages`` are those in the frame, the
     ego's among them. ``previous_frame`` is the frame of the previous answer that the fusion was given. Refusals that
     were too many to get a record each are counted in ``unlogged_refusals``, by vehicle; ``?`` stands for callers
-    without a valid token.
+    without a valid token. ``late`` are frames before this one whose records say that they were in time, which was known
+    when they were written, and whose answers were late after all.
 
     A record that is not full has no ``state``, but its ``state_digest`` (`robosac.audit.packing.state_digest`) and whom
     it trusts. ``gateway`` names the process that decided; older logs do not.
@@ -161,6 +163,7 @@ class FrameAnswered(_Event, FrameAnswer):
     state_digest: str | None = Field(None, exclude_if=lambda digest: digest is None)
     trusted: tuple[str, ...] | None = Field(None, exclude_if=lambda names: names is None)
     unlogged_refusals: dict[str, Count] = Field(default_factory=dict)
+    late: Frames = Field((), exclude_if=lambda frames: not frames)
     next_seed_commitment: str
     gateway: str = Field("", exclude_if=lambda name: not name)
 
@@ -222,10 +225,11 @@ class Equivocation(_Event):
 
 
 class SessionEnded(_Event):
-    """A session was closed by its ego, or expired."""
+    """A session was closed by its ego, or expired; ``late`` as of `FrameAnswered`."""
 
     event: Literal["session_ended"] = "session_ended"
     why: str
+    late: Frames = Field((), exclude_if=lambda frames: not frames)
 
 
 Event = (

@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable, Iterable, Mapping
+from collections.abc import Callable, Iterable, Mapping, Sequence
 from typing import Any
 
 from robosac.answers import Distrust, Reason, RejectedTeammate, Source, Standing
@@ -111,6 +111,7 @@ def _answered(event: FrameAnswered) -> str:
         parts.append(f"cut short by {'the deadline' if event.degraded_by == 'deadline' else 'a fault inside'}")
     if not event.deadline_met:
         parts.append("the answer was late")
+    parts.extend(_late(event.late))
     if event.unlogged_refusals:
         parts.append(f"{_number(sum(event.unlogged_refusals.values()), 'further refusal')} without a record")
     return "; ".join(parts)
@@ -143,7 +144,12 @@ def _equivocation(event: Equivocation) -> str:
 
 
 def _ended(event: SessionEnded) -> str:
-    return _ENDS.get(event.why, f"The session ended: {event.why}")
+    return "; ".join([_ENDS.get(event.why, f"The session ended: {event.why}"), *_late(event.late)])
+
+
+def _late(frames: Sequence[int]) -> list[str]:
+    """What is told afterwards of frames that were to be in time."""
+    return [f"the answer to frame {frame} had been late after all" for frame in frames]
 
 
 def _number(count: int, one: str, more: str = "") -> str:

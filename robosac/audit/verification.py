@@ -211,7 +211,8 @@ class _Verification:
                 self._check_answer(answer)
             case Equivocation() as lie:
                 self._check_equivocation(lie)
-            case SessionEnded():
+            case SessionEnded() as ended:
+                self._check_late(ended)
                 self._ended = True
         written = record.get("format", 1)
         if self._format not in (None, written):
@@ -250,6 +251,12 @@ class _Verification:
             self._find(Fault.CONTRADICTION, f"another key, or none any more, of {', '.join(others)} who stayed")
         self._history.trusted, self._history.team = trusted_in(change.state), change.teammates
 
+    def _check_late(self, event: FrameAnswered | SessionEnded) -> None:
+        before = self._history.frame
+        for frame in event.late:
+            if before is None or frame > before:
+                self._find(Fault.CONTRADICTION, f"frame {frame} is said to be late before it was decided")
+
     def _check_answer(self, answer: FrameAnswered) -> None:
         known = self._history
         if known.commitment is not None and commitment(answer.seed) != known.commitment:
@@ -263,6 +270,7 @@ class _Verification:
             self._find(Fault.CONTRADICTION, f"frame {answer.frame}: {detail}")
         for name, proof in answer.messages.items():
             self._check_signature(name, answer.frame, proof)
+        self._check_late(answer)
         known.latest = answer
         known.commitment = answer.next_seed_commitment
         known.frame = answer.frame

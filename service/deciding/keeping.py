@@ -46,7 +46,9 @@ class Keeping:
         SessionChanged, FrameDecided, SessionOver, StoreUnavailable
             As `service.keeping.store.Store.decide`. Nothing is remembered then.
         """
-        write = _Write(self, asked, present, result, asked.caller.live.count_anew())
+        live = asked.caller.live
+        write = _Write(self, asked, present, result, live.count_anew(), tuple(live.late))
+        live.late.clear()
         task = asyncio.create_task(write.run(record, answer))
         self._tasks.add(task)  # the loop itself holds tasks only weakly
         task.add_done_callback(self._tasks.discard)
@@ -58,7 +60,7 @@ class Keeping:
         if write.patience.give_up():
             write.undo()
             raise StoreTooSlow("did not take the decision in time; nothing of it is kept, send the frame again")
-        asked.caller.live.settling = task
+        live.settling, write.is_too_late = task, True
         raise StoreTooSlow("is still writing the decision; if the frame, sent again, is stale-frame, it was kept")
 
     async def close(self) -> None:
@@ -77,6 +79,10 @@ class _Write:
     result: FusionResult
     counted: Refusals
     """Refusals since the decision before."""
+    late: tuple[int, ...]
+    """Frames before it that were answered too late, though their records say otherwise."""
+    is_too_late: bool = False
+    """Whether it is not waited for any more."""
     patience: Patience = field(default_factory=Patience)
     kept: SessionRecord = field(init=False)
     """The session with the decision, once it is kept."""
@@ -105,6 +111,7 @@ class _Write:
         """It is not kept: the session is as it was before the frame."""
         live = self.asked.caller.live
         live.refusals.add(self.counted)
+        live.late[:0] = self.late
         live.gathering.reopen(self.asked.frame)
 
     def _event(self, record: SessionRecord, answer: FrameAnswer, next_seed: str) -> FrameAnswered:
@@ -120,6 +127,7 @@ class _Write:
             fault=self.result.fault,
             state=dict(self.result.state),
             unlogged_refusals=dict(self.counted.unlogged),
+            late=self.late,
             next_seed_commitment=commitment(next_seed),
             gateway=self.keeping.sessions.moving.name,
         )
@@ -127,6 +135,8 @@ class _Write:
     def _remember(self) -> None:
         """What the next frame is judged by."""
         asked, live = self.asked, self.asked.caller.live
+        if self.is_too_late:
+            live.late.append(asked.frame)
         live.equivocations.clear()
         live.team_changes = 0
         live.session.remember(self.result)

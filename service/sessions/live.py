@@ -80,6 +80,8 @@ class LiveSession:
     lock: asyncio.Lock = field(default_factory=asyncio.Lock)
     last_used: float = field(default_factory=time.monotonic)
     refusals: Refusals = field(default_factory=Refusals)
+    late: list[int] = field(default_factory=list)
+    """Frames whose records say that they were in time, and whose answers were late: the next record tells."""
     equivocations: Counter[str] = field(default_factory=Counter)
     renewals: defaultdict[str, deque[float]] = field(
         default_factory=lambda: defaultdict(partial(deque, maxlen=RENEWALS))
@@ -135,7 +137,7 @@ class LiveSession:
 
     def count_on(self, before: LiveSession) -> None:
         """Count what there was before since the last decision."""
-        self.refusals, self.equivocations = before.refusals, before.equivocations
+        self.refusals, self.late, self.equivocations = before.refusals, before.late, before.equivocations
         self.renewals, self.team_changes = before.renewals, before.team_changes
 
     def count_anew(self) -> Refusals:

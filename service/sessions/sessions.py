@@ -303,8 +303,10 @@ class Sessions:
             self._forget(session_id)
 
     async def _end(self, session_id: str, why: str, unused_since: float | None = None) -> None:
+        live = self._live.get(session_id)
+        ended = SessionEnded(why=why, late=() if live is None else tuple(live.late))
         with contextlib.suppress(SessionOver):
-            await self.store.end(session_id, SessionEnded(why=why), unused_since)
+            await self.store.end(session_id, ended, unused_since)
             logger.info("session ended", session_id=session_id, why=why)
         self._forget(session_id)  # not before: if the store fails, the session goes on with the messages that wait
         self.metrics.sessions.set(await self.store.count())

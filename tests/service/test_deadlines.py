@@ -130,8 +130,8 @@ async def test_a_decision_past_the_point_of_return_is_found_out_about_before_the
     problem(await on_disk.post(session, "frames", good_frame(1)), 409, "stale-frame")
     await asyncio.gather(before, with_it)
     assert (await on_disk.post(session, "frames", good_frame(2))).json()["source"] == "consensus"
-    answered = [r["frame"] for r in await on_disk.ego(session).audit() if r["event"] == "frame_answered"]
-    assert answered == [0, 1, 2]
+    records = [r for r in await on_disk.ego(session).audit() if r["event"] == "frame_answered"]
+    assert [(record["frame"], record.get("late", [])) for record in records] == [(0, []), (1, []), (2, [1])]
 
 
 @pytest.mark.parametrize("stalled", ["store", "engine"])
@@ -167,3 +167,24 @@ async def test_an_answer_that_waited_for_the_store_until_it_was_late_says_so(on_
     assert result["timings_ms"]["total"] > 300
     assert result["timings_ms"]["store"] > 100
     assert await late_frames(on_disk) - late_before == 1
+    stall = asyncio.create_task(on_disk.gateway.store._database.write(lambda _: time.sleep(1.5)))
+    await asyncio.sleep(0.01)
+    problem(await on_disk.post(session, "frames", good_frame(2)), 503, "store-too-slow")  # which loses nothing
+    await stall
+    for frame in (3, 4):
+        await on_disk.post(session, "frames", good_frame(frame))
+    records = [r for r in await on_disk.ego(session).audit() if r["event"] == "frame_answered"]
+    told = {record["frame"]: (record["deadline_met"], record.get("late", [])) for record in records}
+    assert told == {0: (True, []), 1: (True, []), 3: (True, [1]), 4: (True, [])}
+
+
+async def test_the_end_of_a_session_tells_of_its_last_late_frame(on_disk, good_frame):
+    session = await on_disk.open(latency_budget_ms=300, gather_ms=0)
+    stall = asyncio.create_task(on_disk.gateway.store._database.write(lambda _: time.sleep(0.4)))
+    await asyncio.sleep(0.01)
+    assert (await on_disk.post(session, "frames", good_frame(0))).json()["deadline_met"] is False
+    await stall
+    ego = on_disk.ego(session)
+    await ego.close()
+    *_, ended = await ego.audit()
+    assert (ended["event"], ended["late"]) == ("session_ended", [0])

@@ -57,6 +57,13 @@ def test_a_frame_is_told_with_who_was_left_out_and_why(events):
     )
 
 
+def test_frames_that_were_late_after_all_are_told(events):
+    answered, ended = (next(e for e in events if e["event"] == kind) for kind in ("frame_answered", "session_ended"))
+    late = "; the answer to frame 3 had been late after all; the answer to frame 4 had been late after all."
+    assert told(answered, late=[3, 4]).endswith(late)
+    assert told(ended, late=[3, 4]).endswith(late)
+
+
 def test_contradicted_boxes_that_a_session_keeps_in_are_told(events):
     answered = next(event for event in events if event["event"] == "frame_answered")
     boxes = [[0.0, 0.0, 4.0, 2.0, 0.0, 0.9]] * 2

@@ -175,6 +175,9 @@ HYPOTHESIS = {"teammates": ["rsu", "car-3"], "jaccard_index": 0.75, "verdict": "
         ),
         (5, {"public_keys": {}}, "another key, or none any more, of rsu who stayed"),
         (6, {"rejected": []}, "car-2 neither accepted nor rejected"),
+        (1, {"late": [0]}, "frame 0 is said to be late before it was decided"),
+        (6, {"late": [0, 7]}, "frame 7 is said to be late before it was decided"),
+        (7, {"late": [9]}, "frame 9 is said to be late before it was decided"),
         (6, {"rejected": []}, "car-4 enrolled, but neither accepted nor rejected"),
     ],
 )
