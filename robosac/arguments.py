@@ -85,7 +85,8 @@ def check_ids(field: str, names: Iterable[object]) -> None:
 def check_defense(defense: object) -> None:
     """`TypeError` for what is no defence."""
     if lacking := lacks(defense, Defense):
-        raise TypeError(f"defense must be a defence, and {type(defense).__name__} {lacking}")
+        named = ", not its name" if isinstance(defense, str) else ""
+        raise TypeError(f"defense must be a defence{named}, and {type(defense).__name__} {lacking}")
 
 
 def check_rng(rng: object) -> None:

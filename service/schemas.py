@@ -14,6 +14,7 @@ from pydantic import (
     ConfigDict,
     Field,
     StringConstraints,
+    ValidationError,
     ValidationInfo,
     ValidatorFunctionWrapHandler,
     WrapSerializer,
@@ -21,6 +22,7 @@ from pydantic import (
     field_validator,
     model_validator,
 )
+from pydantic_core import PydanticCustomError
 
 from robosac.answers import LogReceipt
 from robosac.calibrated import calibration_digest, calibration_of
@@ -57,7 +59,8 @@ def _as_served(value: object, of_shipped: ValidatorFunctionWrapHandler, about: V
     kinds: Kinds = about.context or shipped()
     kind = value.get("kind")
     if not isinstance(kind, str) or kind not in kinds:
-        raise ValueError(f"kind must be one of {', '.join(kinds)}")
+        unknown = PydanticCustomError("unknown_kind", "must be one of {kinds}", {"kinds": ", ".join(kinds)})
+        raise ValidationError.from_exception_data("defense", [{"type": unknown, "loc": ("kind",), "input": kind}])
     return of_shipped(value) if kind in shipped() else kinds[kind].model_validate(value)
 
 

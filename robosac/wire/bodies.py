@@ -167,7 +167,7 @@ def unpack(body: bytes, *, trusted: bool = False, most_entries: int = MAX_ENTRIE
         raise WireError("malformed-msgpack", "", "is no msgpack, or has bytes left over after its one value") from error
     except Exception as error:  # msgpack raises many unrelated types, ValueError and its own among them
         reason = str(error) or type(error).__name__
-        raise WireError("malformed-msgpack", "", f"not a msgpack value within the limits: {reason}") from error
+        raise WireError("malformed-msgpack", "", f"not a whole msgpack value within the limits: {reason}") from error
 
 
 def read_message(body: bytes) -> MessageEnvelope:

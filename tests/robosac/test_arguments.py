@@ -125,7 +125,7 @@ def test_a_session_names_what_it_cannot_be_made_of():
         ({"team": None}, TypeError, "team must be a sequence of ids"),
         ({"team": "car-2"}, TypeError, "team must be a sequence of ids, got 'car-2'"),
         ({"team": ["a", "b", "a"]}, ValueError, "team: id 2 is there twice"),
-        ({"defense": "none"}, TypeError, "defense must be a defence, and str lacks"),
+        ({"defense": "none"}, TypeError, "defense must be a defence, not its name, and str lacks"),
         ({"saved": {}}, TypeError, "saved must be what Session.save gave, got {}"),
         ({"saved": "state"}, TypeError, "saved must be what Session.save gave, got 'state'"),
         ({"saved": SAVED | {"previous": 5}}, TypeError, "saved must be what Session.save gave"),

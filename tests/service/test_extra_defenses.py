@@ -61,8 +61,8 @@ async def test_a_listed_defence_is_served_like_one_that_ships(ego_message, attac
         ({"kind": "wary", "consensus_threshold": 0}, "defense.consensus_threshold"),
         ({"kind": "wary", "reference": "next"}, "defense.reference"),
         ({"kind": "wary", "sampling_budget": 3}, "defense.sampling_budget"),
-        ({"kind": "unwary"}, "defense"),
-        ({"kind": ["wary"]}, "defense"),
+        ({"kind": "unwary"}, "defense.kind"),
+        ({"kind": ["wary"]}, "defense.kind"),
         ("wary", "defense"),
     ],
 )
@@ -77,14 +77,17 @@ async def test_whoever_names_no_kind_is_told_all_that_are_served():
     async with serve(**EXTRA) as served:
         for defense in ({"kind": "unwary"}, {"kind": None}, {}):
             request = {"ego_id": "a", "teammates": ["b"], "defense": defense}
-            told = problem(await served.http.post("/v1/sessions", json=request), 422, "invalid-request")["detail"]
-            assert told.startswith("kind must be one of a2cp, ")
-            assert told.endswith(", wary")
+            told = problem(await served.http.post("/v1/sessions", json=request), 422, "invalid-request")
+            assert told["field"] == "defense.kind"
+            assert told["detail"].startswith("must be one of a2cp, ")
+            assert ", wary" in told["detail"]
 
 
 async def test_what_is_not_listed_is_not_served(served):
     request = {"ego_id": "a", "teammates": ["b"], "defense": {"kind": "wary"}}
-    assert problem(await served.http.post("/v1/sessions", json=request), 422, "invalid-request")["field"] == "defense"
+    assert (
+        problem(await served.http.post("/v1/sessions", json=request), 422, "invalid-request")["field"] == "defense.kind"
+    )
 
 
 async def test_a_session_whose_defence_is_not_listed_any_more_says_so(tmp_path, good_frame):

@@ -153,7 +153,7 @@ async def test_state_and_end(served, good_frame):
         ({"ego_id": "a", "teammates": ["b"], "latency_budget_ms": 0}, "latency_budget_ms", "greater than 0"),
         ({"ego_id": "a", "teammates": ["b"], "latency_budget_ms": 50, "gather_ms": 51}, "gather_ms", "50 ms"),
         ({"ego_id": "a", "teammates": ["b"], "detector": "nonesuch"}, "detector", "intersection-mean"),
-        ({"ego_id": "a", "teammates": ["b"], "defense": {"kind": "magic"}}, "defense", "sample_consensus"),
+        ({"ego_id": "a", "teammates": ["b"], "defense": {"kind": "magic"}}, "defense.kind", "sample_consensus"),
         (
             {"ego_id": "a", "teammates": ["b"], "defense": {"kind": "sample_consensus", "attacker_ratio": 1.0}},
             "defense.attacker_ratio",
