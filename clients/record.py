@@ -12,8 +12,8 @@ from typing import Annotated
 
 import typer
 from rich.console import Console
-from rich.markup import escape
 from rich.table import Table
+from rich.text import Text
 
 from clients import trial
 from clients.errors import GatewayError
@@ -24,6 +24,7 @@ from robosac.cli.blame import blaming, failing
 from robosac.cli.named import load_named
 from robosac.cli.options import progress
 from robosac.cli.outputs import Force, check_file, make_folder
+from robosac.cli.printing import printable
 from robosac.defenses import Defense, build
 from robosac.detectors import Detector
 from robosac.extras import need
@@ -61,7 +62,7 @@ def info(file: File) -> None:
     console, broken = Console(), False
     for session in _read(file):
         opening, frames = session.opening, session.frames
-        console.print(f"[bold]Session {opening.session_id}[/bold], opened {opening.created_at}", highlight=False)
+        console.print(_literally((f"Session {opening.session_id}", "bold"), f", opened {opening.created_at}"))
         team = list(dict.fromkeys(name for frame in frames for name in frame.decided.team)) or opening.teammates
         sources = Counter(frame.answer.source.value for frame in frames)
         named = list(dict.fromkeys(name for frame in frames for name in frame.answer.named))
@@ -83,13 +84,13 @@ def info(file: File) -> None:
         rows["topics"] = ", ".join(f"{topic} {count}" for topic, count in counts.items())
         table = Table(box=None, show_header=False)
         for name, told in rows.items():
-            table.add_row(name, told)
+            table.add_row(name, _literally(told))
         console.print(table)
         for part in session.files:
             broken |= part.damage is not None
-            whole = "whole" if part.damage is None else f"[red]{part.damage}[/red]; what is before that is good"
-            told = f" {escape(part.path.name)}: {part.path.stat().st_size} bytes, {len(part.frames)} frames, {whole}"
-            console.print(told, highlight=False, soft_wrap=True)  # a name that is cut or folded is no file's name
+            told = f" {part.path.name}: {part.path.stat().st_size} bytes, {len(part.frames)} frames, "
+            whole = ("whole",) if part.damage is None else ((part.damage, "red"), "; what is before that is good")
+            console.print(_literally(told, *whole), soft_wrap=True)  # a name that is cut or folded is no file's name
     if broken:
         raise typer.Exit(1)
 
@@ -124,7 +125,7 @@ def replay(
         else:
             with failing(GatewayError, RecordingError):
                 asked = None if defense is None else {"kind": defense}
-                console.print(asyncio.run(play_against(url, session, asked, api_key)), highlight=False)
+                console.print(_literally(asyncio.run(play_against(url, session, asked, api_key))))
     if not same and defense is None and detector is None:
         raise typer.Exit(1)
 
@@ -165,7 +166,7 @@ def export(
             Form.ROS2: lambda: plain.write_ros2(chosen, out),
         }[to]()
         bar.update(task, completed=len(chosen.frames))
-    console.print(f"{out}: {len(chosen.frames)} frames of {chosen.opening.ego_id}", highlight=False)
+    console.print(_literally(f"{out}: {len(chosen.frames)} frames of {chosen.opening.ego_id}"))
 
 
 def _check_form(to: Form, out: Path) -> None:
@@ -202,8 +203,15 @@ def _one(found: Sequence[RecordedSession], wanted: str | None) -> RecordedSessio
     those = [session for session in found if session.opening.session_id.startswith(wanted or "")]
     if len(those) != 1:
         ids = ", ".join(session.opening.session_id[:8] for session in found)
-        raise typer.BadParameter(f"must choose one of {ids}", param_hint="--session")
+        raise typer.BadParameter(printable(f"must choose one of {ids}"), param_hint="--session")
     return those[0]
+
+
+def _literally(*parts: str | tuple[str, str]) -> Text:
+    """Words, each with its style if it has one: a recording may come from anybody, and its names are no markup."""
+    return Text.assemble(
+        *((printable(part), "") if isinstance(part, str) else (printable(part[0]), part[1]) for part in parts)
+    )
 
 
 def _span(session: RecordedSession) -> str:
@@ -229,18 +237,18 @@ def _decide_again(
         kinds = None if own is None else defenses.known([own])
     kind = opening.defense.get("kind")
     if defense is None and kind not in (kinds or defenses.shipped()):
-        why = f"the recorded defence is {kind}, which does not ship: say where it is"
+        why = printable(f"the recorded defence is {kind}, which does not ship: say where it is")
         raise typer.BadParameter(why, param_hint="--recorded-defense")
     if loaded.info.weights_digest != opening.weights_digest:
-        console.print(f"{loaded.info.name} has other weights than the recorded {opening.detector}.", highlight=False)
+        console.print(_literally(f"{loaded.info.name} has other weights than the recorded {opening.detector}."))
     compared = Compared()
     with failing(RecordingError, OSError):
         for frame in decide(session, loaded, other, kinds):
             compared.add(frame)
     by = defense or opening.defense.get("kind")
-    console.print(f"{opening.session_id}, {by} on {loaded.info.name}:", highlight=False)
+    console.print(_literally(f"{opening.session_id}, {by} on {loaded.info.name}:"))
     for line in compared.lines(SHOWN if (detector, defense) == (None, None) else 0):
-        console.print(line, highlight=False)
+        console.print(_literally(line))
     return compared.same == compared.frames
 
 

@@ -24,6 +24,7 @@ from clients.client import API_KEY_VARIABLE, GatewayClient
 from clients.errors import GatewayError
 from clients.local_gateway import cancelled_by_sigterm, local_gateway
 from robosac.cli import outputs
+from robosac.cli.printing import printable
 from robosac.extras import MissingExtra
 from robosac.figures import need_figures
 from robosac.files import write_text
@@ -130,13 +131,8 @@ def run(trial: Coroutine[Any, Any, T], console: Console, what: str, *others: typ
         console.print(f"[red]{what} was ended.[/red]")
         sys.exit(143)
     except failures as error:
-        console.print(Text.assemble((f"{what} stopped:", "red"), " ", _printable(str(error))))
+        console.print(Text.assemble((f"{what} stopped:", "red"), " ", printable(str(error), lines=True)))
         sys.exit(1)
-
-
-def _printable(text: str) -> str:
-    """What a gateway may have said, which a terminal must not obey."""
-    return "".join(c if c.isprintable() or c == "\n" else repr(c)[1:-1] for c in text)
 
 
 def write(report: Any, out: Path | None, name: str, console: Console) -> None:

@@ -30,9 +30,9 @@ from robosac.defenses import DefenseSettings, Kinds, check_kinds, check_numbers,
 from robosac.defenses.group_testing import CalibrationError
 from robosac.detectors import DetectorInfo
 from robosac.signatures import read_public_key
+from robosac.wire import ID_PATTERN
 
 MAX_KEYS = 1025
-ID_PATTERN = r"^[A-Za-z0-9][A-Za-z0-9._:-]{0,63}$"
 VehicleId = Annotated[str, StringConstraints(pattern=ID_PATTERN)]
 
 

@@ -18,7 +18,6 @@ from robosac.detectors import DetectorInfo, Role, TensorSpec, narrow
 from robosac.recording.truth import MOST_BOXES
 from robosac.signatures import SIGNATURE_BYTES
 from service.arriving.frames import SLACK_BYTES
-from service.schemas import ID_PATTERN
 
 Schema = dict[str, Any]
 RENDERED = (
@@ -32,7 +31,7 @@ _LIMITS = (
 )
 _ROLES: tuple[Role, ...] = get_args(Role)
 _FRAME = {"type": "integer", "minimum": 0, "maximum": wire.MAX_FRAME, "description": "Increases from frame to frame."}
-_ID = {"type": "string", "pattern": ID_PATTERN}
+_ID = {"type": "string", "pattern": wire.ID_PATTERN}
 _POSE = {
     "type": "array",
     "items": {"type": "number"},
@@ -56,7 +55,7 @@ _TRUTH = {
                 "data": {"type": "string", "format": "binary", "description": "Little-endian, C order, finite."},
             },
         },
-        "attackers": {"type": "array", "items": {"type": "string"}, "maxItems": wire.MAX_ARRAY},
+        "attackers": {"type": "array", "items": _ID, "maxItems": wire.MAX_ARRAY},
     },
 }
 

@@ -23,6 +23,7 @@ from robosac.audit.receipts import by_id
 from robosac.cli.blame import blaming
 from robosac.cli.named import load_named
 from robosac.cli.outputs import Force, check_file
+from robosac.cli.printing import printable
 from robosac.files import write_text
 
 app = typer.Typer(no_args_is_help=True, add_completion=False, help=__doc__)
@@ -220,5 +221,4 @@ def _read_receipts(file: Path, keys: list[str]) -> Receipts:
 
 def _say(what: object, *, err: bool = False) -> None:
     """Print what may hold a log's own words; a terminal must not obey them."""
-    shown = (character if character.isprintable() else repr(character)[1:-1] for character in str(what))
-    typer.echo("".join(shown), err=err)
+    typer.echo(printable(str(what)), err=err)

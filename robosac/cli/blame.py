@@ -8,6 +8,7 @@ from contextlib import contextmanager
 
 import typer
 
+from robosac.cli.printing import printable
 from robosac.faults import told
 
 
@@ -17,7 +18,7 @@ def blaming(option: str, *errors: type[Exception]) -> Iterator[None]:
     try:
         yield
     except errors as error:
-        raise typer.BadParameter(told(error), param_hint=option) from error
+        raise typer.BadParameter(printable(told(error), lines=True), param_hint=option) from error
 
 
 @contextmanager
@@ -26,7 +27,7 @@ def failing(*errors: type[Exception]) -> Iterator[None]:
     try:
         yield
     except errors as error:
-        typer.secho(f"Error: {told(error)}", fg="red", err=True)
+        typer.secho(f"Error: {printable(told(error), lines=True)}", fg="red", err=True)
         raise typer.Exit(1) from error
 
 

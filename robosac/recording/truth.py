@@ -2,16 +2,16 @@
 
 from __future__ import annotations
 
+import re
 from dataclasses import dataclass, field
 from typing import Any
 
 import numpy as np
 
 from robosac.boxes import FloatArray
-from robosac.wire import WireError
+from robosac.wire import ID_PATTERN, WireError
 
 MOST_BOXES = 1024
-MOST_LETTERS = 64
 
 
 @dataclass(frozen=True)
@@ -68,6 +68,8 @@ def _boxes(sent: Any, where: str) -> FloatArray:
 
 
 def _attackers(names: Any, where: str) -> tuple[str, ...]:
-    if not isinstance(names, list) or not all(isinstance(name, str) and len(name) <= MOST_LETTERS for name in names):
+    if not isinstance(names, list) or not all(isinstance(name, str) for name in names):
         raise WireError("wrong-type", f"{where}.attackers", "must be an array of vehicle ids")
+    if not all(re.fullmatch(ID_PATTERN, name) for name in names):
+        raise WireError("out-of-range", f"{where}.attackers", f"a vehicle id must match {ID_PATTERN}")
     return tuple(names)

@@ -8,6 +8,7 @@ field it is about.
 """
 
 from robosac.wire.bodies import (
+    ID_PATTERN,
     MAX_ARRAY,
     MAX_ENTRIES,
     MAX_FRAME,
@@ -29,6 +30,7 @@ from robosac.wire.fields import WireError
 from robosac.wire.tensors import ZSTD, Packing
 
 __all__ = [
+    "ID_PATTERN",
     "MAX_ARRAY",
     "MAX_ENTRIES",
     "MAX_FRAME",

@@ -18,6 +18,8 @@ from robosac.wire.tensors import Packing, little_endian, read_tensor, tensor_fie
 
 MAX_FRAME = 2**53 - 1
 """Largest frame number: what every JSON reader can hold exactly."""
+ID_PATTERN = r"^[A-Za-z0-9][A-Za-z0-9._:-]{0,63}$"
+"""Of a vehicle's id."""
 MAX_ARRAY = 64
 MAX_MAP = 1024
 MAX_STRING = 2**16

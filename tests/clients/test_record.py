@@ -1,4 +1,5 @@
 import asyncio
+import dataclasses
 import io
 import json
 import sys
@@ -13,6 +14,7 @@ from clients.playing import play_against
 from clients.record import app
 from robosac import cli
 from robosac.recording.reading import RecordingError, sessions
+from robosac.recording.truth import Truth
 from tests.recorded import write
 
 
@@ -66,6 +68,25 @@ def test_info_tells_what_is_in_it(path, tmp_path):
     status, said = run("info", broken)
     assert status == 1
     assert "what is before that is good" in said
+
+
+def test_what_a_foreign_recording_says_is_no_markup_and_no_terminal_obeys_it(detector, recorded_moments, tmp_path):
+    name = "[/x]:smile:\x1b[2J"
+    (moment,) = recorded_moments[:1]
+    lying = dataclasses.replace(moment, truth=Truth(moment.truth.boxes, (name,)))
+    foreign = {"created_at": name, "defense": {"kind": name}, "session_id": name}
+    path = write(tmp_path / "foreign.mcap", detector, [lying], **foreign)
+    status, said = run("info", path)
+    assert status == 0, said
+    assert said.count(r"[/x]:smile:\x1b[2J") == 4
+    path = write(tmp_path / "kind.mcap", detector, [lying], defense={"kind": name})
+    out = tmp_path / "out.jsonl"
+    for words in (
+        ("replay", path),
+        ("replay", path, "--defense", "none"),
+        ("export", path, "--to", "cpm", "--out", out),
+    ):
+        assert "\x1b" not in run(*words)[1]
 
 
 def test_info_gives_the_name_of_a_file_whole_on_a_narrow_screen(path, tmp_path):

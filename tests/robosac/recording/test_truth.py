@@ -44,7 +44,10 @@ def test_a_message_need_not_tell_it(messages):
         (boxes(data=np.full(10, np.nan).tobytes()), "ego.truth.boxes.data", "non-finite"),
         (changed(attackers="car-2"), "ego.truth.attackers", "wrong-type"),
         (changed(attackers=[5]), "ego.truth.attackers", "wrong-type"),
-        (changed(attackers=["x" * 65]), "ego.truth.attackers", "wrong-type"),
+        (changed(attackers=["x" * 65]), "ego.truth.attackers", "out-of-range"),
+        (changed(attackers=["car-2", "[/x]"]), "ego.truth.attackers", "out-of-range"),
+        (changed(attackers=["\x1b[2J"]), "ego.truth.attackers", "out-of-range"),
+        (changed(attackers=["car-2\n"]), "ego.truth.attackers", "out-of-range"),
     ],
 )
 def test_what_is_wrong_with_it_is_named(truth, field, code):
