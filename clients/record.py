@@ -123,7 +123,7 @@ def replay(
         if url is None:
             same &= _decide_again(session, detector, defense, own, console)
         else:
-            with failing(GatewayError, RecordingError):
+            with blaming("FILE", RecordingError), failing(GatewayError):
                 asked = None if defense is None else {"kind": defense}
                 console.print(_literally(asyncio.run(play_against(url, session, asked, api_key))))
     if not same and defense is None and detector is None:
@@ -242,7 +242,7 @@ def _decide_again(
     if loaded.info.weights_digest != opening.weights_digest:
         console.print(_literally(f"{loaded.info.name} has other weights than the recorded {opening.detector}."))
     compared = Compared()
-    with failing(RecordingError, OSError):
+    with blaming("FILE", RecordingError), failing(OSError):
         for frame in decide(session, loaded, other, kinds):
             compared.add(frame)
     by = defense or opening.defense.get("kind")

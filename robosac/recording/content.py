@@ -7,7 +7,7 @@ from collections.abc import Mapping
 from dataclasses import dataclass
 from typing import Annotated, Any, Protocol
 
-from pydantic import Field
+from pydantic import AfterValidator, Field
 
 from robosac.answers import FrameAnswer, Pose, Typed
 from robosac.defenses import State
@@ -23,6 +23,12 @@ SESSION, MESSAGES, DIGESTS, POSES, TRUTH, ANSWERS, FRAMES = (
 )  # fmt: skip
 
 
+def _of_a_kind(defense: dict[str, Any]) -> dict[str, Any]:
+    if not isinstance(defense.get("kind"), str):
+        raise ValueError("kind must be a string")
+    return defense
+
+
 class Opening(Typed):
     """The session that a file is of; each file begins with it."""
 
@@ -32,10 +38,12 @@ class Opening(Typed):
     detector: str
     weights_digest: str | None
     calibration_digest: str | None
-    defense: dict[str, Any] = Field(description="Settings, as the API gives them.")
+    defense: Annotated[dict[str, Any], AfterValidator(_of_a_kind)] = Field(
+        description="Settings, as the API gives them."
+    )
     least_score: float = Field(description="Boxes from this score on took part in the consensus test.")
     latency_budget_ms: float
-    frame_period_ms: float
+    frame_period_ms: float = Field(gt=0, allow_inf_nan=False)
     created_at: str = Field(description="When the session was opened, RFC 3339, UTC.")
     version: str = Field(description="Of the gateway.")
     bodies: bool = Field(description="Whether messages are recorded; else only their digests.")
@@ -81,7 +89,7 @@ class Decided(Typed):
     frame: int
     team: tuple[str, ...] = Field(description="Enrolled teammates.")
     fused: tuple[str, ...] = Field(description="Teammates whose messages took part.")
-    seed: str = Field(description="Of the draws, hexadecimal.")
+    seed: str = Field(description="Of the draws, hexadecimal.", pattern="^[0-9a-f]+$")
     before: Before | None = Field(
         None, description="Where it is not what the frame before in the file left, or there is none."
     )

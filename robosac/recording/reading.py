@@ -34,6 +34,7 @@ from robosac.recording.content import (
     TrueFrame,
 )
 from robosac.recording.unpacking import records_in
+from robosac.wire.fields import Fields, WireError, named, shown
 
 if TYPE_CHECKING:
     from mcap.records import Message as Written
@@ -42,8 +43,8 @@ SUFFIX = ".mcap"
 MOST_BYTES = 2**30
 """Of one chunk, or of one message, unpacked: a frame of 64 vehicles has a tenth of it."""
 MAGIC_BYTES = 8
-_KINDS = "fiu"
-"""Of numbers in tensors."""
+_DTYPES = frozenset(np.dtype(code).name for code in "bhilqBHILQefd")
+"""Numbers that tensors may hold."""
 
 
 class RecordingError(ValueError):
@@ -264,22 +265,25 @@ def _message(body: bytes, path: Path) -> tuple[str, Message]:
     try:
         envelope = wire.read_message(body)
         tensors = envelope.payload.get("tensors")
-        specs = {name: _spec(sent) for name, sent in tensors.items()} if isinstance(tensors, dict) else {}
+        sent = tensors if isinstance(tensors, dict) else {}
+        specs = {name: _spec(Fields(sent[name], f"tensors.{name}")) for name in named(sent, "tensors")}
         if sum(_bytes(spec) for spec in specs.values()) > MOST_BYTES:
-            raise RecordingError(f"{path}: a message has tensors of more than {MOST_BYTES} bytes")
+            raise WireError("out-of-range", "tensors", f"must be no more than {MOST_BYTES} bytes")
         layout = DetectorInfo("as recorded", {"ego": specs}, (0, 0, 0, 0), 1.0, "", 0.0)
         return envelope.vehicle_id, wire.check_message(envelope.payload, layout, "ego")
-    except (wire.WireError, TypeError) as error:
+    except (ValueError, OverflowError) as error:  # of what is sent, or of an array of a shape that cannot be
         raise RecordingError(f"{path}: a message cannot be read: {error}") from error
 
 
-def _spec(sent: Any) -> TensorSpec:
+def _spec(sent: Fields) -> TensorSpec:
     """What a tensor says that it is."""
-    dtype, shape = sent.get("dtype"), sent.get("shape")
-    if np.dtype(dtype).kind not in _KINDS:
-        raise TypeError(f"tensors hold numbers, got {dtype!r}")
+    dtype, shape = sent.take("dtype", str), sent.take("shape", list)
+    if dtype not in _DTYPES:
+        raise WireError("wrong-dtype", sent.at("dtype"), f"tensors hold numbers, got {shown(dtype)}")
+    if not all(type(size) is int and size >= 0 for size in shape):
+        raise WireError("wrong-shape", sent.at("shape"), "must be an array of integers that are not negative")
     return TensorSpec(dtype, tuple(shape))
 
 
 def _bytes(spec: TensorSpec) -> int:
-    return abs(math.prod(spec.shape)) * np.dtype(spec.dtype).itemsize
+    return math.prod(spec.shape) * np.dtype(spec.dtype).itemsize

@@ -4,7 +4,10 @@ import io
 import json
 import sys
 
+import msgpack
 import pytest
+from mcap.reader import make_reader
+from mcap.writer import Writer
 from rich.console import Console
 from typer.testing import CliRunner
 
@@ -165,8 +168,58 @@ def test_a_defence_that_does_not_ship_has_to_be_named(detector, recorded_moments
 def test_a_recording_of_digests_cannot_be_replayed(detector, recorded_moments, tmp_path):
     path = write(tmp_path / "digests.mcap", detector, recorded_moments[:1], bodies=False)
     status, said = run("replay", path)
-    assert status == 1
+    assert status == 2
+    assert "for FILE" in said
     assert "holds digests in the place of messages" in said
+
+
+@pytest.mark.parametrize(
+    ("changes", "field"),
+    [
+        ({"frame_period_ms": 0.0}, "/session is not of this form: frame_period_ms"),
+        ({"frame_period_ms": float("inf")}, "/session is not of this form: frame_period_ms"),
+        ({"defense": {"kind": ["a"]}}, "/session is not of this form: defense"),
+        ({"defense": {}}, "/session is not of this form: defense"),
+        ({"seed": "zz"}, "/frames is not of this form: seed"),
+        ({"seed": "-1"}, "/frames is not of this form: seed"),
+        ({"tensors": {"a": 5}}, "tensors.a"),
+        ({"tensors": {"a": {"dtype": "(99999999999999999999,)f4", "shape": [1], "data": b""}}}, "tensors.a.dtype"),
+        ({"tensors": {"a": {"dtype": "float32", "shape": ["x", 2], "data": b""}}}, "tensors.a.shape"),
+        ({"tensors": {"a": {"dtype": "float32", "shape": [-1, -4], "data": bytes(16)}}}, "tensors.a.shape"),
+        ({"tensors": {"a": {"dtype": "float32", "shape": [0, 2**63], "data": b""}}}, "a message cannot be read"),
+        ({"tensors": {5: {"dtype": "float32", "shape": [1], "data": bytes(4)}}}, "tensors"),
+    ],
+)
+def test_what_no_gateway_writes_is_told_with_its_file_and_field(changes, field, path, tmp_path):
+    odd = tmp_path / "odd.mcap"
+    rewrite(path, odd, changes)
+    status, said = run("replay", odd)
+    assert status == 2, said
+    assert "for FILE" in said
+    assert "odd.mcap" in said
+    assert field in said
+
+
+CODECS = {
+    "json": (json.loads, lambda content: json.dumps(content).encode()),
+    "msgpack": (msgpack.unpackb, msgpack.packb),
+}
+
+
+def rewrite(path, to, changes):
+    """The same recording with other values for some fields, wherever they stand."""
+    with path.open("rb") as file, to.open("wb") as out:
+        writer, channels = Writer(out), {}
+        writer.start()
+        for _, channel, told in make_reader(file).iter_messages(log_time_order=False):
+            if channel.topic not in channels:
+                channels[channel.topic] = writer.register_channel(channel.topic, channel.message_encoding, 0)
+            data = told.data
+            if channel.message_encoding in CODECS:
+                unpack, pack = CODECS[channel.message_encoding]
+                data = pack({name: changes.get(name, value) for name, value in unpack(data).items()})
+            writer.add_message(channels[channel.topic], told.log_time, data, told.publish_time)
+        writer.finish()
 
 
 async def test_an_empty_recording_is_played_to_nobody(detector, recorded_moments, tmp_path):
