@@ -4,6 +4,7 @@ from __future__ import annotations
 
 from collections.abc import Iterator, Mapping
 from dataclasses import dataclass
+from pathlib import Path
 from typing import Any
 
 import numpy as np
@@ -59,18 +60,19 @@ def replay(
     for frame in session.frames[:1]:  # a detector of another layout lacks more than what the defence needs
         _messages(frame, detector, session.opening.ego_id)
     chosen = _recorded_defense(session, detector, kinds) if defense is None else defense
-    running: Session | None = None
-    team: tuple[str, ...] = ()
+    going: dict[Path | None, tuple[Session, tuple[str, ...]]] = {}
     for frame in session.frames:
         decided = frame.decided
+        file = frame.file.path if as_it_was else None  # what a frame goes on from is in its own file
         if as_it_was and decided.before is not None:
             saved = {"state": decided.before.state, "previous": decided.before.previous}
-            running, team = Session(detector, decided.team, chosen, saved), decided.team
-        if running is None:
-            running, team = Session(detector, decided.team, chosen), decided.team
+            going[file] = Session(detector, decided.team, chosen, saved), decided.team
+        if file not in going:
+            going[file] = Session(detector, decided.team, chosen), decided.team
+        running, team = going[file]
         if team != decided.team:
             running.change_team(decided.team)
-            team = decided.team
+            going[file] = running, decided.team
         messages = _messages(frame, detector, session.opening.ego_id)
         ego = messages.pop(session.opening.ego_id)
         rng = np.random.default_rng(int(decided.seed, 16))

@@ -130,6 +130,7 @@ class RecordedSession:
     opening: Opening
     """Of the first file that is there."""
     frames: Sequence[RecordedFrame]
+    """By their numbers, whichever file they are in."""
     files: Sequence[RecordedFile]
 
     @property
@@ -157,9 +158,14 @@ def sessions(path: Path) -> list[RecordedSession]:
     for file in sorted(files, key=lambda file: file.frames[0].time_ns if file.frames else 0):
         parts.setdefault(file.opening.session_id, []).append(file)
     return [
-        RecordedSession(group[0].opening, [frame for file in group for frame in file.frames], group)
+        RecordedSession(group[0].opening, sorted((f for file in group for f in file.frames), key=_number), group)
         for group in parts.values()
     ]
+
+
+def _number(frame: RecordedFrame) -> int:
+    """Its place among those of its session, which several processes may have answered by turns."""
+    return frame.number
 
 
 def _of_folder(folder: Path) -> list[RecordedFile]:

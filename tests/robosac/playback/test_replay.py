@@ -8,7 +8,7 @@ from robosac.detectors.base import DetectorInfo, TensorSpec
 from robosac.playback.comparing import Compared
 from robosac.playback.replay import replay
 from robosac.recording.reading import RecordingError, sessions
-from tests.recorded import write
+from tests.recorded import moments, write
 
 
 @pytest.fixture(scope="module")
@@ -31,6 +31,15 @@ def test_recorded_decisions_come_out_the_same(session, detector):
 def test_so_they_do_after_a_gap(detector, some, tmp_path):
     (session,) = sessions(write(tmp_path / "gap.mcap", detector, [some[0], some[3]]))
     assert [each.differing for each in replay(session, detector)] == [(), ()]
+
+
+def test_so_they_do_where_a_file_goes_on_from_its_own_frames_and_others_are_in_between(detector, tmp_path):
+    write(tmp_path / "here.mcap", detector, moments(detector, (0, 2, 4), attacker="car-2"))
+    write(tmp_path / "there.mcap", detector, moments(detector, (1, 3), attacker="car-3"))
+    (session,) = sessions(tmp_path)
+    assert [frame.decided.before is None for frame in session.frames] == [False, False, True, True, True]
+    replayed = list(replay(session, detector))
+    assert [(each.frame.number, each.differing) for each in replayed] == [(number, ()) for number in range(5)]
 
 
 def test_a_recording_that_was_changed_does_not(session, detector):

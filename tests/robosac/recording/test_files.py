@@ -113,6 +113,14 @@ def test_the_files_of_a_session_are_one_recording(detector, some, tmp_path):
     assert (len(other.frames), other.opening.ego_id) == (1, EGO)
 
 
+def test_the_frames_of_a_session_that_came_back_are_in_order(detector, recorded_moments, tmp_path):
+    write(tmp_path / "here.mcap", detector, recorded_moments[0:6:2])
+    write(tmp_path / "there.mcap", detector, recorded_moments[1:6:2])
+    (session,) = sessions(tmp_path)
+    assert [frame.number for frame in session.frames] == [0, 1, 2, 3, 4, 5]
+    assert [file.path.name for file in session.files] == ["here.mcap", "there.mcap"]
+
+
 def test_what_is_no_recording_is_refused(tmp_path):
     (tmp_path / "text.mcap").write_text("no recording at all")
     with pytest.raises(RecordingError, match="is no MCAP file"):
