@@ -3,7 +3,8 @@
 Each class here takes a scene and is one: the same agents, the same truth, but somebody senses worse, is late, or is
 wrong about its pose. They can be put around each other, and around scenes of one's own data. A *teammate* is any agent
 but the first ego, the one that sequences belong to; only `JumpingEgo` and `NarrowEgo` touch that. True boxes stay those
-of the scene itself: what rain hides is there all the same.
+of the scene itself: what rain hides is there all the same. In a recording, whose views hold messages in the place of
+returns, what changes returns changes nothing.
 
 What is random follows from the scene's number, the frame's, and the agent, so any frame can be had by itself.
 """
@@ -11,7 +12,7 @@ What is random follows from the scene's number, the frame's, and the agent, so a
 from __future__ import annotations
 
 from abc import ABC, abstractmethod
-from collections.abc import Mapping
+from collections.abc import Iterable, Iterator, Mapping, Sequence
 from dataclasses import dataclass, field, replace
 
 import numpy as np
@@ -35,6 +36,12 @@ class DisturbedFrame:
     def index(self) -> int:
         """That of the original."""
         return self.original.index
+
+    @property
+    def attackers(self) -> Sequence[str]:
+        """Agents whose messages are attacks already, as the original names them."""
+        named: Sequence[str] = getattr(self.original, "attackers", ())
+        return named
 
     def truth(self, ego: str) -> FloatArray:
         """True boxes (G, 5) of the original, in the frame of the sensor as it really stands."""
@@ -79,12 +86,12 @@ class Rain(Disturbed):
     """Of the others, ``exp(-distance / reach_m)`` are left."""
 
     def views(self, frame: Frame) -> Mapping[str, View]:
-        disturbed = {}
-        for number, name in enumerate(self.agents):
-            if (view := frame.views.get(name)) is not None:
-                kept = (1.0 - self.missing) * np.exp(-np.linalg.norm(view.points, axis=1) / self.reach_m)
-                drawn = self.rng(_RAIN, frame.index, number).random(len(kept))
-                disturbed[name] = View(view.pose, view.points[drawn < kept])
+        disturbed = dict(frame.views)
+        numbers = {name: number for number, name in enumerate(self.agents)}
+        for name, view in scans(frame, self.agents):
+            kept = (1.0 - self.missing) * np.exp(-np.linalg.norm(view.points, axis=1) / self.reach_m)
+            drawn = self.rng(_RAIN, frame.index, numbers[name]).random(len(kept))
+            disturbed[name] = View(view.pose, view.points[drawn < kept])
         return disturbed
 
 
@@ -97,13 +104,11 @@ class NoisyScanner(Disturbed):
 
     def views(self, frame: Frame) -> Mapping[str, View]:
         disturbed = dict(frame.views)
-        for name in self.one_of_them(_NOISY):
-            if name in disturbed:
-                view = disturbed[name]
-                distance = np.maximum(np.linalg.norm(view.points, axis=1), 0.1)
-                wrong = self.rng(_NOISE, frame.index).normal(0.0, self.noise_m, len(distance))
-                stretch = np.maximum(1.0 + wrong / distance, 0.0).astype(view.points.dtype)
-                disturbed[name] = View(view.pose, view.points * stretch[:, None])
+        for name, view in scans(frame, self.one_of_them(_NOISY)):
+            distance = np.maximum(np.linalg.norm(view.points, axis=1), 0.1)
+            wrong = self.rng(_NOISE, frame.index).normal(0.0, self.noise_m, len(distance))
+            stretch = np.maximum(1.0 + wrong / distance, 0.0).astype(view.points.dtype)
+            disturbed[name] = View(view.pose, view.points * stretch[:, None])
         return disturbed
 
 
@@ -133,7 +138,7 @@ class Late(Disturbed):
             for name in late:
                 if name in disturbed and name in earlier:
                     old = earlier[name]
-                    disturbed[name] = View(disturbed[name].pose if self.fresh_pose else old.pose, old.points)
+                    disturbed[name] = replace(old, pose=disturbed[name].pose) if self.fresh_pose else old
         self._keep(frame)
         return disturbed
 
@@ -198,12 +203,19 @@ class NarrowEgo(Disturbed):
     """How wide."""
 
     def views(self, frame: Frame) -> Mapping[str, View]:
-        ego = self.egos[0]
-        if ego not in frame.views:
-            return frame.views
-        view = frame.views[ego]
-        seen = np.abs(np.arctan2(view.points[:, 1], view.points[:, 0])) <= np.deg2rad(self.view_deg / 2)
-        return {**frame.views, ego: View(view.pose, view.points[seen])}
+        disturbed = dict(frame.views)
+        for name, view in scans(frame, self.egos[:1]):
+            seen = np.abs(np.arctan2(view.points[:, 1], view.points[:, 0])) <= np.deg2rad(self.view_deg / 2)
+            disturbed[name] = View(view.pose, view.points[seen])
+        return disturbed
+
+
+def scans(frame: Frame, names: Iterable[str]) -> Iterator[tuple[str, View]]:
+    """The views of those who are present with what they sense. A view with a message holds what was sent instead."""
+    for name in names:
+        view = frame.views.get(name)
+        if view is not None and getattr(view, "message", None) is None:
+            yield name, view
 
 
 def replaced(view: View, dx: float, dy: float, turn: float = 0.0) -> View:

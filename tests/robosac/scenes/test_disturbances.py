@@ -1,8 +1,10 @@
 import numpy as np
 import pytest
 
-from robosac.scenes import IntersectionScene
-from robosac.scenes.disturbances import Biased, Dropped, JumpingEgo, Late, NarrowEgo, NoisyScanner, Rain
+from robosac.scenes import IntersectionScene, encoded
+from robosac.scenes.disturbances import _LATE, Biased, Dropped, JumpingEgo, Late, NarrowEgo, NoisyScanner, Rain
+from robosac.scenes.recorded import Recording
+from tests.recorded import write
 
 SCENE = IntersectionScene(4)
 TEAM = SCENE.agents[1:]
@@ -182,3 +184,34 @@ def test_a_scene_without_teammates_can_be_disturbed():
 
     for disturbed in EVERYTHING:
         assert list(disturbed(Alone()).frame(1).views) == ["car-1"]
+
+
+@pytest.fixture(scope="module")
+def recorded(detector, recorded_moments, tmp_path_factory):
+    (scene,) = Recording(write(tmp_path_factory.mktemp("recording") / "one.mcap", detector, recorded_moments)).scenes(
+        "test"
+    )
+    return scene
+
+
+@pytest.mark.parametrize("disturbed", EVERYTHING)
+def test_recorded_messages_stay_what_was_sent(disturbed, recorded, detector):
+    scene = disturbed(recorded)
+    frame, now, before = scene.frame(3), recorded.frame(3).views, recorded.frame(2).views
+    late = scene.one_of_them(_LATE) if disturbed is Late else ()
+    for name, view in frame.views.items():
+        sent = (before if name in late else now)[name]
+        np.testing.assert_array_equal(
+            encoded(view, detector).tensors["features"], encoded(sent, detector).tensors["features"]
+        )
+    assert set(frame.views) == set(now) or disturbed is Dropped
+    assert frame.attackers == ("car-2",)
+
+
+@pytest.mark.parametrize("fresh", [True, False])
+def test_a_late_message_of_a_recording_has_the_pose_that_it_should(fresh, recorded, detector):
+    now, before, sent = recorded.frame(3), recorded.frame(2), Late(recorded, everybody=True, fresh_pose=fresh).frame(3)
+    for name in recorded.agents[1:]:
+        message = encoded(sent.views[name], detector)
+        np.testing.assert_array_equal(message.pose, (now if fresh else before).views[name].pose)
+        np.testing.assert_array_equal(message.tensors["features"], before.views[name].message.tensors["features"])
