@@ -64,7 +64,7 @@ class V2XSimFrame:
     """One instant of a scene; the world is the frame of the first agent present."""
 
     index: int
-    """As its folder says."""
+    """Its place among the frames that are listed; the folder may have another number."""
     views: Mapping[str, View]
     """By agent id: those present. Points are the centres of occupied voxels. The roadside unit's are moved down with
     its pose, by 5 m, so that its voxels are as high above its sensor as a vehicle's.
@@ -90,18 +90,18 @@ class V2XSimScene:
     frame_period_s = FRAME_PERIOD_S
 
     @cached_property
-    def _indices(self) -> list[int]:
+    def _folders(self) -> list[str]:
         return _listed(self.root)[self.number]
 
     @property
     def length(self) -> int:
         """Number of frames that are listed."""
-        return len(self._indices)
+        return len(self._folders)
 
     @cached_property
     def agents(self) -> tuple[str, ...]:
         """Those present in the first frame, the roadside unit last."""
-        return tuple(sorted(self._samples(self._indices[0]), key=lambda name: (name == ROADSIDE_UNIT, name)))
+        return tuple(sorted(self._samples(self._folders[0]), key=lambda name: (name == ROADSIDE_UNIT, name)))
 
     @property
     def egos(self) -> tuple[str, ...]:
@@ -109,27 +109,27 @@ class V2XSimScene:
         return tuple(name for name in self.agents if name != ROADSIDE_UNIT)
 
     def frame(self, index: int) -> V2XSimFrame:
-        """The listed frame of a number.
+        """The frame of a place in the list.
 
         Raises
         ------
         SampleError
             If a file is not a sample, or does not say where a present agent is.
         """
-        listed = self._indices[index]
-        samples = self._samples(listed)
+        folder = self._folders[index]
+        samples = self._samples(folder)
         views = {}
         for name, sample in samples.items():
             pose = next(iter(samples.values())).trans_matrices[int(name.removeprefix("agent"))].copy()
             if not np.allclose(pose[:3, :3] @ pose[:3, :3].T, np.eye(3), atol=1e-3):
-                raise SampleError(f"{self.root}: scene {self.number}, frame {listed}: no pose of {name}")
+                raise SampleError(f"{self.root}: {folder}: no pose of {name}")
             if name == ROADSIDE_UNIT:
                 pose[:3, 3] += pose[:3, 2] * (ROADSIDE_BOTTOM_M - BOTTOM_M)
             views[name] = View(pose, centres(sample.voxels))
-        return V2XSimFrame(listed, views, {name: sample.truth for name, sample in samples.items()})
+        return V2XSimFrame(index, views, {name: sample.truth for name, sample in samples.items()})
 
-    def _samples(self, index: int) -> dict[str, V2XSimSample]:
-        paths = {f"agent{k}": self.root / f"agent{k}" / f"{self.number}_{index}" / "0.npy" for k in range(AGENTS)}
+    def _samples(self, folder: str) -> dict[str, V2XSimSample]:
+        paths = {f"agent{k}": self.root / f"agent{k}" / folder / "0.npy" for k in range(AGENTS)}
         read = {name: read_sample(path) for name, path in paths.items() if path.exists()}
         return {name: sample for name, sample in read.items() if sample is not None}
 
@@ -177,14 +177,22 @@ class V2XSim:
         return [V2XSimScene(root, number) for number in numbers]
 
 
-def _listed(root: Path) -> dict[int, list[int]]:
-    """Numbers of scenes, and of the frames of each."""
-    found = [_FOLDER.fullmatch(folder.name) for folder in root.glob(f"agent[0-{AGENTS - 1}]/*_*")]
-    listed: dict[int, set[int]] = {}
-    for match in found:
-        if match:
-            listed.setdefault(int(match[1]), set()).add(int(match[2]))
-    return {scene: sorted(listed[scene]) for scene in sorted(listed)}
+def _listed(root: Path) -> dict[int, list[str]]:
+    """Numbers of scenes, and the folders of each by the numbers of their frames.
+
+    Raises
+    ------
+    SceneError
+        If two folders are the same frame.
+    """
+    listed: dict[int, dict[int, str]] = {}
+    for name in sorted({folder.name for folder in root.glob(f"agent[0-{AGENTS - 1}]/*_*")}):
+        if match := _FOLDER.fullmatch(name):
+            scene, frame = int(match[1]), int(match[2])
+            known = listed.setdefault(scene, {}).setdefault(frame, name)
+            if known != name:
+                raise SceneError(f"{root}: {known} and {name} are the same frame")
+    return {scene: [listed[scene][frame] for frame in sorted(listed[scene])] for scene in sorted(listed)}
 
 
 def read_sample(path: Path) -> V2XSimSample | None:

@@ -7,6 +7,7 @@ from robosac.boxes import pose_matrix
 from robosac.detectors.v2xsim.anchors import anchor_boxes
 from robosac.detectors.v2xsim.voxels import occupancy
 from robosac.scenes import SOURCES, SceneError
+from robosac.scenes.disturbances import Late
 from robosac.scenes.v2xsim import SampleError, V2XSim, V2XSimScene, read_sample
 
 POSES = {0: pose_matrix(1.0, 2.0, 0.0, 0.3), 2: pose_matrix(-4.0, 6.0, 0.0, -1.1), 5: pose_matrix(8.0, 0.0, 0.0, 2.0)}
@@ -56,8 +57,30 @@ def test_a_scene_has_those_present_in_its_first_frame(scene):
     assert (scene.number, scene.length) == (8, 2)
     assert scene.agents == ("agent2", "agent5", "agent0")
     assert scene.egos == ("agent2", "agent5")
-    assert [scene.frame(index).index for index in range(2)] == [2, 10]
+    assert [scene.frame(index).index for index in range(2)] == [0, 1]
     assert all(list(scene.frame(index).views) == ["agent0", "agent2", "agent5"] for index in range(2))
+
+
+def test_a_late_teammate_sends_the_frame_listed_before(root, scene):
+    moved = sample(5) | {"voxel_indices_0": np.array([[9, 9, 9]], dtype=np.int32)}
+    np.save(root / "agent5" / "8_10" / "0.npy", moved)
+    late = Late(scene, everybody=True)
+    for index in range(2):
+        sent, before = late.frame(index).views["agent5"], scene.frame(0).views["agent5"]
+        np.testing.assert_array_equal(sent.points, before.points)
+    assert len(scene.frame(1).views["agent5"].points) == 1
+
+
+def test_folders_may_be_padded_with_zeros(root):
+    for folder in root.glob("agent*/8_2"):
+        folder.rename(folder.with_name("08_002"))
+    (scene,) = V2XSim(root).scenes("test")
+    assert (scene.number, scene.length) == (8, 2)
+    assert scene.agents == ("agent2", "agent5", "agent0")
+    assert all(list(scene.frame(index).views) == ["agent0", "agent2", "agent5"] for index in range(2))
+    (root / "agent2" / "8_2").mkdir()
+    with pytest.raises(SceneError, match="08_002 and 8_2 are the same frame"):
+        V2XSim(root).scenes("test")
 
 
 def test_folders_for_each_purpose_are_told_apart(root, tmp_path):
