@@ -48,10 +48,15 @@ def checks(report: Report) -> list[Check]:
     Raises
     ------
     ValueError
-        As `costs_of`.
+        As `costs_of`, or if costs were fitted to all loads.
     """
     costs, fitted = costs_of(report), calibration(report)
-    return [check for load in report.loads if load not in fitted for check in _of_load(costs, report, load)]
+    others = [load for load in report.loads if load not in fitted]
+    if not others:
+        raise ValueError(
+            "the report has no load to compare with: costs were fitted to all; measure with --egos 1 --egos 4"
+        )
+    return [check for load in others for check in _of_load(costs, report, load)]
 
 
 def predicted_fps(costs: Costs, load: MeasuredLoad, processes: int, cores: int) -> float:

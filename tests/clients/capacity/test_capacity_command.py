@@ -22,6 +22,11 @@ def run(*arguments):
     return CliRunner().invoke(APP, [*map(str, arguments)])
 
 
+def said(result):
+    """What a command said, without the frame and its line breaks."""
+    return " ".join(result.output.replace("│", "").split())
+
+
 def test_a_plan_is_told_as_a_table_and_as_json(report, tmp_path):
     out = tmp_path / "out"
     result = run(report, "--vehicles", 400, "--attacked", 0, "--database-writes", 500, "--frames", 100, "--out", out)
@@ -50,6 +55,13 @@ def test_a_model_that_is_off_ends_the_check_with_1(report, tmp_path):
     assert (4, True, "frames a second") in told
 
 
+def test_a_check_that_could_compare_nothing_says_so(report):
+    report.write_text(json.dumps(a_report(egos=(1,))))
+    result = run("--check", report)
+    assert result.exit_code == 2
+    assert "no load to compare with" in said(result)
+
+
 def test_the_day_of_a_city_is_told_for_each_way_to_place_sessions(report, tmp_path):
     options = ["--vehicles", 60, "--frames", 40, "--city", "--out", tmp_path / "out"]
     result = run(report, *options)
@@ -72,11 +84,10 @@ def test_a_report_that_is_none_is_the_arguments_fault(tmp_path):
 def test_a_team_that_was_not_measured_is_explained(report):
     result = run(report, "--teammates", 9)
     assert result.exit_code == 2
-    assert "measured 5 only" in " ".join(result.output.replace("│", "").split())
+    assert "measured 5 only" in said(result)
 
 
 def test_a_budget_without_time_for_a_frame_is_to_blame_itself(report):
     result = run(report, "--budget-ms", 1)
     assert result.exit_code == 2
-    said = " ".join(result.output.replace("│", "").split())
-    assert "for --budget-ms or --rate: no process answers 5 frames a second within 1 ms: one takes " in said
+    assert "for --budget-ms or --rate: no process answers 5 frames a second within 1 ms: one takes " in said(result)
