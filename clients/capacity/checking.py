@@ -2,11 +2,10 @@
 
 from __future__ import annotations
 
-import math
 from collections.abc import Iterator
 from dataclasses import dataclass
 
-from clients.capacity.costs import TIMES, Costs, calibration, costs_of, others_at_work
+from clients.capacity.costs import Costs, calibration, costs_of, others_at_work
 from clients.capacity.queueing import closed_rate
 from clients.capacity.report import MeasuredLoad, Report
 
@@ -48,7 +47,7 @@ def checks(report: Report) -> list[Check]:
     Raises
     ------
     ValueError
-        As `costs_of`, or if costs were fitted to all loads.
+        As `costs_of` and `predicted_fps`, or if costs were fitted to all loads.
     """
     costs, fitted = costs_of(report), calibration(report)
     others = [load for load in report.loads if load not in fitted]
@@ -71,12 +70,16 @@ def predicted_fps(costs: Costs, load: MeasuredLoad, processes: int, cores: int) 
     meanwhile (`MeasuredLoad.slowness`). How many do depends on the rate, so that the rate is the one that agrees with
     itself. Egos are where they fell, or else spread evenly. In an open loop no more is answered than is asked. Frames
     that are refused are not in it: measure with a budget that refuses none.
+
+    Raises
+    ------
+    ValueError
+        If processor time was not measured.
     """
     at = (load.teammates, load.sampling_steps_mean)
     latency_ms = costs.latency_ms.at(*at)
-    gateway_ms, client_ms, machine_ms = (line.at(*at) if (line := costs.used[name]) else math.nan for name in TIMES)
-    if math.isnan(machine_ms):
-        machine_ms = gateway_ms + client_ms
+    gateway_ms, machine = costs.known("gateway_cpu_ms").at(*at), costs.used["machine_cpu_ms"]
+    machine_ms = gateway_ms + costs.known("client_cpu_ms").at(*at) if machine is None else machine.at(*at)
     delay_ms = max(0.0, latency_ms - gateway_ms / OVERLAP)
     even = [load.egos // processes + (number < load.egos % processes) for number in range(processes)]
     shares = load.placed or even

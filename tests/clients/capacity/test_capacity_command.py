@@ -62,6 +62,19 @@ def test_a_check_that_could_compare_nothing_says_so(report):
     assert "no load to compare with" in said(result)
 
 
+@pytest.mark.parametrize("cost", ["gateway_cpu_ms", "client_cpu_ms"])
+@pytest.mark.parametrize("options", [(), ("--check",)])
+def test_without_processor_time_nothing_is_told(report, options, cost, tmp_path):
+    told = json.loads(report.read_text())
+    for load in told["loads"]:
+        load["used_a_frame"][cost] = None
+    report.write_text(json.dumps(told))
+    result = run(report, *options, "--frames", 10, "--out", tmp_path / "out")
+    assert result.exit_code == 2
+    assert f"the report has no {cost}" in said(result)
+    assert not list((tmp_path / "out").iterdir())
+
+
 def test_the_day_of_a_city_is_told_for_each_way_to_place_sessions(report, tmp_path):
     options = ["--vehicles", 60, "--frames", 40, "--city", "--out", tmp_path / "out"]
     result = run(report, *options)
