@@ -3,11 +3,14 @@
 from __future__ import annotations
 
 from pathlib import Path
-from typing import Any, Literal
+from typing import Annotated, Any, Literal
 
-from pydantic import BaseModel, ConfigDict, Field, ValidationError
+from pydantic import BaseModel, ConfigDict, Field, ValidationError, field_validator
+
+from robosac.faults import in_words
 
 Positive = Field(gt=0, allow_inf_nan=False)
+Amount = Annotated[float, Field(ge=0, allow_inf_nan=False)]
 
 
 class Tested(BaseModel):
@@ -44,13 +47,21 @@ class MeasuredLoad(BaseModel):
     fps: float = Positive
     sampling_steps_mean: float = Field(ge=0, allow_inf_nan=False)
     by_steps: dict[int, Tested] = Field(min_length=1)
-    used_a_frame: dict[str, float | None]
-    stages_ms: dict[str, float]
+    used_a_frame: dict[str, Amount | None]
+    stages_ms: dict[str, Amount]
     errors: dict[str, int]
     placed: list[int] | None = None
     """Egos of each process; None where it is not known."""
     pace: MeasuredPace | None = None
     """None in reports of older versions, and where costs were not measured."""
+
+    @field_validator("used_a_frame")
+    @classmethod
+    def _takes_time(cls, used: dict[str, float | None]) -> dict[str, float | None]:
+        for name in ("gateway_cpu_ms", "machine_cpu_ms"):
+            if used.get(name) == 0:
+                raise ValueError(f"{name} must be above 0: no frame is decided without processor time")
+        return used
 
     def slowness(self, reference_ms: float | None, others: float) -> float:
         """By how much more processor time a computation takes in this load than at the reference's pace on a core
@@ -114,4 +125,4 @@ def read_report(path: Path) -> Report:
     except ValidationError as error:
         first = error.errors()[0]
         where = ".".join(map(str, first["loc"])) or "the file"
-        raise ValueError(f"{path}: {where}: {first['msg']} (reports come from `robosac load-test --out`)") from error
+        raise ValueError(f"{path}: {where}: {in_words(first)} (reports come from `robosac load-test --out`)") from error

@@ -47,12 +47,27 @@ def test_what_was_not_measured_is_not_made_up():
         costs_of(Report.model_validate(honest))
 
 
+def used(report):
+    return report["loads"][0]["used_a_frame"]
+
+
 @pytest.mark.parametrize(
     ("change", "field"),
     [
         (lambda report: report["loads"][0].pop("by_steps"), r"loads\.0\.by_steps"),
         (lambda report: report["loads"][3].update(fps=0), r"loads\.3\.fps"),
         (lambda report: report.update(loads=[]), "loads"),
+        (
+            lambda report: used(report).update(gateway_cpu_ms=0.0),
+            r"loads\.0\.used_a_frame: gateway_cpu_ms must be above 0",
+        ),
+        (
+            lambda report: used(report).update(machine_cpu_ms=0.0),
+            r"loads\.0\.used_a_frame: machine_cpu_ms must be above 0",
+        ),
+        (lambda report: used(report).update(disk_bytes=-5.0), r"loads\.0\.used_a_frame\.disk_bytes"),
+        (lambda report: used(report).update(gateway_cpu_ms=1e999), r"loads\.0\.used_a_frame\.gateway_cpu_ms"),
+        (lambda report: report["loads"][0]["stages_ms"].update(store=-4.0), r"loads\.0\.stages_ms\.store"),
         (lambda report: report.pop("machine"), "machine"),
     ],
 )
