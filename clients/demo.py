@@ -72,7 +72,7 @@ async def run(
         while watch:
             await run_fleet(options, console)
     if record is not None:
-        console.print(f"Recorded: robosac record info {record}")
+        outputs.tell(console, f"Recorded: robosac record info {record}")
     return summary
 
 

@@ -26,6 +26,7 @@ from robosac.answers import FrameAnswer
 from robosac.attacks import CAMPAIGN_HELP
 from robosac.cli.blame import blaming
 from robosac.cli.options import check_attack, load_data, load_detector
+from robosac.cli.outputs import tell
 from robosac.detectors import DEFAULT_DETECTOR, Detector
 from robosac.evaluation.frames import another_scene
 from robosac.recording.truth import Truth
@@ -326,7 +327,7 @@ def close_run(options: FleetOptions, summary: FleetSummary, console: Console) ->
         picture = summary.write(options.report, settings)
     summary.print(console)
     if options.report is not None:
-        console.print(f"Report: {options.report / REPORT} and {picture}")
+        tell(console, f"Report: {options.report / REPORT} and {picture}")
 
 
 if __name__ == "__main__":

@@ -23,7 +23,7 @@ from robosac.calibrated import calibration_of
 from robosac.cli.blame import blaming, failing
 from robosac.cli.named import load_named
 from robosac.cli.options import progress
-from robosac.cli.outputs import Force, check_file, make_folder
+from robosac.cli.outputs import Force, check_file, make_folder, tell
 from robosac.cli.printing import printable
 from robosac.defenses import Defense, build
 from robosac.detectors import Detector
@@ -166,7 +166,7 @@ def export(
             Form.ROS2: lambda: plain.write_ros2(chosen, out),
         }[to]()
         bar.update(task, completed=len(chosen.frames))
-    console.print(_literally(f"{out}: {len(chosen.frames)} frames of {chosen.opening.ego_id}"))
+    tell(console, printable(f"{out}: {len(chosen.frames)} frames of {chosen.opening.ego_id}"))
 
 
 def _check_form(to: Form, out: Path) -> None:

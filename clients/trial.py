@@ -139,7 +139,7 @@ def write(report: Any, out: Path | None, name: str, console: Console) -> None:
     """Write a report to a folder, where one is given, and say so."""
     if out is not None:
         write_text(out / name, json.dumps(report, indent=2) + "\n")
-        console.print(f"Written: {out / name}")
+        outputs.tell(console, f"Written: {out / name}")
 
 
 def percentiles(values: Sequence[float]) -> dict[str, float | None]:

@@ -12,7 +12,7 @@ from rich.console import Console
 
 from robosac.cli.blame import blaming
 from robosac.cli.options import DataName, DetectorName, load_data, load_detector, progress
-from robosac.cli.outputs import Force, check_file
+from robosac.cli.outputs import Force, check_file, tell
 from robosac.detectors import DEFAULT_DETECTOR
 from robosac.evaluation.benign_scores import single_teammate_indices
 from robosac.files import write_text
@@ -38,4 +38,4 @@ def run(
         task = bar.add_task("scenes", total=scenes)
         indices = single_teammate_indices(chosen, wanted, lambda: bar.advance(task))
     write_text(out, json.dumps([round(index, DIGITS) for index in indices]) + "\n")
-    console.print(f"{out}: {len(indices)} Jaccard indices")
+    tell(console, f"{out}: {len(indices)} Jaccard indices")

@@ -11,6 +11,7 @@ import torch
 import typer
 from rich.console import Console
 from rich.table import Table
+from rich.text import Text
 
 from robosac.attacks import ATTACKS
 from robosac.calibrated import without_witness
@@ -32,7 +33,7 @@ from robosac.cli.options import (
     load_worlds,
     progress,
 )
-from robosac.cli.outputs import Force, check_file
+from robosac.cli.outputs import Force, check_file, tell
 from robosac.defenses.group_testing import Calibration, CalibrationError
 from robosac.detectors import DEFAULT_DETECTOR, Detector, Encoder
 from robosac.files import replacing
@@ -129,7 +130,7 @@ def run(  # the options of a command line
         _check_worlds(chosen, worlds, check_scenes, beside, command(context), console)
     for error_m, bins in reliability.items():
         _print(console, error_m, bins)
-    console.print(f"{out}: {calibration.detector}, weights {calibration.weights_digest:.12}...")
+    tell(console, f"{out}: {calibration.detector}, weights {calibration.weights_digest:.12}...")
     if chosen.info.witness is None:
         console.print(f"{without_witness(chosen.info.name)}.", markup=False)
 
@@ -166,7 +167,7 @@ def _check_worlds(
         table.add_column(heading, justify="left" if heading == "world" else "right")
     for name, each in found.items():
         counts = (each.honest, each.honest_suspected, each.attackers, each.attackers_suspected)
-        table.add_row(name, *map(str, counts), f"{each.error:.3f}")
+        table.add_row(Text(name), *map(str, counts), f"{each.error:.3f}")
     console.print(table)
 
 

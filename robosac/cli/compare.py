@@ -30,7 +30,7 @@ from robosac.cli.options import (
     load_worlds,
     progress,
 )
-from robosac.cli.outputs import Force, make_folder
+from robosac.cli.outputs import Force, make_folder, tell
 from robosac.defenses import Defense
 from robosac.detectors import DEFAULT_DETECTOR, Detector, DetectorError
 from robosac.detectors.loading import DETECTORS
@@ -120,7 +120,7 @@ def run(  # the options of a command line
     columns, left_out = _defenses(only or (), defense or (), chosen)
     possible, impossible = _possible(extent, chosen, asked=bool(setting))
     for why in (*left_out, *impossible):
-        console.print(f"Left out: {why}")
+        tell(console, f"Left out: {why}")
     if lacks_witness(columns):
         console.print(f"{without_witness(chosen.info.name)}.", markup=False)
     extent = replace(extent, settings=possible)
@@ -145,7 +145,7 @@ def run(  # the options of a command line
         console.print("Stopped. The same command goes on from the sequences that are played.")
         raise typer.Exit(130) from None
     rows = sum(len(each) for each in found)
-    console.print(f"{path}: {rows} rows in {(time.monotonic() - started) / 60:.1f} minutes")
+    tell(console, f"{path}: {rows} rows in {(time.monotonic() - started) / 60:.1f} minutes")
 
 
 def _write(rows: Mapping[str, Sequence[Row]], plans: Mapping[str, Plan], out: Path, line: str) -> Path:

@@ -17,7 +17,7 @@ from robosac import attacks
 from robosac.attacks import CAMPAIGN_HELP, AttackError
 from robosac.cli.blame import blaming, failing
 from robosac.cli.options import DataName, DetectorName, Seed, check_attack, load_data, load_detector, progress
-from robosac.cli.outputs import Force, make_folder
+from robosac.cli.outputs import Force, make_folder, tell
 from robosac.detectors import DEFAULT_DETECTOR, DetectorError
 from robosac.evaluation import BoundsReport, NoFrames, Sampling, evaluate_bounds
 from robosac.evaluation.frames import evaluation_frames
@@ -79,7 +79,7 @@ def run(  # the options of a command line
         }
         text = json.dumps({"settings": settings, **asdict(report)}, indent=2, allow_nan=False)
         write_text(out / REPORT, text + "\n")
-        console.print(f"Written: {out / REPORT}")
+        tell(console, f"Written: {out / REPORT}")
 
 
 def _print(console: Console, report: BoundsReport, attack: str, attackers: int) -> None:

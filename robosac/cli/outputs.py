@@ -13,6 +13,8 @@ from pathlib import Path
 from typing import Annotated
 
 import typer
+from rich.console import Console
+from rich.text import Text
 
 from robosac import files
 from robosac.cli.blame import blaming
@@ -25,6 +27,11 @@ def spell_what_can_be() -> None:
     for stream in (sys.stdout, sys.stderr):
         if isinstance(stream, io.TextIOWrapper):
             stream.reconfigure(errors="replace")
+
+
+def tell(console: Console, line: str) -> None:
+    """Print a line that names a file: as it is and whole, since a name of which something is missing is no file's."""
+    console.print(Text(line), soft_wrap=True)
 
 
 def check_file(path: Path, option: str, force: bool) -> None:

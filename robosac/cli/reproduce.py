@@ -13,7 +13,7 @@ from rich.console import Console
 
 from robosac.cli.blame import blaming, check_known
 from robosac.cli.options import DataName, DetectorName, Seed, command, load_data, load_detector, progress
-from robosac.cli.outputs import Force, make_folder
+from robosac.cli.outputs import Force, make_folder, tell
 from robosac.detectors import DEFAULT_DETECTOR, EmbeddedDetector
 from robosac.detectors.embedded import ADVERSARIAL_WEIGHTS
 from robosac.evaluation.experiments import EXPERIMENTS, FULL, HEAD, QUICK, Context
@@ -66,4 +66,4 @@ def run(  # the options of a command line
     minutes = (time.monotonic() - started) / 60
     head = HEAD.format(command=command(context), minutes=max(minutes, 1.0))
     path = write_report(out / REPORT, head, sections)
-    console.print(f"{path}: {len(sections)} experiments in {minutes:.1f} minutes")
+    tell(console, f"{path}: {len(sections)} experiments in {minutes:.1f} minutes")

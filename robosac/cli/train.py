@@ -14,7 +14,7 @@ from rich.progress import TaskID, TextColumn
 
 from robosac.cli.blame import check_known, failing
 from robosac.cli.options import progress
-from robosac.cli.outputs import Force, make_folder
+from robosac.cli.outputs import Force, make_folder, tell
 from robosac.detectors.embedded import ADVERSARIAL_WEIGHTS, SHIPPED_WEIGHTS
 from robosac.detectors.weights_file import read_weights
 from robosac.training.adversary import AdversaryConfig
@@ -103,6 +103,6 @@ def _train(console: Console, out: Path, plan: _Plan) -> None:
         point = choose_operating_point(attacked, lambda: bar.advance(validating), plan.gains, plan.harm)
         bar.update(validating, completed=len(plan.gains), remark="")
     recipe = export_weights(network, plan.config, point, plan.command, weights)
-    console.print(f"{weights}: {weights.stat().st_size / 1e6:.2f} MB")
+    tell(console, f"{weights}: {weights.stat().st_size / 1e6:.2f} MB")
     shown = ("feature_gain", "consensus_score", "validation", "tensors_sha256")
     console.print_json(data={key: recipe[key] for key in shown})

@@ -15,7 +15,7 @@ from robosac.calibration.witness import WitnessRecipe, lessons, train, training_
 from robosac.calibration.witness_check import check
 from robosac.cli.blame import blaming, failing
 from robosac.cli.options import DetectorName, Seed, command, load_data, load_detector, progress
-from robosac.cli.outputs import Force, check_file
+from robosac.cli.outputs import Force, check_file, tell
 from robosac.detectors import DEFAULT_DETECTOR, Encoder
 from robosac.detectors.witness_network import Layout
 from robosac.plugins import lacks
@@ -78,4 +78,4 @@ def run(  # the options of a command line
     for name, value in list(asdict(figures).items())[1:]:
         table.add_row(name.replace("_m", ", metres").replace("_", " "), f"{value:.4f}")
     console.print(table)
-    console.print(f"{out}: {chosen.info.name}, weights {chosen.info.weights_digest:.12}...")
+    tell(console, f"{out}: {chosen.info.name}, weights {chosen.info.weights_digest:.12}...")

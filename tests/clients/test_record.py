@@ -231,6 +231,8 @@ async def test_an_empty_recording_is_played_to_nobody(detector, recorded_moments
 
 
 def test_perceived_objects_are_exported(path, tmp_path):
-    status, said = run("export", path, "--to", "cpm", "--out", tmp_path / "out.jsonl")
+    out = tmp_path / "[red]out.jsonl"
+    status, said = run("export", path, "--to", "cpm", "--out", out)
     assert status == 0, said
-    assert [json.loads(line)["frame"] for line in (tmp_path / "out.jsonl").read_text().splitlines()] == [0, 1, 2]
+    assert f"{out}: 3 frames" in said
+    assert [json.loads(line)["frame"] for line in out.read_text().splitlines()] == [0, 1, 2]

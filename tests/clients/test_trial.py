@@ -44,6 +44,15 @@ def test_what_a_gateway_said_is_shown_as_it_is_and_obeyed_by_nobody():
     assert console.file.getvalue() == "The trial stopped: [red]a[/red] [/b] \\x1b[2J\n"
 
 
+def test_a_report_is_told_of_by_its_name_as_it_is(tmp_path):
+    console = Console(file=io.StringIO(), width=20)
+    folder = tmp_path / "[bold]run[1]"
+    folder.mkdir()
+    trial.write({}, folder, "[a].json", console)
+    assert console.file.getvalue() == f"Written: {folder / '[a].json'}\n"
+    assert (folder / "[a].json").exists()
+
+
 PROGRAM = """
 import asyncio
 from rich.console import Console

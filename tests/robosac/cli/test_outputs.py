@@ -1,13 +1,16 @@
 """No command overwrites what is there unless it is told to, and says so before it works."""
 
+import io
 import json
 
 import pytest
 import typer
+from rich.console import Console
 from typer.testing import CliRunner
 
 from robosac.cli import app, commands
 from robosac.cli.blame import check_known
+from robosac.cli.outputs import tell
 
 runner = CliRunner()
 WRITTEN = {
@@ -156,3 +159,10 @@ def test_a_file_that_is_not_there_is_told_by_its_name(tmp_path):
 def test_names_are_listed_as_one_types_them():
     with pytest.raises(typer.BadParameter, match=r"unknown x; known: plain, 'group_testing, expecting \.2 m'$"):
         check_known(["x"], ["plain", "group_testing, expecting .2 m"], "--only")
+
+
+def test_the_name_of_a_file_is_told_as_it_is_and_whole():
+    console = Console(file=io.StringIO(), width=20)
+    for path in ("out[1]/[/x]/[red]:smile:.json", "a/" * 20 + "[bold]"):
+        tell(console, f"Written: {path}")
+        assert console.file.getvalue().endswith(f"Written: {path}\n")

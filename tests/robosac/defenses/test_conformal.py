@@ -137,6 +137,8 @@ def test_the_default_calibration_is_what_the_command_measures(detector, tmp_path
     assert measured == sorted(measured)
     known = np.array(SINGLE_TEAMMATE)
     assert max(np.abs(known - index).min() for index in measured) <= 5e-4 + 1e-9
-    result = CliRunner().invoke(app, ["benign-scores", "--scenes", "3", "--out", str(tmp_path / "indices.json")])
+    out = tmp_path / "[red]indices[1].json"
+    result = CliRunner().invoke(app, ["benign-scores", "--scenes", "3", "--out", str(out)])
     assert result.exit_code == 0, result.output
-    assert json.loads((tmp_path / "indices.json").read_text()) == [round(index, 3) for index in measured]
+    assert f"{out}: 15 Jaccard indices" in result.output
+    assert json.loads(out.read_text()) == [round(index, 3) for index in measured]
