@@ -130,7 +130,7 @@ async def open_session(
     response.headers.update(_NO_STORE)
     gateway.recorder.check(asked=request.record)
     opened = await gateway.opening.open(request, key_id)
-    recorded = gateway.recorder.begin(opened.session_id, asked=request.record)
+    recorded = await gateway.recorder.begin(opened.session_id, asked=request.record)
     return opened.model_copy(update={"recorded": recorded})
 
 

@@ -71,9 +71,34 @@ class Folder:
         probe.touch()
         probe.unlink()
 
-    def recorded(self) -> set[str]:
-        """The sessions of which there are files."""
-        return {match["session"] for match, _ in self._found()}
+    def ask(self, session_id: str) -> None:
+        """Keep that a session is to be recorded, for all processes that see the folder; from any thread.
+
+        Raises
+        ------
+        OSError
+        """
+        self._asked(session_id).touch()
+
+    def is_asked(self, session_id: str) -> bool:
+        """Whether a session is to be recorded, or is recorded already.
+
+        Raises
+        ------
+        OSError
+        """
+        found = (match["session"] for match, _ in self._found())
+        return self._asked(session_id).exists() or session_id in found
+
+    def over(self, session_id: str) -> None:
+        """A session has ended: its recording is whole.
+
+        Raises
+        ------
+        OSError
+        """
+        self._asked(session_id).unlink(missing_ok=True)
+        self.end(session_id)
 
     def add(self, record: SessionRecord, moment: Moment, dropped: int) -> None:
         """Add a frame to its session's recording.
@@ -171,6 +196,9 @@ class Folder:
             del self._at_hand[first]
             if first in self._files:
                 self._files[first].file.rest()
+
+    def _asked(self, session_id: str) -> Path:
+        return self.root / f"{session_id}.asked"
 
     def _found(self) -> Iterator[tuple[re.Match[str], Path]]:
         for path in self.root.iterdir():

@@ -4,6 +4,7 @@ thread or the disk cannot follow, frames are left out and counted, and no answer
 
 from __future__ import annotations
 
+import asyncio
 import queue
 import threading
 import time
@@ -21,6 +22,7 @@ from service.deciding.asked import Answered
 from service.errors import Kind, Refused
 from service.keeping.record import SessionRecord
 from service.recording.folder import IDLE_S, Folder
+from service.sessions.live import LiveSession
 from service.settings import Settings
 from service.watching.metrics import Metrics
 
@@ -38,6 +40,7 @@ TOLD_EVERY_S = 60.0
 @dataclass(frozen=True)
 class _Noted:
     record: SessionRecord
+    live: LiveSession
     moment: Moment
     nbytes: int
     dropped: int
@@ -65,7 +68,6 @@ class Recorder:
             self._folder = Folder(settings.record, settings.record_file_bytes, settings.record_bytes, bodies)
         self._all = settings.record_sessions == "all"
         self._metrics = metrics
-        self._asked: set[str] = set()
         self._waiting: queue.SimpleQueue[_Noted | _Over | None] = queue.SimpleQueue()
         self._lock = threading.Lock()
         self._frames = self._nbytes = 0
@@ -86,7 +88,6 @@ class Recorder:
             return
         try:
             self._folder.make()
-            self._asked = self._folder.recorded()
         except OSError as fault:
             raise ValueError(f"ROBOSAC_RECORD: {told(fault)}") from fault
         self._thread.start()
@@ -102,22 +103,21 @@ class Recorder:
         if asked and self._folder is None:
             raise Refused(Kind.INVALID_REQUEST, "this gateway records nothing (ROBOSAC_RECORD)", "record")
 
-    def begin(self, session_id: str, *, asked: bool) -> bool:
-        """A session is open; whether it is recorded."""
-        if asked:
-            self._asked.add(session_id)
-        return self._folder is not None and (self._all or asked)
+    async def begin(self, session_id: str, *, asked: bool) -> bool:
+        """A session is open; whether it is recorded. The folder keeps who asked, for other processes, too."""
+        if self._all or not asked:
+            return self._folder is not None and self._all
+        return await asyncio.to_thread(self._try, lambda folder: folder.ask(session_id)) is None
 
     def end(self, session_id: str) -> None:
         """A session is over: its recording is whole."""
-        self._asked.discard(session_id)
         if self._folder is not None:
             self._waiting.put(_Over(session_id))
 
     def note(self, answered: Answered, answer: FrameAnswer) -> None:
         """Hand an answered frame over to be recorded, if there is room for it. Nothing is computed or copied."""
-        record = answered.record
-        if self._folder is None or not (self._all or record.session_id in self._asked):
+        record, live = answered.record, answered.asked.caller.live
+        if self._folder is None or not (self._all or live.recorded is not False):
             return
         asked, result = answered.asked, answered.result
         messages = {record.ego_id: asked.ego, **asked.messages}
@@ -141,11 +141,11 @@ class Recorder:
             previous=answered.previous,
             left=result.state,
             left_previous=result.previous,
-            least_score=asked.caller.live.detector.info.consensus_score,
+            least_score=live.detector.info.consensus_score,
             out_of_time=result.out_of_time,
             truth=asked.ego.truth,
         )
-        self._waiting.put(_Noted(record, moment, nbytes, dropped))
+        self._waiting.put(_Noted(record, live, moment, nbytes, dropped))
 
     def _work(self) -> None:
         """What the thread does."""
@@ -166,7 +166,7 @@ class Recorder:
 
     def _take(self, noted: _Noted | _Over) -> None:
         if isinstance(noted, _Over):
-            self._try(lambda folder: folder.end(noted.session_id))
+            self._try(lambda folder: folder.over(noted.session_id))
             return
         self._write(noted)
         with self._lock:
@@ -175,15 +175,22 @@ class Recorder:
     def _write(self, noted: _Noted) -> None:
         session_id = noted.record.session_id
         if time.monotonic() >= self._retry_at:
-            fault = self._try(lambda folder: folder.add(noted.record, noted.moment, noted.dropped))
+            fault = self._try(lambda folder: self._add(folder, noted))
             if fault is None:
-                self._metrics.recorded()
                 return
         else:
             fault = "the disk has failed"
         with self._lock:
             self._dropped[session_id] += noted.dropped
         self._leave_out(session_id, "disk", fault)
+
+    def _add(self, folder: Folder, noted: _Noted) -> None:
+        """Write a frame, unless nobody asked for it: of each session it is looked once."""
+        if not self._all and noted.live.recorded is None:
+            noted.live.recorded = folder.is_asked(noted.record.session_id)
+        if self._all or noted.live.recorded:
+            folder.add(noted.record, noted.moment, noted.dropped)
+            self._metrics.recorded()
 
     def _try(self, work: Callable[[Folder], None]) -> str | None:
         """Do something with the folder; what went wrong, if anything did."""

@@ -92,6 +92,8 @@ class LiveSession:
     """Bodies that are not whole yet, by vehicle."""
     settling: asyncio.Task[None] | None = None
     """A decision that nobody waits for any more, and of which it is not known yet whether it is kept."""
+    recorded: bool | None = None
+    """Whether it is one of those that asked to be recorded; None until it is looked in the folder."""
     held: bool = False
     """Whether the ego has asked here, and not been seen to ask elsewhere since."""
     standing: dict[str, Standing] = field(default_factory=dict)

@@ -110,6 +110,22 @@ async def test_only_sessions_that_ask_are_recorded_where_the_operator_says_so(fl
     assert [file.counts["/digests"] for file in recorded.files] == [6, 6]
 
 
+async def test_a_session_that_asked_is_recorded_wherever_it_goes(fleet, tmp_path):
+    folder = tmp_path / "recordings"
+    settings = {"record": folder, "record_sessions": "asked", "database_url": f"sqlite:///{tmp_path}/db"}
+    async with serve(**settings) as one, serve(**settings) as other:
+        early, late, unasked = await one.open(record=True), await one.open(record=True), await one.open()
+        for session, turns in ((early, (other, one)), (late, (one, other, other)), (unasked, (other,))):
+            for index, served in enumerate(turns):
+                async for _ in drive(served, session, fleet[index : index + 1], start=index):
+                    pass
+        for session in (early, late, unasked):
+            await other.ego(session).close()
+    found = {session.opening.session_id: [frame.number for frame in session.frames] for session in sessions(folder)}
+    assert found == {early.session_id: [0, 1], late.session_id: [0, 1, 2]}
+    assert {path.suffix for path in folder.iterdir()} == {".mcap"}
+
+
 async def test_a_gateway_that_records_nothing_says_so(served):
     refused = await served.http.post("/v1/sessions", json={"ego_id": EGO, "teammates": ["a"], "record": True})
     assert problem(refused, 422, "invalid-request")["field"] == "record"
@@ -163,8 +179,8 @@ class Slow:
         self._until.wait(20)
         self._folder.add(*what)
 
-    def end(self, session_id):
-        self._folder.end(session_id)
+    def over(self, session_id):
+        self._folder.over(session_id)
 
     def close(self, idle_s=0.0):
         self._folder.close(idle_s)
@@ -248,7 +264,8 @@ def test_of_many_sessions_that_take_turns_each_has_one_file_and_few_are_open(rec
     found = sessions(tmp_path)
     assert [[frame.number for frame in session.frames] for session in found] == [[0, 1, 2, 3]] * 66
     assert not any(file.damage for session in found for file in session.files)
-    assert folder.recorded() == {f"{number:032x}" for number in range(66)}
+    assert folder.is_asked(f"{65:032x}")
+    assert not folder.is_asked(f"{66:032x}")
 
 
 def test_a_file_that_is_removed_while_it_waits_for_its_next_frame_is_not_missed(recorded_moments, tmp_path):
