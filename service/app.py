@@ -156,7 +156,7 @@ def _built(
     with asked_by("ROBOSAC_RECORD"):
         recorder = Recorder(settings, metrics)
     keys = GatewayKeys(settings.gateway_key_file)
-    sessions = Sessions(settings, store, engine, metrics, tokens, keys, len(api_keys) > 1, seeds)
+    sessions = Sessions(settings, store, engine, metrics, tokens, keys, len(api_keys) > 1, seeds, recorder.end)
     feed = Feed(store.audit, settings.max_viewers, frames_event)
     keeping = Keeping(sessions, store, settings.keep_frames)
     deciding = Deciding(sessions, keeping, engine, metrics, admission, tracing, feed)

@@ -152,7 +152,6 @@ async def delete_session(caller: ProvenEgo, gateway: GatewayDep, response: Respo
     """
     receipt = await gateway.sessions.close(caller)
     response.headers.update({"Audit-Head": receipt.head, **_promised(receipt)})
-    gateway.recorder.end(caller.record.session_id)
 
 
 @v1.post(

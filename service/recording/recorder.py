@@ -8,7 +8,6 @@ import asyncio
 import queue
 import threading
 import time
-from collections import Counter
 from collections.abc import Callable
 from dataclasses import dataclass
 
@@ -71,7 +70,6 @@ class Recorder:
         self._waiting: queue.SimpleQueue[_Noted | _Over | None] = queue.SimpleQueue()
         self._lock = threading.Lock()
         self._frames = self._nbytes = 0
-        self._dropped: Counter[str] = Counter()
         self._thread = threading.Thread(target=self._work, name="recorder", daemon=True)
         self._retry_at = self._tell_at = 0.0
         self._untold = 0
@@ -126,9 +124,9 @@ class Recorder:
             full = self._frames >= MOST_WAITING or self._nbytes + nbytes > MOST_WAITING_BYTES
             if not full:
                 self._frames, self._nbytes = self._frames + 1, self._nbytes + nbytes
-                dropped = self._dropped.pop(record.session_id, 0)
+                dropped, live.unrecorded = live.unrecorded, 0
         if full:
-            self._leave_out(record.session_id, "waiting", "the disk is too slow")
+            self._leave_out(record.session_id, live, "waiting", "the disk is too slow")
             return
         moment = Moment(
             time_ns=time.time_ns(),
@@ -181,8 +179,8 @@ class Recorder:
         else:
             fault = "the disk has failed"
         with self._lock:
-            self._dropped[session_id] += noted.dropped
-        self._leave_out(session_id, "disk", fault)
+            noted.live.unrecorded += noted.dropped
+        self._leave_out(session_id, noted.live, "disk", fault)
 
     def _add(self, folder: Folder, noted: _Noted) -> None:
         """Write a frame, unless nobody asked for it: of each session it is looked once."""
@@ -206,11 +204,11 @@ class Recorder:
             return describe(fault)
         return None
 
-    def _leave_out(self, session_id: str, why: str, detail: str) -> None:
+    def _leave_out(self, session_id: str, live: LiveSession, why: str, detail: str) -> None:
         """Count a frame that is not recorded, and say so every so often."""
         self._metrics.unrecorded(why)
         with self._lock:
-            self._dropped[session_id] += 1
+            live.unrecorded += 1
             self._untold += 1
             if time.monotonic() < self._tell_at:
                 return

@@ -94,6 +94,8 @@ class LiveSession:
     """A decision that nobody waits for any more, and of which it is not known yet whether it is kept."""
     recorded: bool | None = None
     """Whether it is one of those that asked to be recorded; None until it is looked in the folder."""
+    unrecorded: int = 0
+    """Frames that its recording lacks, since the latest that it has."""
     held: bool = False
     """Whether the ego has asked here, and not been seen to ask elsewhere since."""
     standing: dict[str, Standing] = field(default_factory=dict)
@@ -141,6 +143,7 @@ class LiveSession:
         """Count what there was before since the last decision."""
         self.refusals, self.late, self.equivocations = before.refusals, before.late, before.equivocations
         self.renewals, self.team_changes = before.renewals, before.team_changes
+        self.unrecorded = before.unrecorded
 
     def count_anew(self) -> Refusals:
         """Refusals since the last decision; all counts begin again, unless they are given back."""

@@ -49,7 +49,8 @@ class Sessions:
     """All sessions of this gateway.
 
     ``several_keys`` says whether they may be of more than one API key. ``draw_seed`` gives the seed of a frame's draws,
-    hexadecimal; by default from the operating system, so that nobody can foresee them.
+    hexadecimal; by default from the operating system, so that nobody can foresee them. ``on_end`` is told of each
+    session that is ended here, by its id.
     """
 
     settings: Settings
@@ -60,6 +61,7 @@ class Sessions:
     keys: GatewayKeys
     several_keys: bool = False
     draw_seed: Callable[[], str] = new_seed
+    on_end: Callable[[str], None] = lambda _: None
 
     def __post_init__(self) -> None:
         self._live: dict[str, LiveSession] = {}
@@ -309,6 +311,7 @@ class Sessions:
             await self.store.end(session_id, ended, unused_since)
             logger.info("session ended", session_id=session_id, why=why)
         self._forget(session_id)  # not before: if the store fails, the session goes on with the messages that wait
+        self.on_end(session_id)
         self.metrics.sessions.set(await self.store.count())
 
     def _is_served(self, record: SessionRecord) -> bool:

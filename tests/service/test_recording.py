@@ -126,6 +126,19 @@ async def test_a_session_that_asked_is_recorded_wherever_it_goes(fleet, tmp_path
     assert {path.suffix for path in folder.iterdir()} == {".mcap"}
 
 
+async def test_the_recording_of_a_session_that_expires_is_whole_at_once(fleet, tmp_path):
+    async with serve(record=tmp_path, record_sessions="asked", session_idle_s=1.0) as served:
+        session = await served.open(record=True)
+        async for _ in drive(served, session, fleet[:1]):
+            pass
+        await until_recorded(served, 1)
+        async with asyncio.timeout(20):
+            while len(list(tmp_path.iterdir())) > 1 or served.gateway.recorder._folder._files:
+                await asyncio.sleep(0.01)
+    (recorded,) = sessions(tmp_path)
+    assert recorded.files[0].damage is None
+
+
 async def test_a_gateway_that_records_nothing_says_so(served):
     refused = await served.http.post("/v1/sessions", json={"ego_id": EGO, "teammates": ["a"], "record": True})
     assert problem(refused, 422, "invalid-request")["field"] == "record"
