@@ -196,8 +196,9 @@ def test_what_no_gateway_writes_is_told_with_its_file_and_field(changes, field, 
     status, said = run("replay", odd)
     assert status == 2, said
     assert "for FILE" in said
-    assert "odd.mcap" in said
-    assert field in said
+    unfolded = said.replace(" ", "")
+    assert "odd.mcap" in unfolded
+    assert field.replace(" ", "") in unfolded
 
 
 CODECS = {
