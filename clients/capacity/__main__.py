@@ -33,7 +33,7 @@ VEHICLES_OF_A_CROSSING = 10
 def main(  # the options of a command line
     report: Annotated[Path, typer.Argument(help="What `robosac load-test --out` wrote: load_test.json.")],
     vehicles: Annotated[int, typer.Option(min=1, help="Vehicles at the peak, each with a session.")] = 100_000,
-    rate: Annotated[float, typer.Option(min=0.1, help="Frames a second of a vehicle.")] = 5.0,
+    rate: Annotated[float, typer.Option(min=1.0, help="Frames a second of a vehicle.")] = 5.0,
     teammates: Annotated[int, typer.Option(min=1, help="Teammates of a vehicle.")] = 5,
     attacked: Annotated[float, typer.Option(min=0, max=1, help="Share of the sessions with an attacker.")] = 0.05,
     message_bytes: Annotated[
