@@ -86,7 +86,7 @@ async def test_without_a_defence_everybody_is_fused(served, ego_message, attacke
         ({"kind": "a2cp", "ratios": [0.33]}, "defense", "impossible-defense"),
         ({"kind": "none", "sampling_budget": 3}, "defense.sampling_budget", "invalid-request"),
         ({"kind": "sample_consensus", "reference": "next"}, "defense.reference", "invalid-request"),
-        ({"attacker_ratio": 0.2}, "defense", "invalid-request"),
+        ({"attacker_ratio": 0.2}, "defense.kind", "invalid-request"),
         ({"kind": "group_testing", "sampling_budget": 3}, "defense.sampling_budget", "invalid-request"),
         ({"kind": "group_testing", "naming_bound": 1.0}, "defense.naming_bound", "invalid-request"),
         ({"kind": "group_testing", "hijack": 0.6}, "defense.hijack", "invalid-request"),
