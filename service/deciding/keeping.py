@@ -106,6 +106,8 @@ class _Write:
                 self.undo()
             raise
         self._remember()
+        if self.is_too_late and answer.deadline_met:
+            asked.caller.live.late.append(asked.frame)
 
     def undo(self) -> None:
         """It is not kept: the session is as it was before the frame."""
@@ -135,8 +137,6 @@ class _Write:
     def _remember(self) -> None:
         """What the next frame is judged by."""
         asked, live = self.asked, self.asked.caller.live
-        if self.is_too_late:
-            live.late.append(asked.frame)
         live.equivocations.clear()
         live.team_changes = 0
         live.session.remember(self.result)
