@@ -25,6 +25,7 @@ from service.arriving.frames import Frames  # noqa: E402
 from service.arriving.giving_way import GivesWay, Line  # noqa: E402
 from service.arriving.hanging_up import HangingUp  # noqa: E402
 from service.arriving.limits import BodyLimit  # noqa: E402
+from service.arriving.pacing import Metered, Pacing  # noqa: E402
 from service.arriving.parties import Parties  # noqa: E402
 from service.deciding.admission import Admission  # noqa: E402
 from service.deciding.answering import Deciding  # noqa: E402
@@ -125,6 +126,7 @@ def create_app(
         app.add_middleware(Door, check=check_local)
     app.add_middleware(Traced, tracing=tracing)
     app.add_middleware(Door, check=check_head)
+    app.add_middleware(Metered, pacing=Pacing(parties.of_loop, lambda: gateway.admission.busy))
     app.add_middleware(Arrival, watch=gateway.watch)
     app.add_middleware(Starting)
     for router in (v1, operations, pages):

@@ -19,7 +19,7 @@ from fastapi.staticfiles import StaticFiles
 from starlette.exceptions import HTTPException
 
 from service import description
-from service.arriving.bodies import STREAMED
+from service.arriving.bodies import JSON, STREAMED
 from service.callers import GatewayDep
 from service.schemas import WatchableList
 from service.viewing.feed import Feed
@@ -128,11 +128,17 @@ def api_pages(app: FastAPI) -> None:
     static = str(files("fastapi_offline") / "static")
     app.mount(API_FILES, StaticFiles(directory=static), name="api-pages")
 
+    written: dict[str, bytes] = {}
+    writing = asyncio.Lock()
+
     @app.get(OPENAPI, include_in_schema=False)
     async def openapi(request: Request) -> Response:
         root = request.scope.get("root_path", "")
-        # in a thread: to make it takes a tenth of a second, and to write it milliseconds
-        return await asyncio.to_thread(_described, app, {"servers": [{"url": root}]} if root else {})
+        async with writing:
+            if root not in written:  # in a thread: to make it takes a tenth of a second, and to write it milliseconds
+                written.clear()
+                written[root] = await asyncio.to_thread(_described, app, {"servers": [{"url": root}]} if root else {})
+        return Response(written[root], media_type=JSON)
 
     @app.get("/docs", include_in_schema=False)
     async def docs(request: Request) -> Response:
@@ -159,8 +165,8 @@ def api_pages(app: FastAPI) -> None:
         return _framed(page)
 
 
-def _described(app: FastAPI, more: Mapping[str, Any]) -> Response:
-    return JSONResponse({**app.openapi(), **more})
+def _described(app: FastAPI, more: Mapping[str, Any]) -> bytes:
+    return bytes(JSONResponse({**app.openapi(), **more}).body)
 
 
 def _framed(page: HTMLResponse) -> Response:

@@ -6,20 +6,32 @@ Nothing that takes long to import may be imported here: a server needs this befo
 
 from __future__ import annotations
 
+import functools
+import re
+import time
 from asyncio import TimerHandle, Transport
+from collections.abc import Sequence
 
-from uvicorn.protocols.http.httptools_impl import HttpToolsProtocol
+from uvicorn.protocols.http.httptools_impl import HttpToolsProtocol, RequestResponseCycle
 
 from service.arriving.arrival import note_first_byte
-from service.arriving.waiting import waited_s
+from service.arriving.pacing import KEY, METER, OTHERS, Pacing, Party
+from service.arriving.waiting import waited_s, waits
 
 HEAD_BYTES = 64 * 1024
 """What of a head is taken before it is whole; `service.arriving.doors` judges it then."""
 HEADERS = 256
 PIPELINED = 4
 """Requests that are taken on a connection beside the one that is being answered."""
-PIECES, PIECE_BYTES = 1024, 64
+PIECES, PIECE_BYTES = 128, 64
 """From so many pieces on, those of a body have so many bytes on average."""
+
+
+MADE_S, BYTE_S = 3e-4, 1e-9
+"""Of the event loop's time what is not measured: to make and end a connection, to take a byte from its socket."""
+
+
+_CREDENTIAL = re.compile(rb"\r\nAuthorization:[ \t]*(Bearer [^\r\n]{1,4096})\r\n", re.IGNORECASE)
 
 
 class _TooMuch(Exception):
@@ -48,13 +60,68 @@ class BoundedHTTP(HttpToolsProtocol):
     _body_bytes = 0
     _refused: _TooMuch | None = None
     _unread: TimerHandle | None = None
+    _kept = b""
+    _kept_since = 0.0
+    """What came while others had to be served, and when; nothing more is read meanwhile."""
+    _unanswered: Sequence[RequestResponseCycle] = ()
+    """Requests: to answer them once the connection is closed would be a fault, though nobody is to blame for it."""
+    _pacing: Pacing | None = None
+    party: Party = (OTHERS, "")
 
     def connection_made(self, transport: Transport) -> None:  # type: ignore[override]
         self._waited_s = waited_s(transport)
         super().connection_made(transport)
         self._arm()
+        self._pacing = self.app_state.get(KEY)
+        if self._pacing is not None:
+            self.party = self._pacing.party_of({"client": self.client, "headers": []})
+            self._pacing.charge(self.party, MADE_S)
 
     def data_received(self, data: bytes) -> None:
+        pacing = self._pacing
+        if pacing is None:
+            self._take(data)
+            return
+        self._look_whose(data, pacing)
+        if not pacing.is_over(self.party):
+            self._take_metered(data, pacing)
+        elif pacing.wait(self, len(data)):
+            self._unset_keepalive_if_required()
+            self._kept, self._kept_since = data, time.perf_counter()
+            self.transport.pause_reading()
+        else:
+            self.transport.abort()
+
+    def go_on(self, pacing: Pacing) -> None:
+        """As `service.arriving.pacing.Paced` has it."""
+        if self.transport.is_closing():
+            return
+        data, self._kept = self._kept, b""
+        self._waited_s += time.perf_counter() - self._kept_since
+        self._take_metered(data, pacing)
+        if self.transport.is_closing():
+            return
+        if waits(self.transport):
+            self._waited_s = time.perf_counter() - self._kept_since  # so long at most
+        if not self.flow.read_paused:
+            self.transport.resume_reading()
+
+    def _look_whose(self, data: bytes, pacing: Pacing) -> None:
+        """See whose a request is, before anything is done for it: by the credential, if it is in the first bytes."""
+        if self._in_head or (self.cycle is not None and self.cycle.more_body):
+            return
+        found = _CREDENTIAL.search(data, 0, HEAD_BYTES)
+        if found is not None:
+            self.party = pacing.party_of({"client": self.client, "headers": [(b"authorization", found[1])]})
+
+    def _take_metered(self, data: bytes, pacing: Pacing) -> None:
+        began = time.thread_time()
+        self._take(data)
+        if self._in_head or self.cycle is not None:
+            self._waited_s = 0.0  # what comes next did not wait
+        pacing.charge(self.party, time.thread_time() - began + BYTE_S * len(data))
+
+    def _take(self, data: bytes) -> None:
         begins_in_head = self._in_head or self.cycle is None  # and not with the end of a body
         self._head_ended = False
         super().data_received(data)
@@ -82,6 +149,9 @@ class BoundedHTTP(HttpToolsProtocol):
         self._in_head, self._head_ended, self._head_bytes = False, True, 0
         self._pieces = self._body_bytes = 0
         super().on_headers_complete()
+        self._unanswered = [cycle for cycle in (*self._unanswered, self.cycle) if not cycle.response_complete]
+        if self._pacing is not None:
+            self.scope["state"][METER] = functools.partial(self._pacing.charge, self.party)
         if len(self.pipeline) > PIPELINED:
             self._refuse("429 Too Many Requests", f"At most {PIPELINED} requests may wait on a connection.")
 
@@ -106,6 +176,7 @@ class BoundedHTTP(HttpToolsProtocol):
     def connection_lost(self, exc: Exception | None) -> None:
         self._disarm()
         self._forget_unread()
+        self._give_up()
         super().connection_lost(exc)
 
     def pause_writing(self) -> None:
@@ -150,13 +221,17 @@ class BoundedHTTP(HttpToolsProtocol):
         self._refused = _TooMuch(status, why)
         raise self._refused
 
+    def _give_up(self) -> None:
+        for cycle in self._unanswered:
+            cycle.disconnected = True
+            cycle.message_event.set()
+
     def _hang_up(self, status: str, why: str) -> None:
         self._disarm()
         if self.transport.is_closing():
             return
         in_body = self._answering() and not self._in_head and not self.pipeline and not self.cycle.response_started
-        if in_body:
-            self.cycle.disconnected = True  # what it would answer comes too late
+        self._give_up()
         if in_body or (self._in_head and not self._answering()):
             head = f"HTTP/1.1 {status}\r\ncontent-type: text/plain\r\ncontent-length: {len(why)}\r\nconnection: close"
             self.transport.write(f"{head}\r\n\r\n{why}".encode())

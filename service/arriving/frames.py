@@ -4,6 +4,8 @@ from __future__ import annotations
 
 import asyncio
 import contextlib
+import os
+import sys
 import time
 from collections.abc import AsyncIterator, Callable
 from dataclasses import dataclass, field
@@ -31,6 +33,11 @@ T = TypeVar("T")
 
 SLACK_BYTES = 64 * 1024
 """What a message may have besides its tensors."""
+_CORES = len(os.sched_getaffinity(0)) if sys.platform == "linux" else os.cpu_count() or 1
+READ_AT_A_TIME = min(_CORES, 2)
+"""Bodies, so that reading does not press fusion out of a single core."""
+READING_MOST_S = 5.0
+"""After which reading a body holds up no other: none takes so long."""
 READING_SHARE = 0.5
 """Of its budget, for which a body may wait until it is read: later there is hardly time to answer it."""
 _COMPRESSED = wire.ZSTD.encode()
@@ -47,7 +54,7 @@ class Frames:
     admission: Admission
     max_jump: int
     """By how much a frame's number may exceed the latest answered one."""
-    reading: Line = field(default_factory=lambda: Line(busy=lambda: False))
+    reading: Line = field(default_factory=lambda: Line(lambda: False, READ_AT_A_TIME, READING_MOST_S))
     """Bodies that take long to read, by turns of keys, of a key's sessions and of a session's vehicles: else whoever
     sends many at once is read before all others.
     """

@@ -42,7 +42,7 @@ class Turn:
     def begin(self) -> None:
         """It may go on."""
         self.began.set_result(None)
-        self._end = asyncio.get_running_loop().call_later(TURN_S, self.end)
+        self._end = asyncio.get_running_loop().call_later(self._line.turn_s, self.end)
 
     def end(self) -> None:
         """Let the next one begin; again and again does no harm."""
@@ -86,10 +86,16 @@ class Line:
     ----------
     busy : callable
         Whether frames are in hand.
+    at_a_time : int
+        Requests that have a turn at a time.
+    turn_s : float
+        After which a request holds up no other, even if its turn is not over.
     """
 
-    def __init__(self, busy: Callable[[], bool]) -> None:
+    def __init__(self, busy: Callable[[], bool], at_a_time: int = AT_A_TIME, turn_s: float = TURN_S) -> None:
+        self.turn_s = turn_s
         self._busy = busy
+        self._at_most = at_a_time
         self._waiting = _Waiting()
         self._at_work = 0
         self._latest = -1.0
@@ -113,7 +119,7 @@ class Line:
         self._go_on()
 
     def _go_on(self) -> None:
-        while self._waiting and self._at_work < AT_A_TIME:
+        while self._waiting and self._at_work < self._at_most:
             now = time.perf_counter()
             if self._busy() and now < self._latest + EVERY_S:
                 if self._look is None:

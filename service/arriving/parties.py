@@ -9,6 +9,7 @@ from starlette.datastructures import Headers
 from starlette.types import Scope
 
 from service.arriving.giving_way import Party
+from service.arriving.pacing import OTHERS
 from service.keeping.record import SessionRecord
 from service.sessions.identity import ApiKeys, Claimed, claimed
 from service.sessions.viewers import ViewerTokens
@@ -42,9 +43,12 @@ class Parties:
 
     def __call__(self, scope: Scope) -> Party:
         """The party of a request."""
-        credential = _credential(scope)
-        known = self._known(credential) if credential else None
-        return known or (f"address {_place((scope.get('client') or ('',))[0])}", "")
+        known = self._known(_credential(scope))
+        return known or (_address(scope), "")
+
+    def of_loop(self, scope: Scope) -> tuple[str, str]:
+        """The party of a request, as `service.arriving.pacing` has it: addresses are members of one."""
+        return self._known(_credential(scope)) or (OTHERS, _address(scope))
 
     def is_vehicle(self, scope: Scope, session_id: str) -> bool:
         """Whether a request shows a token of a session, one that counts or one that this gateway signed."""
@@ -52,7 +56,9 @@ class Parties:
         record = self._session_of(claimed(credential))
         return (record is not None and record.session_id == session_id) or self._signed(session_id, credential)
 
-    def _known(self, credential: str) -> Party | None:
+    def _known(self, credential: str) -> tuple[str, str] | None:
+        if not credential:
+            return None
         key_id = self._api_keys.id_of(credential)
         if key_id is not None:
             return f"key {key_id}", ""
@@ -73,6 +79,10 @@ class Parties:
 
 def _credential(scope: Scope) -> str:
     return Headers(scope=scope).get("authorization", "").partition(" ")[2].strip()
+
+
+def _address(scope: Scope) -> str:
+    return f"address {_place((scope.get('client') or ('',))[0])}"
 
 
 def _place(address: str) -> str:

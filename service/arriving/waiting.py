@@ -9,9 +9,11 @@ Nothing that takes long to import may be imported here: a server needs this befo
 from __future__ import annotations
 
 import contextlib
+import fcntl
 import socket
 import struct
 import sys
+import termios
 from asyncio import BaseTransport
 
 TOLD = sys.platform == "linux"
@@ -42,3 +44,15 @@ def waited_s(transport: BaseTransport) -> float:
         )
         return milliseconds / 1e3 if received and milliseconds >= LEAST_S * 1e3 else 0.0
     return 0.0
+
+
+def waits(transport: BaseTransport) -> bool:
+    """Whether bytes of a connection wait to be read, or may."""
+    of = transport.get_extra_info("socket")
+    if of is None:
+        return True
+    with contextlib.suppress(OSError):
+        number = bytearray(4)
+        fcntl.ioctl(of.fileno(), termios.FIONREAD, number)
+        return number != bytes(4)
+    return True

@@ -8,7 +8,6 @@ import pytest
 from starlette.responses import PlainTextResponse, StreamingResponse
 
 from robosac import wire
-from service.arriving import giving_way
 from service.arriving.giving_way import AT_A_TIME, EVERY_S, GivesWay, Line
 from service.arriving.parties import Parties
 from tests.service.conftest import EGO, serve
@@ -174,9 +173,8 @@ async def test_while_frames_are_in_hand_requests_begin_seldom_but_do():
     await asyncio.wait_for(asyncio.gather(*late), 25 * EVERY_S)
 
 
-async def test_who_waits_for_its_client_holds_up_nobody_for_long(monkeypatch):
-    monkeypatch.setattr(giving_way, "TURN_S", 0.05)
-    requests = Requests(Line(Frames()))
+async def test_who_waits_for_its_client_holds_up_nobody_for_long():
+    requests = Requests(Line(Frames(), turn_s=0.05))
     asked = [requests.ask(f"/slow/{number}") for number in range(3 * AT_A_TIME)]
     await asyncio.sleep(0.2)
     assert len(requests.begun) == 3 * AT_A_TIME

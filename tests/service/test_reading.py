@@ -7,7 +7,7 @@ import time
 from clients.client import GatewayClient
 from robosac import wire
 from service.arriving.checking import InFrame
-from service.arriving.giving_way import AT_A_TIME
+from service.arriving.frames import READ_AT_A_TIME
 from tests.service.conftest import EGO, TEAM, problem, serve
 from tests.service.credentials import KEY, OTHER_KEY
 
@@ -29,12 +29,12 @@ async def test_bodies_are_read_by_turns_of_keys(monkeypatch, good_frame):
     async with serve(api_keys=f"{KEY},{OTHER_KEY}") as served:
         greedy, other = [await opened_with(served, KEY) for _ in range(4)], await opened_with(served, OTHER_KEY)
         posts = [asyncio.create_task(served.post(one, "frames", good_frame(0))) for one in greedy * 3]
-        while len(read) < AT_A_TIME:
+        while len(read) < READ_AT_A_TIME:
             await asyncio.sleep(0.001)
         problem(await served.post(other, "frames", good_frame(0)), 400, "malformed-msgpack")
         await asyncio.gather(*posts)
     assert len(read) == len(posts) + 1
-    assert len(set(read[: AT_A_TIME + 2])) == 2
+    assert len(set(read[: READ_AT_A_TIME + 2])) == 2
 
 
 async def test_bodies_of_a_session_are_read_by_turns_of_its_vehicles(monkeypatch, messages, good_frame):
@@ -51,12 +51,12 @@ async def test_bodies_of_a_session_are_read_by_turns_of_its_vehicles(monkeypatch
         session = await served.open()
         token, body = session.teammate_tokens["rsu"], wire.pack_message(0, "rsu", messages["rsu"])
         posts = [asyncio.create_task(served.post(session, "messages", body, token)) for _ in range(12)]
-        while len(read) < AT_A_TIME:
+        while len(read) < READ_AT_A_TIME:
             await asyncio.sleep(0.001)
         problem(await served.post(session, "frames", good_frame(0)), 400, "malformed-msgpack")
         await asyncio.gather(*posts)
     assert len(read) == len(posts) + 1
-    assert EGO in read[: 2 * AT_A_TIME + 1]
+    assert EGO in read[: 2 * READ_AT_A_TIME + 1]
 
 
 async def test_a_small_body_that_may_be_compressed_is_not_read_on_the_event_loop(served, monkeypatch, messages):
@@ -83,7 +83,7 @@ async def test_a_body_that_waits_for_half_of_its_budget_is_refused_unread(monkey
         raise InFrame(wire.WireError("malformed-msgpack", "", "it is read for ever"), None)
 
     async with serve() as served:
-        slow = [await served.open() for _ in range(AT_A_TIME)]
+        slow = [await served.open() for _ in range(READ_AT_A_TIME)]
         session = await served.open(latency_budget_ms=200.0, gather_ms=50.0)
         with monkeypatch.context() as patch:
             patch.setattr("service.arriving.giving_way.TURN_S", 10.0)

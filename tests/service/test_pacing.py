@@ -1,0 +1,367 @@
+"""The event loop's time is shared: whoever took more than others lately is read from later."""
+
+import asyncio
+import contextlib
+import logging
+import socket
+import time
+
+import pytest
+import uvicorn
+import uvloop
+
+from service.arriving.arrival import Arrival, arrival_of
+from service.arriving.connections import PIPELINED, BoundedHTTP
+from service.arriving.pacing import (
+    LATELY_S,
+    LIMIT,
+    LIMIT_BUSY,
+    MOST_KEPT_BYTES,
+    OF_OTHERS,
+    OTHERS,
+    SLACK,
+    Metered,
+    Pacing,
+)
+from service.watching.stalls import LoopWatch
+
+GREEDY, MODEST = ("key greedy", "ego"), ("key modest", "ego")
+STRANGER = (OTHERS, "address 10.0.0.1")
+WAIT_S = 0.3
+KEEP_ALIVE_S = 1
+
+
+class Clock:
+    now = 0.0
+
+    def __call__(self):
+        return self.now
+
+
+def paced(busy=False):
+    clock = Clock()
+    return Pacing(lambda scope: STRANGER, lambda: busy, clock), clock
+
+
+def spend(pacing, clock, seconds=0.5, **share):
+    """Let parties, each in a session of its own name, have parts of the time for a while."""
+    for _ in range(int(seconds * 1000)):
+        clock.now += 0.001
+        for key, part in share.items():
+            pacing.charge(tuple(key.split("_")), 0.001 * part)
+
+
+def over(pacing, *names):
+    return [name for name in names if pacing.is_over(tuple(name.split("_")))]
+
+
+def test_nobody_waits_while_there_is_time():
+    pacing, clock = paced()
+    spend(pacing, clock, a_ego=0.9 * LIMIT)
+    assert not over(pacing, "a_ego", "b_ego")
+
+
+def test_whoever_had_more_than_an_equal_part_waits_until_there_is_time():
+    pacing, clock = paced()
+    spend(pacing, clock, a_ego=0.9, b_ego=0.05)
+    assert over(pacing, "a_ego", "b_ego", "never_seen") == ["a_ego"]
+    clock.now += 2 * LATELY_S
+    assert not over(pacing, "a_ego")
+
+
+def test_those_who_all_want_as_much_do_not_wait():
+    pacing, clock = paced(busy=True)
+    spend(pacing, clock, a_ego=0.4 * LIMIT_BUSY, a_mate=0.45 * LIMIT_BUSY, b_ego=0.9 * LIMIT_BUSY)
+    assert not over(pacing, "a_ego", "a_mate", "b_ego")
+
+
+def test_a_member_of_a_key_waits_for_its_own_part_only():
+    pacing, clock = paced()
+    spend(pacing, clock, a_mate=0.9, a_ego=0.02, b_ego=0.02)
+    assert over(pacing, "a_mate", "a_ego", "b_ego") == ["a_mate"]
+
+
+def test_there_is_less_time_while_frames_are_in_hand():
+    part = (LIMIT + SLACK / 2 * LIMIT_BUSY) / 2
+    for busy in (False, True):
+        pacing, clock = paced(busy)
+        spend(pacing, clock, a_ego=part, b_ego=0.01)
+        assert pacing.is_over(("a", "ego")) is busy
+
+
+def test_all_without_a_credential_have_one_small_part():
+    pacing, clock = paced()
+    shares = {f"{OTHERS}_{number}": 1.5 * SLACK * LIMIT * OF_OTHERS / 10 for number in range(10)}
+    spend(pacing, clock, a_ego=LIMIT * 0.8, **shares)
+    assert len(over(pacing, *shares)) == 10
+    assert not over(pacing, "a_ego")
+
+
+def test_parties_are_forgotten_that_were_away():
+    pacing, clock = paced()
+    for number in range(20_000):
+        clock.now += 0.01
+        pacing.charge((f"key {number % 300}", f"{number}"), 0.001)
+    assert len(pacing._first) <= 101
+    assert sum(map(len, pacing._members.values())) <= 300 * 2
+
+
+class Connection:
+    def __init__(self, party, gone_on):
+        self.party, self._gone_on = party, gone_on
+
+    def go_on(self, pacing):
+        self._gone_on.append(self.party)
+
+
+async def test_who_had_least_goes_on_first_and_all_do():
+    gone_on = []
+    pacing = Pacing(lambda scope: STRANGER, lambda: False)
+    for party, seconds in ((GREEDY, 0.3), (MODEST, 0.01), (STRANGER, 0.1)):
+        pacing.charge(party, seconds)
+    for party in (GREEDY, STRANGER, GREEDY, MODEST):
+        assert pacing.wait(Connection(party, gone_on), 1)
+    async with asyncio.timeout(5.0):
+        while len(gone_on) < 4:
+            await asyncio.sleep(0.001)
+    assert gone_on == [MODEST, STRANGER, GREEDY, GREEDY]
+
+
+async def test_what_waits_is_bounded():
+    pacing = Pacing(lambda scope: STRANGER, lambda: False)
+    gone_on = []
+    assert pacing.wait(Connection(GREEDY, gone_on), MOST_KEPT_BYTES)
+    assert not pacing.wait(Connection(MODEST, gone_on), 1)
+    while not gone_on:
+        await asyncio.sleep(0.001)
+    assert pacing.wait(Connection(MODEST, gone_on), MOST_KEPT_BYTES)
+
+
+class Told(Pacing):
+    """Has those wait who show a certain credential, until it is told otherwise."""
+
+    def __init__(self):
+        super().__init__(self.by_credential, lambda: False)
+        self.held, self.charged = {"greedy"}, {}
+
+    def by_credential(self, scope):
+        said = dict(scope["headers"]).get(b"authorization", b"Bearer nobody")
+        return "key", said.decode().split(" ")[1]
+
+    def is_over(self, party):
+        return party[1] in self.held
+
+    def charge(self, party, seconds):
+        self.charged[party[1]] = self.charged.get(party[1], 0.0) + seconds
+
+
+def burn(seconds):
+    until = time.thread_time() + seconds
+    while time.thread_time() < until:
+        pass
+
+
+async def application(scope, receive, send):
+    if scope["type"] != "http":
+        return
+    waited_s = time.perf_counter() - arrival_of(scope)
+    length = 0
+    while scope["path"] != "/unread":
+        message = await receive()
+        length += len(message.get("body", b""))
+        if not message.get("more_body"):
+            break
+    if scope["path"] == "/work":
+        burn(0.02)
+        await asyncio.sleep(WAIT_S)
+        burn(0.02)
+    if scope["path"] in ("/long", "/unread"):
+        await asyncio.sleep(WAIT_S)
+    body = b"%5.3f %8d" % (waited_s, length)
+    await send({"type": "http.response.start", "status": 200, "headers": [(b"content-length", b"%d" % len(body))]})
+    await send({"type": "http.response.body", "body": body})
+
+
+@pytest.fixture
+def pacing():
+    return Told()
+
+
+@contextlib.asynccontextmanager
+async def serving(pacing):
+    with socket.socket() as listening:
+        listening.bind(("127.0.0.1", 0))
+        application_ = Arrival(Metered(application, pacing), LoopWatch())
+        config = uvicorn.Config(application_, http=BoundedHTTP, log_config=None, timeout_keep_alive=KEEP_ALIVE_S)
+        server = uvicorn.Server(config)
+        running = asyncio.create_task(server.serve([listening]))
+        while not server.started:
+            await asyncio.sleep(0.005)
+        yield listening.getsockname()[1]
+        server.should_exit = True
+        await running
+
+
+@pytest.fixture
+async def port(pacing):
+    async with serving(pacing) as port:
+        yield port
+
+
+def request(who, path="/", body=b""):
+    head = f"POST {path} HTTP/1.1\r\nHost: x\r\nAuthorization: Bearer {who}\r\nContent-Length: {len(body)}\r\n\r\n"
+    return head.encode() + body
+
+
+@contextlib.asynccontextmanager
+async def connected(port):
+    reader, writer = await asyncio.open_connection("127.0.0.1", port)
+    yield reader, writer
+    writer.close()
+
+
+async def answer(reader):
+    """How long a request waited for the application, and how much of a body it saw."""
+    assert b"200" in await reader.readuntil(b"\r\n\r\n")
+    waited_s, length = (await reader.readexactly(14)).split()
+    return float(waited_s), int(length)
+
+
+@pytest.mark.parametrize("kept_alive", [False, True])
+async def test_only_whoever_is_over_its_part_waits_and_its_time_runs(port, pacing, kept_alive):
+    body = bytes(1_000_000)
+    async with connected(port) as (reader, writer), connected(port) as (other, to_other):
+        if kept_alive:
+            pacing.held.clear()
+            writer.write(request("greedy"))
+            await answer(reader)
+            pacing.held.add("greedy")
+        writer.write(request("greedy", body=body) + request("greedy", body=body))
+        waiting = asyncio.create_task(answer(reader))
+        for _ in range(3):
+            to_other.write(request("modest", body=body))
+            waited_s, length = await answer(other)
+            assert waited_s < WAIT_S / 2
+            assert length == len(body)
+        await asyncio.sleep(KEEP_ALIVE_S + WAIT_S)
+        assert not waiting.done()
+        pacing.held.clear()
+        waited_s, length = await asyncio.wait_for(waiting, 5.0)
+        assert waited_s >= WAIT_S
+        assert length == len(body)
+        assert (await answer(reader))[1] == len(body)
+        await asyncio.sleep(WAIT_S)
+        writer.write(request("greedy"))
+        assert (await answer(reader))[0] < WAIT_S / 2
+
+
+async def test_a_request_that_came_while_its_connection_waited_has_come_then(port, pacing):
+    body = bytes(1000)
+    async with connected(port) as (reader, writer):
+        writer.write(request("greedy", body=body))
+        await asyncio.sleep(WAIT_S / 2)
+        writer.write(request("greedy", body=body))
+        await asyncio.sleep(WAIT_S)
+        pacing.held.clear()
+        for least in (1.5 * WAIT_S, WAIT_S):
+            waited_s, length = await answer(reader)
+            assert length == len(body)
+            assert waited_s >= least
+
+
+async def test_what_the_end_of_a_body_waited_does_not_count_for_the_next_request(port, pacing):
+    pacing.held.clear()
+    async with connected(port) as (reader, writer):
+        sent = request("greedy", body=bytes(1000))
+        writer.write(sent[:-500])
+        await asyncio.sleep(WAIT_S / 3)
+        pacing.held.add("greedy")
+        writer.write(sent[-500:])
+        await asyncio.sleep(WAIT_S)
+        pacing.held.clear()
+        assert (await answer(reader))[0] < WAIT_S / 2
+        writer.write(sent)
+        assert (await answer(reader))[0] < WAIT_S / 2
+
+
+async def test_the_loops_time_is_measured_and_no_other(port, pacing):
+    async with connected(port) as (reader, writer):
+        writer.write(request("busy", "/work"))
+        await answer(reader)
+        writer.write(request("idle", "/long"))
+        await answer(reader)
+    assert 0.04 <= pacing.charged["busy"] < 0.04 + WAIT_S / 2
+    assert pacing.charged["idle"] < 0.02
+
+
+async def test_whoever_has_too_much_waiting_is_hung_up_on(port, pacing, monkeypatch):
+    monkeypatch.setattr("service.arriving.pacing.MOST_KEPT_BYTES", 0)
+    async with connected(port) as (reader, writer):
+        writer.write(request("greedy"))
+        with contextlib.suppress(ConnectionError):
+            assert await asyncio.wait_for(reader.read(-1), 5.0) == b""
+    async with connected(port) as (reader, writer):
+        writer.write(request("modest"))
+        await answer(reader)
+
+
+async def test_who_goes_away_while_it_waits_does_no_harm(port, pacing, caplog):
+    async with connected(port) as (_, writer):
+        writer.write(request("greedy"))
+        await asyncio.sleep(0.05)
+    async with connected(port) as (reader, writer):
+        await asyncio.sleep(0.05)
+        pacing.held.clear()
+        writer.write(request("greedy"))
+        await answer(reader)
+    assert not [record.getMessage() for record in caplog.records if record.levelno >= logging.ERROR]
+
+
+async def test_no_more_of_a_body_is_taken_than_before(port, pacing):
+    async with connected(port) as (reader, writer):
+        writer.write(request("greedy", "/unread", bytes(2**26)))
+        await asyncio.sleep(WAIT_S / 2)
+        pacing.held.clear()
+        await answer(reader)
+        assert writer.transport.get_write_buffer_size() > 2**25
+
+
+def test_nothing_is_answered_on_a_connection_that_was_hung_up(pacing, caplog):
+    async def hung_up():
+        async with serving(pacing) as port, connected(port) as (reader, writer):
+            writer.write(request("modest", "/long") * (PIPELINED + 3))
+            with contextlib.suppress(ConnectionError):
+                await asyncio.wait_for(reader.read(-1), 5.0)
+            await asyncio.sleep(2 * WAIT_S)
+
+    with asyncio.Runner(loop_factory=uvloop.new_event_loop) as runner:  # asyncio's own forgives it
+        runner.run(hung_up())
+    assert not [record.getMessage() for record in caplog.records if record.levelno >= logging.ERROR]
+
+
+async def test_faults_and_cancelling_pass_through():
+    seen = []
+
+    async def failing(scope, receive, send):
+        try:
+            await asyncio.sleep(60.0)
+        except asyncio.CancelledError:
+            seen.append("cancelled")
+            raise
+        finally:
+            await asyncio.sleep(0)
+
+    async def faulty(scope, receive, send):
+        await asyncio.sleep(0)
+        raise KeyError("fault")
+
+    scope = {"type": "http", "state": {"robosac_meter": seen.append}}
+    task = asyncio.create_task(Metered(failing, None)(scope, None, None))
+    await asyncio.sleep(0.01)
+    task.cancel()
+    with pytest.raises(asyncio.CancelledError):
+        await task
+    assert "cancelled" in seen
+    with pytest.raises(KeyError, match="fault"):
+        await Metered(faulty, None)(scope, None, None)
+    assert len(seen) >= 5
