@@ -45,12 +45,14 @@ class Reason(StrEnum):
     """Why a teammate was left out of an answer.
 
     ``not_sampled`` also stands where a teammate was in tested hypotheses but no verdict was reached, because ego and
-    fusion were both empty, or where only consensus was: the answer is of others, such as those suspected less. For
-    ``distrusted``, `Distrust` says why.
+    fusion were both empty, or where only consensus was, and the answer is of others. ``suspected``: no test of the
+    frame speaks against it, but the defence takes it more likely than not for an attacker. For ``distrusted``,
+    `Distrust` says why.
     """
 
     DISSENSUS = "dissensus"
     NOT_SAMPLED = "not_sampled"
+    SUSPECTED = "suspected"
     DISTRUSTED = "distrusted"
     MISSING = "missing"
     LATE = "late"

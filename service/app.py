@@ -126,7 +126,8 @@ def create_app(
         app.add_middleware(Door, check=check_local)
     app.add_middleware(Traced, tracing=tracing)
     app.add_middleware(Door, check=check_head)
-    app.add_middleware(Metered, pacing=Pacing(parties.of_loop, lambda: gateway.admission.busy))
+    pacing = Pacing(parties.of_loop, lambda first: gateway.admission.busy_besides(parties.key_of(first)))
+    app.add_middleware(Metered, pacing=pacing)
     app.add_middleware(Arrival, watch=gateway.watch)
     app.add_middleware(Starting)
     for router in (v1, operations, pages):

@@ -66,6 +66,12 @@ class Attack(StrEnum):
     """Thousands of requests are sent over each connection before the first answer."""
     CHUNKS = "chunks of a byte"
     """A body in as many chunks as it has bytes."""
+    DRIPPING = "bodies byte by byte"
+    """A body in as many writes as it has bytes."""
+    KNOCKS = "connections in a loop"
+    """Connections are made and ended without a word."""
+    UPGRADES = "upgrades in a loop"
+    """Connections of another protocol are asked for."""
     HEADERS = "thousands of headers"
     """Heads of many short lines."""
     LISTS = "lists in a header"
@@ -103,6 +109,9 @@ _PLAYED: dict[Attack, Callable[[Attacker], Awaitable[object]]] = {
     Attack.UNREAD: connections.unread,
     Attack.PIPELINE: connections.pipeline,
     Attack.CHUNKS: connections.chunks,
+    Attack.DRIPPING: connections.dripping,
+    Attack.KNOCKS: connections.knocks,
+    Attack.UPGRADES: connections.upgrades,
     Attack.HEADERS: connections.headers,
     Attack.LISTS: sessions.long_accepts,
     Attack.STOLEN: stolen.tokens,

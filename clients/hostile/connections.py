@@ -82,6 +82,48 @@ async def chunks(attacker: Attacker) -> None:
     await _exchange(attacker, request)
 
 
+async def dripping(attacker: Attacker) -> None:
+    """Send bodies as many small writes, to where a message may be as large."""
+    session = await attacker.open(["mate"])
+    url, path = attacker.target.url, f"/v1/sessions/{session['session_id']}/messages"
+    head = post_head(url, path, CHUNKED_BYTES, session["teammate_tokens"]["mate"], Connection="close")
+
+    async def one() -> None:
+        async with connected(url) as (reader, writer):
+            writer.write(head)
+            answer = asyncio.ensure_future(read_response(reader))
+            try:
+                while not answer.done():
+                    writer.write(b"\xc1")
+                    await asyncio.sleep(0)
+                status, _ = await answer
+            finally:
+                answer.cancel()
+                await asyncio.gather(answer, return_exceptions=True)
+            attacker.answers[str(status)] += 1
+
+    await attacker.again_and_again(CONNECTIONS, one)
+
+
+async def knocks(attacker: Attacker) -> None:
+    """Make connections, and end them without a word."""
+
+    async def one() -> None:
+        async with connected(attacker.target.url):
+            attacker.answers["made"] += 1
+
+    await attacker.again_and_again(CONNECTIONS, one)
+
+
+async def upgrades(attacker: Attacker) -> None:
+    """Ask for a WebSocket on each connection."""
+    request = (
+        b"GET /v1/live HTTP/1.1\r\nHost: localhost\r\nConnection: Upgrade\r\nUpgrade: websocket\r\n"
+        b"Sec-WebSocket-Version: 13\r\nSec-WebSocket-Key: eA==\r\n\r\n"
+    )
+    await _exchange(attacker, request)
+
+
 async def pipeline(attacker: Attacker) -> None:
     """Send thousands of requests before the first answer, and read what comes."""
     request = b"GET /healthz HTTP/1.1\r\nHost: localhost\r\n\r\n" * PIPELINED

@@ -23,6 +23,7 @@ from robosac.audit.events import (
 REASONS: Mapping[Reason, str] = {
     Reason.DISSENSUS: "in dissensus",
     Reason.NOT_SAMPLED: "no test speaks against it",
+    Reason.SUSPECTED: "suspected, though no test of this frame speaks against it",
     Reason.DISTRUSTED: "distrusted",
     Reason.MISSING: "no message came",
     Reason.LATE: "too late",

@@ -167,6 +167,12 @@ class BoundedHTTP(HttpToolsProtocol):
         if not self.pipeline:
             self.flow.resume_reading()  # the next request's first byte is to be seen when it comes
 
+    def _should_upgrade_to_ws(self) -> bool:
+        return False  # an upgrade would pass by all bounds, and the gateway has no use for one
+
+    def _unsupported_upgrade_warning(self) -> None:
+        """Say nothing: whoever asks for an upgrade is answered in HTTP/1.1."""
+
     def send_400_response(self, msg: str) -> None:
         if self._refused is None:
             super().send_400_response(msg)

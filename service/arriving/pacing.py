@@ -31,7 +31,7 @@ Party = tuple[str, str]
 LATELY_S = 0.05
 """What somebody had counts for about so long."""
 LIMIT, LIMIT_BUSY = 0.5, 0.25
-"""Part of the loop's time from which on it is short of time, and the same while frames are in hand."""
+"""Part of the loop's time from which on it is short of time, and the same while others' frames are in hand."""
 SLACK = 2.0
 """How many equal parts somebody may have before it has to wait: those who all want as much are not held up by turns."""
 OF_OTHERS = 0.25
@@ -77,7 +77,8 @@ class Pacing:
     party_of : callable
         Of a request's scope.
     busy : callable
-        Whether frames are in hand.
+        Whether frames are in hand, of others than this key if one is given: its own do not make it wait, unless it is
+        the only one.
     clock : callable
         Seconds.
     """
@@ -85,7 +86,7 @@ class Pacing:
     def __init__(
         self,
         party_of: Callable[[Scope], Party],
-        busy: Callable[[], bool],
+        busy: Callable[[str | None], bool],
         clock: Callable[[], float] = time.perf_counter,
     ) -> None:
         self.party_of = party_of
@@ -113,10 +114,10 @@ class Pacing:
     def is_over(self, party: Party) -> bool:
         """Whether the loop is short of time, and a party had more than its part of it."""
         now, (first, member) = self._clock(), party
-        limit = self._limit()
+        keys = len(self._first) - (OTHERS in self._first)
+        limit = LIMIT_BUSY if self._busy(first if keys > 1 else None) else LIMIT
         if self._all.value(now) < limit or first not in self._first:
             return False
-        keys = len(self._first) - (OTHERS in self._first)
         part = SLACK * (limit * OF_OTHERS if first == OTHERS else limit / keys)
         members = self._members[first]
         return (
@@ -135,9 +136,6 @@ class Pacing:
         self._waiting.setdefault(connection.party, deque()).append((connection, kept))
         self._look_later()
         return True
-
-    def _limit(self) -> float:
-        return LIMIT_BUSY if self._busy() else LIMIT
 
     def _look_later(self) -> None:
         if self._look is None:

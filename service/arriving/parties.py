@@ -14,6 +14,8 @@ from service.keeping.record import SessionRecord
 from service.sessions.identity import ApiKeys, Claimed, claimed
 from service.sessions.viewers import ViewerTokens
 
+_KEY = "key "
+
 
 class Parties:
     """Tells the parties of requests apart: whoever shows a credential that counts by the API key behind it, the viewers
@@ -50,6 +52,11 @@ class Parties:
         """The party of a request, as `service.arriving.pacing` has it: addresses are members of one."""
         return self._known(_credential(scope)) or (OTHERS, _address(scope))
 
+    @staticmethod
+    def key_of(first: str | None) -> str | None:
+        """The id of the API key of which this is the first part of a party."""
+        return None if first is None else first.removeprefix(_KEY)
+
     def is_vehicle(self, scope: Scope, session_id: str) -> bool:
         """Whether a request shows a token of a session, one that counts or one that this gateway signed."""
         credential = _credential(scope)
@@ -61,12 +68,12 @@ class Parties:
             return None
         key_id = self._api_keys.id_of(credential)
         if key_id is not None:
-            return f"key {key_id}", ""
+            return f"{_KEY}{key_id}", ""
         if self._viewer_tokens.has(credential):
             return "viewers", credential
         named = claimed(credential)
         record = self._session_of(named)
-        return None if named is None or record is None else (f"key {record.key_id}", named.token_id)
+        return None if named is None or record is None else (f"{_KEY}{record.key_id}", named.token_id)
 
     def _session_of(self, named: Claimed | None) -> SessionRecord | None:
         """The session in which a token counts, as it is remembered here."""

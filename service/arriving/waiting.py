@@ -9,11 +9,9 @@ Nothing that takes long to import may be imported here: a server needs this befo
 from __future__ import annotations
 
 import contextlib
-import fcntl
 import socket
 import struct
 import sys
-import termios
 from asyncio import BaseTransport
 
 TOLD = sys.platform == "linux"
@@ -51,7 +49,10 @@ def waits(transport: BaseTransport) -> bool:
     of = transport.get_extra_info("socket")
     if of is None:
         return True
-    with contextlib.suppress(OSError):
+    with contextlib.suppress(OSError, ImportError):
+        import fcntl  # noqa: PLC0415 (not there on Windows)
+        import termios  # noqa: PLC0415
+
         number = bytearray(4)
         fcntl.ioctl(of.fileno(), termios.FIONREAD, number)
         return number != bytes(4)

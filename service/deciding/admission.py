@@ -89,6 +89,10 @@ class Admission:
         """Whether frames are in hand."""
         return bool(self._in_hand)
 
+    def busy_besides(self, key: str | None) -> bool:
+        """Whether frames are in hand of others than this key; of anybody for None."""
+        return any(work.key != key for work in self._in_hand)
+
     def check(self, key: str, session_id: str, left_s: float) -> None:
         """Refuse a frame that is not expected to be answered in the time that it has left.
 

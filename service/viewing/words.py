@@ -12,6 +12,7 @@ from robosac.audit.sentences import DISTRUSTS, listed
 REASONS: Mapping[Reason, str] = {
     Reason.DISSENSUS: "the ego's own perception contradicts its fusion",
     Reason.NOT_SAMPLED: "no test speaks against it, but the answer is of others",
+    Reason.SUSPECTED: "it is suspected, though no test of this frame speaks against it",
     Reason.DISTRUSTED: "it is distrusted",
     Reason.MISSING: "it sent nothing for this frame",
     Reason.LATE: "its message came too late",

@@ -43,7 +43,7 @@ async def application(scope, receive, send):
 async def port():
     with socket.socket() as listening:
         listening.bind(("127.0.0.1", 0))
-        config = uvicorn.Config(Arrival(application, LoopWatch()), http=Hasty, log_level="error", timeout_keep_alive=60)
+        config = uvicorn.Config(Arrival(application, LoopWatch()), http=Hasty, log_config=None, timeout_keep_alive=60)
         server = uvicorn.Server(config)
         serving = asyncio.create_task(server.serve([listening]))
         while not server.started:
@@ -214,6 +214,15 @@ async def test_a_head_of_any_size_that_is_looked_at_is_whole(port):
     async with connected(port) as (reader, writer):
         writer.write(GET.replace(b"Host: x", b"Host: x\r\nlong: " + b"x" * (HEAD_BYTES - 100)))
         assert b"200" in await reader.readuntil(b"\r\n\r\n")
+
+
+@pytest.mark.parametrize("protocol", [b"websocket\r\nSec-WebSocket-Version: 13\r\nSec-WebSocket-Key: eA==", b"h2c"])
+async def test_nobody_gets_another_protocol_by_which_nothing_is_bounded(port, protocol, caplog):
+    async with connected(port) as (reader, writer):
+        writer.write(GET.replace(b"Host: x", b"Host: x\r\nConnection: Upgrade\r\nUpgrade: " + protocol))
+        assert (await reader.readuntil(b"\r\n\r\n")).startswith(b"HTTP/1.1 200")
+        assert await reader.readexactly(2) == b"ok"
+    assert "upgrade" not in caplog.text.lower()
 
 
 WAITED = GET.replace(b"/", b"/waited", 1)

@@ -23,7 +23,10 @@ from service.arriving.pacing import (
     Metered,
     Pacing,
 )
+from service.arriving.parties import Parties
 from service.watching.stalls import LoopWatch
+from tests.service.conftest import serve
+from tests.service.credentials import KEY, OTHER_KEY
 
 GREEDY, MODEST = ("key greedy", "ego"), ("key modest", "ego")
 STRANGER = (OTHERS, "address 10.0.0.1")
@@ -40,7 +43,7 @@ class Clock:
 
 def paced(busy=False):
     clock = Clock()
-    return Pacing(lambda scope: STRANGER, lambda: busy, clock), clock
+    return Pacing(lambda scope: STRANGER, lambda besides: busy and besides != "a", clock), clock
 
 
 def spend(pacing, clock, seconds=0.5, **share):
@@ -85,8 +88,18 @@ def test_there_is_less_time_while_frames_are_in_hand():
     part = (LIMIT + SLACK / 2 * LIMIT_BUSY) / 2
     for busy in (False, True):
         pacing, clock = paced(busy)
-        spend(pacing, clock, a_ego=part, b_ego=0.01)
-        assert pacing.is_over(("a", "ego")) is busy
+        spend(pacing, clock, b_ego=part, a_ego=0.01)
+        assert pacing.is_over(("b", "ego")) is busy
+
+
+def test_ones_own_frames_make_one_wait_only_where_there_is_no_other_key():
+    pacing, clock = paced(busy=True)
+    spend(pacing, clock, a_ego=(LIMIT + SLACK / 2 * LIMIT_BUSY) / 2, b_ego=0.01)
+    assert not over(pacing, "a_ego")
+    for busy in (False, True):
+        alone, clock = paced(busy)
+        spend(alone, clock, a_ego=1.2 * SLACK * LIMIT_BUSY)
+        assert alone.is_over(("a", "ego")) is busy
 
 
 def test_all_without_a_credential_have_one_small_part():
@@ -116,7 +129,7 @@ class Connection:
 
 async def test_who_had_least_goes_on_first_and_all_do():
     gone_on = []
-    pacing = Pacing(lambda scope: STRANGER, lambda: False)
+    pacing = Pacing(lambda scope: STRANGER, lambda besides: False)
     for party, seconds in ((GREEDY, 0.3), (MODEST, 0.01), (STRANGER, 0.1)):
         pacing.charge(party, seconds)
     for party in (GREEDY, STRANGER, GREEDY, MODEST):
@@ -128,7 +141,7 @@ async def test_who_had_least_goes_on_first_and_all_do():
 
 
 async def test_what_waits_is_bounded():
-    pacing = Pacing(lambda scope: STRANGER, lambda: False)
+    pacing = Pacing(lambda scope: STRANGER, lambda besides: False)
     gone_on = []
     assert pacing.wait(Connection(GREEDY, gone_on), MOST_KEPT_BYTES)
     assert not pacing.wait(Connection(MODEST, gone_on), 1)
@@ -141,7 +154,7 @@ class Told(Pacing):
     """Has those wait who show a certain credential, until it is told otherwise."""
 
     def __init__(self):
-        super().__init__(self.by_credential, lambda: False)
+        super().__init__(self.by_credential, lambda besides: False)
         self.held, self.charged = {"greedy"}, {}
 
     def by_credential(self, scope):
@@ -365,3 +378,25 @@ async def test_faults_and_cancelling_pass_through():
     with pytest.raises(KeyError, match="fault"):
         await Metered(faulty, None)(scope, None, None)
     assert len(seen) >= 5
+
+
+async def test_a_keys_own_frames_are_told_from_those_of_others(good_frame):
+    async with serve(api_keys=f"{KEY},{OTHER_KEY}", api_key=KEY) as served:
+        gateway = served.gateway
+        session = await served.open()
+        assert (await served.post(session, "frames", good_frame(0))).status_code == 200
+        parties = Parties(gateway.api_keys, gateway.viewer_tokens, gateway.store.seen, gateway.sessions.tokens.signed)
+
+        def key_of(credential):
+            headers = [(b"authorization", f"Bearer {credential}".encode())]
+            return parties.key_of(parties.of_loop({"client": ("10.0.0.1", 1), "headers": headers})[0])
+
+        assert key_of(KEY) == key_of(session.ego_token) == key_of(session.teammate_tokens["rsu"])
+        assert len({key_of(one) for one in (KEY, OTHER_KEY, "none")}) == 3
+        live = gateway.sessions.in_use(session.session_id)
+        admission = gateway.admission
+        with admission.frame(live.key, session.session_id, time.perf_counter() + 1.0, 1.0):
+            assert not admission.busy_besides(key_of(KEY))
+            assert all(admission.busy_besides(key_of(one)) for one in (OTHER_KEY, "none"))
+            assert admission.busy_besides(None)
+        assert not admission.busy_besides(None)

@@ -20,6 +20,8 @@ from robosac.defenses.protocol import Decision, Hypothesis, Outcome, Rejection, 
 
 TRUSTED_BELOW = 0.1
 """Largest suspicion of a teammate on the trust list."""
+SUSPECTED_FROM = 0.5
+"""Suspicion from which on it is told that it keeps a teammate out."""
 CLEARED_BELOW = 0.5
 """A named teammate is named no longer once its suspicion is below."""
 FORGOTTEN_BELOW = 0.05
@@ -210,6 +212,8 @@ class JudgedFrame:
                 evidence["ego_astray"] = True
             elif name in memory.placing.out:
                 evidence["misplaced_m"] = round(memory.placing.off[name], 2)
+            elif reason is Reason.NOT_SAMPLED and suspicion[name] >= SUSPECTED_FROM:
+                reason = Reason.SUSPECTED
             if name in named:
                 reason = Reason.DISTRUSTED
                 evidence["evidence"] = [dict(item) for item in memory.evidence.get(name, ())]

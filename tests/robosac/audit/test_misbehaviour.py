@@ -19,7 +19,7 @@ from tests.robosac.audit.conftest import KEY, SESSION, head, proof, seal_all
 from tests.service.conftest import serve
 
 NOW = datetime(2025, 1, 1, tzinfo=UTC)
-HARMLESS = ("not_sampled", "missing", "late", "malformed", "stale", "unauthenticated", "replayed")
+HARMLESS = ("not_sampled", "suspected", "missing", "late", "malformed", "stale", "unauthenticated", "replayed")
 
 
 def observations(made):

@@ -5,7 +5,7 @@ from functools import partial
 import numpy as np
 import pytest
 
-from robosac.answers import Source, Verdict
+from robosac.answers import Reason, Source, Verdict
 from robosac.boxes import from_world, pose_matrix
 from robosac.defenses import Outcome
 from robosac.defenses.group_testing import GroupTestingSettings
@@ -47,6 +47,22 @@ def test_who_stays_where_it_is_is_left_out_and_not_named(rng):
     apart, _ = run(with_settings(compare_frames=False), ["car-3"], 8, rng)
     assert apart.suspicion["car-3"] > 0.95
     assert named(apart) == set()
+
+
+def test_who_is_suspected_is_told_apart_from_who_was_not_sampled(rng):
+    state, seen = DEFENSE.initial_state(TEAM), set()
+    for _ in range(12):
+        decision, tested = run_frame(DEFENSE, state, TEAM, ["car-3"], rng, most=1)
+        state = json.loads(json.dumps(decision.state))
+        against = {name for one in tested if one.verdict is Verdict.DISSENSUS for name in one.teammates}
+        for name, why in decision.rejected.items():
+            if name not in against and why.reason is not Reason.DISTRUSTED:
+                expected = Reason.SUSPECTED if decision.suspicion[name] >= 0.5 else Reason.NOT_SAMPLED
+                assert why.reason is expected
+                seen.add((name == "car-3", why.reason))
+    assert (True, Reason.SUSPECTED) in seen
+    assert (False, Reason.SUSPECTED) not in seen
+    assert Reason.NOT_SAMPLED in {reason for _, reason in seen}
 
 
 def still(shown, frame):

@@ -1,6 +1,7 @@
 import numpy as np
 import pytest
 import torch
+from scipy.spatial.distance import cdist
 
 from robosac.detectors import load
 from robosac.detectors.map_fusion import WORTH
@@ -9,6 +10,15 @@ from tests.robosac.detectors.elsewhere import elsewhere
 
 ANCHORS = 256 * 256 * 6
 SUBSETS = [(), ("car-0", "car-2"), ("car-1",), ("car-0", "car-1", "car-2")]
+
+
+def check_same(boxes, right):
+    """Two whose scores differ by less than a rounding may change places."""
+    assert len(boxes) == len(right)
+    order = cdist(right[:, :2], boxes[:, :2]).argmin(axis=1)
+    assert sorted(order) == list(range(len(right)))
+    for these in (boxes[order], np.column_stack([boxes[order, :5], boxes[:, 5]])):
+        np.testing.assert_allclose(these, right, rtol=1e-5, atol=1e-3)
 
 
 @pytest.mark.parametrize("fusion", ["mean", "max", "sum"])
@@ -29,7 +39,7 @@ def test_a_frame_is_prepared_and_decoded_there(fusion, published_state, tmp_path
     # how many rows one multiplies, and in which order one sums, changes how it is rounded
     for one, another, and_here, right in zip(found, at_once, here.detect_all(SUBSETS), expected, strict=True):
         for boxes in (one, another, and_here):
-            np.testing.assert_allclose(boxes, right, rtol=1e-5, atol=1e-3)
+            check_same(boxes, right)
 
 
 @pytest.mark.parametrize("fusion", ["mean", "max"])
@@ -47,7 +57,7 @@ def test_frames_of_several_egos_are_decoded_at_once(fusion, published_state, tmp
     assert [len(of_frame) for of_frame in found] == [3, 1, 1]
     for frame, asked, boxes in zip(here, subsets, found, strict=True):
         for subset, of_subset in zip(asked, boxes, strict=True):
-            np.testing.assert_allclose(of_subset, frame.detect(subset), rtol=1e-5, atol=1e-3)
+            check_same(of_subset, frame.detect(subset))
 
 
 @pytest.mark.parametrize("fusion", ["mean", "sum"])
