@@ -2,7 +2,7 @@
 
 What comes costs time before anybody can say what it is worth: connections, heads, pieces of bodies, refusals. So the
 time is measured that the loop spends on each connection and on its requests, and once the loop is short of time,
-nothing more is read from those who had most. What they send waits in the kernel, and then with them.
+nothing more is read from those who had most. What was read of them last is kept, and the rest waits in the kernel.
 
 Nothing that takes long to import may be imported here: a server needs this before the application.
 """
@@ -35,7 +35,7 @@ LIMIT, LIMIT_BUSY = 0.5, 0.25
 SLACK = 2.0
 """How many equal parts somebody may have before it has to wait: those who all want as much are not held up by turns."""
 OF_OTHERS = 0.25
-"""Part of that which all without a credential may have together then."""
+"""Part of the limit that counts as the equal part of all who show no credential."""
 MOST_KEPT_BYTES = 2**25
 """Of what came and waits, of all connections together."""
 _FORGOTTEN_S = 1.0
