@@ -53,7 +53,7 @@ class BoundedHTTP(HttpToolsProtocol):
 
     _waited_s = 0.0
     _deadline: TimerHandle | None = None
-    _in_head = False
+    _in_head = _in_body = False
     _head_ended = False
     _head_bytes = 0
     _pieces = 0
@@ -108,11 +108,11 @@ class BoundedHTTP(HttpToolsProtocol):
 
     def _look_whose(self, data: bytes, pacing: Pacing) -> None:
         """See whose a request is, before anything is done for it: by the credential, if it is in the first bytes."""
-        if self._in_head or (self.cycle is not None and self.cycle.more_body):
+        if self._in_head or self._in_body:
             return
-        found = _CREDENTIAL.search(data, 0, HEAD_BYTES)
-        if found is not None:
-            self.party = pacing.party_of({"client": self.client, "headers": [(b"authorization", found[1])]})
+        found = _CREDENTIAL.search(data, 0, HEAD_BYTES)  # if none, a proxy may send for somebody else than before
+        headers = [(b"authorization", found[1])] if found else []
+        self.party = pacing.party_of({"client": self.client, "headers": headers})
 
     def _take_metered(self, data: bytes, pacing: Pacing) -> None:
         began = time.thread_time()
@@ -146,7 +146,7 @@ class BoundedHTTP(HttpToolsProtocol):
             self._refuse("431 Request Header Fields Too Large", f"A head may have {HEADERS} headers.")
 
     def on_headers_complete(self) -> None:
-        self._in_head, self._head_ended, self._head_bytes = False, True, 0
+        self._in_head, self._in_body, self._head_ended, self._head_bytes = False, True, True, 0
         self._pieces = self._body_bytes = 0
         super().on_headers_complete()
         self._unanswered = [cycle for cycle in (*self._unanswered, self.cycle) if not cycle.response_complete]
@@ -163,6 +163,7 @@ class BoundedHTTP(HttpToolsProtocol):
         super().on_body(body)
 
     def on_message_complete(self) -> None:
+        self._in_body = False
         super().on_message_complete()
         if not self.pipeline:
             self.flow.resume_reading()  # the next request's first byte is to be seen when it comes

@@ -31,6 +31,7 @@ from tests.service.credentials import KEY, OTHER_KEY
 GREEDY, MODEST = ("key greedy", "ego"), ("key modest", "ego")
 STRANGER = (OTHERS, "address 10.0.0.1")
 WAIT_S = 0.3
+GET_WORK = b"GET /work HTTP/1.1\r\nHost: x\r\n\r\n"
 KEEP_ALIVE_S = 1
 
 
@@ -305,6 +306,24 @@ async def test_the_loops_time_is_measured_and_no_other(port, pacing):
         await answer(reader)
     assert 0.04 <= pacing.charged["busy"] < 0.04 + WAIT_S / 2
     assert pacing.charged["idle"] < 0.02
+
+
+@pytest.mark.parametrize("refused", [False, True])
+async def test_each_request_of_a_connection_is_put_down_to_its_own_sender(port, pacing, refused):
+    """A proxy sends for many. An answer may come before the body does."""
+    async with connected(port) as (reader, writer):
+        sent = request("modest", "/unread" if refused else "/", bytes(1000))
+        writer.write(sent[:-500])
+        if refused:
+            await answer(reader)
+        writer.write(sent[-500:])
+        if not refused:
+            await answer(reader)
+        await asyncio.sleep(0.05)
+        writer.write(GET_WORK)
+        await answer(reader)
+    assert pacing.charged["modest"] < 0.03
+    assert pacing.charged["nobody"] >= 0.04
 
 
 async def test_whoever_has_too_much_waiting_is_hung_up_on(port, pacing, monkeypatch):

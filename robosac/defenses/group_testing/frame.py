@@ -21,7 +21,7 @@ from robosac.defenses.protocol import Decision, Hypothesis, Outcome, Rejection, 
 TRUSTED_BELOW = 0.1
 """Largest suspicion of a teammate on the trust list."""
 SUSPECTED_FROM = 0.5
-"""Suspicion from which on it is told that it keeps a teammate out."""
+"""Suspicion from which on a teammate that is left out is told to be suspected."""
 CLEARED_BELOW = 0.5
 """A named teammate is named no longer once its suspicion is below."""
 FORGOTTEN_BELOW = 0.05
