@@ -60,9 +60,8 @@ def match(
     reference, candidate = as_boxes(reference, "reference"), as_boxes(candidate, "candidate")
     if iou is None:
         iou = pairwise_iou(reference, candidate)
-    good = iou >= iou_threshold
-    if (good.sum(axis=0) <= 1).all() and (good.sum(axis=1) <= 1).all():
-        rows, columns = np.nonzero(good)
+    rows, columns = np.nonzero(iou >= iou_threshold)
+    if all(len(set(each.tolist())) == len(each) for each in (rows, columns)):
         return rows, columns
     from scipy.optimize import linear_sum_assignment  # noqa: PLC0415 (a second to import; `fuse` has it already)
 

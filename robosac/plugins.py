@@ -202,10 +202,13 @@ def lacks(candidate: object, contract: type[Any], needed: Collection[str] | None
     str
         ``lacks NAME (PURPOSE), ...``; empty if it lacks nothing.
     """
-    purposes, wanted = parts(contract), _parts(contract)
-    missing = [name for name in (purposes if needed is None else needed) if not _has(candidate, name, wanted.get(name))]
+    wanted = _parts(contract)
+    missing = [name for name in (wanted if needed is None else needed) if not _has(candidate, name, wanted.get(name))]
+    if not missing:
+        return ""
+    purposes = parts(contract)
     shown = [f"{name} ({purposes[name]})" if name in purposes else name for name in missing]
-    return f"lacks {', '.join(shown)}" if missing else ""
+    return f"lacks {', '.join(shown)}"
 
 
 def misfits(candidate: object, contract: type[Any]) -> str:

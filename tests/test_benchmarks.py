@@ -45,9 +45,9 @@ def test_a_device_is_measured_and_one_that_is_not_there_is_refused():
     assert done.returncode == 0, done.stderr
     assert "intersection-mean on cpu, 5 teammates" in done.stdout
     cells = [[cell.strip() for cell in line.split("│")[1:-1]] for line in done.stdout.splitlines() if "│" in line]
-    assert [row[0] for row in cells[:2]] == ["one by one", "8 at once"]
-    assert [row[0] for row in cells[2:5]] == ["prepared", "decoded", "compared"]
-    assert [row[0] for row in cells[5:11]] == ["1", "2", "4", "8", "16", "32"]
-    assert all(float(cell) > 0 for row in cells for cell in row[1:])
+    assert [row[0] for row in cells[:3]] == ["one by one", "8 at once", "8 at once, from its last message on"]
+    assert [row[0] for row in cells[3:6]] == ["prepared", "decoded", "compared"]
+    assert [row[0] for row in cells[6:12]] == ["1", "2", "4", "8", "16", "32"]
+    assert all(float(cell) > 0 for row in cells for cell in row[1:] if cell)
     assert refused.returncode == 2
     assert "torch cannot compute on the device 'nonsense' here" in refused.stderr

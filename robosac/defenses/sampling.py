@@ -2,9 +2,8 @@
 
 from __future__ import annotations
 
-from collections.abc import Iterator, Sequence
-from copy import deepcopy
-from functools import partial
+from collections import deque
+from collections.abc import Iterator, Mapping, Sequence
 from math import comb
 from typing import Annotated, Any, ClassVar, Self
 
@@ -119,9 +118,10 @@ def search(
     tuple of str
         The subset in consensus; empty if there is none.
     """
-    (s, n), seen = plan, set[Hypothesis]() if distinct else None
-    for tries, subset in enumerate(_draws(team, plan, rng, seen), 1):
-        tested = yield Batch([subset], partial(_next_draws, team, (s, n - tries), rng, seen))
+    draws = _Draws(team, plan, rng, distinct)
+    while draws.left:
+        subset = draws.draw()
+        tested = yield Batch([subset], draws.coming)
         outcomes.extend(tested)
         if not tested:
             break
@@ -130,26 +130,45 @@ def search(
     return ()
 
 
-def _draws(
-    team: Sequence[str], plan: tuple[int, int], rng: np.random.Generator, seen: set[Hypothesis] | None
-) -> Iterator[Hypothesis]:
-    """Random subsets by a plan as `search` takes it; none of those ``seen``, if it is said which."""
-    s, left = plan
-    while left > 0:
-        subset = draw(team, s, rng)
-        if seen is not None:
-            if subset in seen:  # so that large teams cost no memory
-                continue
-            seen.add(subset)
-        left -= 1
-        yield subset
+class _Draws:
+    """Random subsets by a plan as `search` takes it.
 
+    Those that are coming may be looked at. They are drawn then, but the generator stands where it stood.
+    """
 
-def _next_draws(
-    team: Sequence[str], plan: tuple[int, int], rng: np.random.Generator, seen: set[Hypothesis] | None
-) -> Iterator[Hypothesis]:
-    """What `_draws` will give."""
-    return _draws(team, plan, deepcopy(rng), None if seen is None else set(seen))
+    def __init__(self, team: Sequence[str], plan: tuple[int, int], rng: np.random.Generator, distinct: bool) -> None:
+        self._team, self._rng = team, rng
+        self._s, self.left = plan
+        self._seen = set[Hypothesis]() if distinct else None
+        self._ahead = deque[tuple[Hypothesis, Mapping[str, Any]]]()  # with the generator's state after each
+
+    def draw(self) -> Hypothesis:
+        """The next one."""
+        if not self._ahead:
+            self._look()
+        subset, self._rng.bit_generator.state = self._ahead.popleft()
+        self.left -= 1
+        return subset
+
+    def coming(self) -> Iterator[Hypothesis]:
+        """What will be drawn from now on."""
+        for i in range(self.left):
+            if i == len(self._ahead):
+                self._look()
+            yield self._ahead[i][0]
+
+    def _look(self) -> None:
+        bits = self._rng.bit_generator
+        now = bits.state
+        if self._ahead:
+            bits.state = self._ahead[-1][1]
+        subset = draw(self._team, self._s, self._rng)
+        if self._seen is not None:
+            while subset in self._seen:  # so that large teams cost no memory
+                subset = draw(self._team, self._s, self._rng)
+            self._seen.add(subset)
+        self._ahead.append((subset, bits.state))
+        bits.state = now
 
 
 def draw(team: Sequence[str], s: int, rng: np.random.Generator) -> Hypothesis:

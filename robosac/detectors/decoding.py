@@ -12,7 +12,7 @@ from torch.nn import functional
 from robosac.boxes import FloatArray, IntArray, nms
 from robosac.detectors.network import HEAD
 from robosac.detectors.recorded import Tensors
-from robosac.detectors.suppression import Picked, brought_back, suppressed
+from robosac.detectors.suppression import LOOKED_AT, Picked, brought_back, suppressed
 from robosac.detectors.voxels import AREA_M
 
 HEAD_CELL_M = 2 * AREA_M / HEAD
@@ -73,7 +73,7 @@ def found_there(logits: torch.Tensor, codes: torch.Tensor, score_threshold: floa
     within = (torch.hypot(x, y) >= OWN_BODY_M) & (x.abs() <= AREA_M) & (y.abs() <= AREA_M)
     length, width = code[..., 2:4].clip(*LOG_SIZES).exp().unbind(-1)
     boxes = torch.stack([x, y, length, width, torch.atan2(code[..., 5], code[..., 4]) / 2], -1)
-    return suppressed(torch.where(within, value, -torch.inf), index, code, boxes, NMS_IOU)
+    return suppressed(torch.where(within, value, -torch.inf), index, code, boxes[:, :LOOKED_AT], NMS_IOU)
 
 
 def boxes_there(found: Tensors) -> list[FloatArray]:

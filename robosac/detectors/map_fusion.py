@@ -6,6 +6,7 @@ detector is a subclass of `MapFusionDetector`, which says how its maps are fused
 
 from __future__ import annotations
 
+import math
 from abc import ABC, abstractmethod
 from collections.abc import Callable, Collection, Iterator, Mapping, Sequence
 from copy import deepcopy
@@ -28,6 +29,8 @@ WORTH = 8
 """Subsets that an accelerator decodes at once, unless told otherwise: the ego alone, and seven hypotheses."""
 AT_ONCE = 8
 """Maps warped together: what more of them take in between no longer fits into caches."""
+AT_A_TIME = 8
+"""Parts of a map's channels that an accelerator warps at a time: cells alone would not keep it busy."""
 Tensor = np.ndarray[Any, np.dtype[Any]]
 Maps = Sequence[torch.Tensor]
 Heads = tuple[torch.Tensor, torch.Tensor]
@@ -122,12 +125,17 @@ class MapFusionDetector(ABC):
         """Maps (C, H, W) of teammates as they lie in the ego's frame."""
         if self.device != CPU:
             sent = gone_up(_features(teammates), self.device)
-            (laid,) = self._laid(sent, self.matrices(ego, teammates).to(self.device))
+            matrices = self._matrices(ego, teammates).astype(np.float32)
+            (laid,) = self._laid(sent, gone_up([matrices], self.device)[0])
             return iter(laid.clone())
         return self._laid_here(ego, teammates)
 
     def _laid_there(self, sent: torch.Tensor, matrices: torch.Tensor) -> Tensors:
-        return (warp(sent.float().contiguous(memory_format=torch.channels_last), matrices) / self.gain,)
+        channels, *size = sent.shape[1:]
+        parts = math.gcd(channels, AT_A_TIME)
+        moves = matrices[:, None].expand(-1, parts, -1, -1).flatten(0, 1)
+        laid = warp(sent.float().view(-1, channels // parts, *size), moves).view(sent.shape)
+        return ((laid / self.gain).contiguous(memory_format=torch.channels_last),)
 
     def _laid_here(self, ego: Message, teammates: Sequence[Message]) -> Iterator[torch.Tensor]:
         height, width = teammates[0].tensors[FEATURES].shape[1:]
@@ -154,7 +162,7 @@ def _features(messages: Collection[Message]) -> list[Tensor]:
 def combined(maps: torch.Tensor, weights: FloatArray) -> torch.Tensor:
     """Sums (n, C, H, W) of maps (m, C, H, W), each with its weight in a row of ``weights`` (n, m), float32."""
     cells = maps.permute(0, 2, 3, 1)
-    sums = torch.from_numpy(weights).to(maps.device) @ cells.flatten(1)
+    sums = gone_up([weights], maps.device)[0] @ cells.flatten(1)
     return sums.view(-1, *cells.shape[1:]).permute(0, 3, 1, 2)
 
 
@@ -207,7 +215,8 @@ class PreparedMaps:
         contexts = [frame._context for frame, subsets in wanted for _ in subsets]
         with torch.inference_mode():
             fused = [frame._fused_for(subsets) for frame, subsets in wanted]
-            found = iter(wanted[0][0]._detector.find(torch.cat(fused), contexts))
+            together = fused[0] if len(fused) == 1 else torch.cat(fused)
+            found = iter(wanted[0][0]._detector.find(together, contexts))
         return [list(islice(found, len(subsets))) for _, subsets in wanted]
 
     def _fused_for(self, subsets: Subsets) -> torch.Tensor:

@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable
+from collections.abc import Callable, Sequence
 from typing import Any
 
 import torch
@@ -45,8 +45,8 @@ class Recorded:
             padded = (torch.cat([each, *[each[-1:]] * (n - len(each))]) for n, each in zip(rows, given, strict=True))
             self._recordings[key] = self._record(tuple(padded))
         graph, taken, returned = self._recordings[key]
-        for mine, each in zip(taken, given, strict=True):
-            mine[: len(each)].copy_(each)  # what is in the rows beyond changes nothing
+        # what is in the rows beyond changes nothing
+        put([mine[: len(each)] for mine, each in zip(taken, given, strict=True)], given)
         graph.replay()
         return tuple(each[:count] for each in returned)
 
@@ -68,6 +68,20 @@ class Recorded:
         with torch.cuda.graph(graph, pool=self._pool, capture_error_mode="thread_local"):
             returned = self._function(*taken)
         return graph, taken, returned
+
+
+def copies(tensors: Sequence[torch.Tensor]) -> Tensors:
+    """A copy of each of some tensors of one device."""
+    of_each = tuple(map(torch.empty_like, tensors))
+    put(of_each, tensors)
+    return of_each
+
+
+def put(into: Sequence[torch.Tensor], tensors: Sequence[torch.Tensor]) -> None:
+    """Copy each of some tensors into another one; those of a type at once, as each copy would take a call."""
+    for dtype in {each.dtype for each in tensors}:
+        pairs = [pair for pair in zip(into, tensors, strict=True) if pair[1].dtype == dtype]
+        torch._foreach_copy_([to for to, _ in pairs], [of for _, of in pairs])
 
 
 def can_record(device: torch.device) -> bool:

@@ -12,7 +12,7 @@ from torch import nn
 
 from robosac.boxes import BoolArray, FloatArray
 from robosac.detectors.base import DetectorInfo, Message
-from robosac.detectors.device import CPU, stacked
+from robosac.detectors.device import CPU, gone_up, stacked
 from robosac.detectors.weights_file import WeightsError
 from robosac.testimony import LAYERS
 
@@ -143,4 +143,4 @@ class Layout:
 def told(heights: Sequence[float], device: torch.device = CPU) -> torch.Tensor:
     """How high sensors are, metres, as the network is told it: (n,)."""
     sure = [min(height, HIGHEST_M) if 0.0 <= height <= MAST_M else USUAL_M for height in heights]
-    return torch.tensor(sure, dtype=torch.float32).to(device) / 5
+    return gone_up([np.array(sure, dtype=np.float32)], device)[0] / 5

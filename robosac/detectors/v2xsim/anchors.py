@@ -20,7 +20,7 @@ import torch
 
 from robosac.boxes import FloatArray, IntArray, nms
 from robosac.detectors.recorded import Tensors
-from robosac.detectors.suppression import Picked, brought_back, suppressed
+from robosac.detectors.suppression import LOOKED_AT, Picked, brought_back, suppressed
 from robosac.detectors.v2xsim.network import ANCHORS, GRID
 from robosac.detectors.v2xsim.voxels import AREA_M, CELL_M
 
@@ -175,10 +175,11 @@ def found_there(logits: torch.Tensor, codes: Indexed, score_threshold: float = S
     """As `detections_of_each`, on an accelerator; `detections_there` makes boxes of it."""
     margin, index, code = best_anchors(logits, codes, _floor(score_threshold))
     margin = torch.where(code.isfinite().all(2), margin, -torch.inf)
-    anchors = _all_anchors(index.device)[index.flatten()]
-    x, y, log_length, log_width, cosine, sine = geometry(code.flatten(0, 1), anchors).unbind(1)
+    looked_at = index[:, :LOOKED_AT]
+    anchors = _all_anchors(index.device)[looked_at.flatten()]
+    x, y, log_length, log_width, cosine, sine = geometry(code[:, :LOOKED_AT].flatten(0, 1), anchors).unbind(1)
     boxes = torch.stack([x, y, log_length.exp(), log_width.exp(), torch.atan2(sine, cosine) / 2], 1)
-    return suppressed(margin, index, code, boxes.view(*index.shape, -1), NMS_IOU)
+    return suppressed(margin, index, code, boxes.view(*looked_at.shape, -1), NMS_IOU)
 
 
 def detections_there(found: Tensors) -> list[FloatArray]:

@@ -27,7 +27,7 @@ from robosac.detectors.base import (
 )
 from robosac.detectors.device import CPU, gone_up, stacked
 from robosac.detectors.map_fusion import FEATURES, Decode, Heads, MapFusionDetector, Maps, combined
-from robosac.detectors.recorded import Recorded, Tensors
+from robosac.detectors.recorded import Recorded, Tensors, copies
 from robosac.detectors.v2xsim.anchors import (
     SCORE_THRESHOLD,
     detections_of_each,
@@ -183,7 +183,7 @@ class V2XSimDetector(MapFusionDetector):
         packed = gone_up([ego.tensors[_GRID]], self.device)
         if self.device == CPU:
             return self._begun_there(packed, own[None])
-        return tuple(each.clone() for each in self._begun(packed, own[None]))
+        return copies(self._begun(packed, own[None]))
 
     def _begun_there(self, packed: torch.Tensor, own: torch.Tensor) -> Context:
         return self._fast.context(_unpacked(packed), own)

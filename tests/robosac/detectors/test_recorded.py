@@ -4,7 +4,7 @@ import pytest
 import torch
 
 from robosac.detectors import recorded
-from robosac.detectors.recorded import EACH, MOST, Recorded
+from robosac.detectors.recorded import EACH, MOST, Recorded, copies
 
 
 class Playing:
@@ -69,3 +69,14 @@ def test_on_the_processor_the_function_is_just_called():
     played = Recorded(twice)
     played(torch.ones(2, 4), torch.ones(1, 4))
     assert played._recordings == {}
+
+
+def test_copies_hold_what_was_copied_in_its_type_and_layout():
+    tensors = torch.rand(2, 3, 4, 5).contiguous(memory_format=torch.channels_last), torch.rand(3).half(), torch.rand(2)
+    kept = [each.clone() for each in tensors]
+    made = copies(tensors)
+    for each in tensors:
+        each.zero_()
+    for copy, expected in zip(made, kept, strict=True):
+        assert torch.equal(copy, expected)
+        assert (copy.dtype, copy.stride()) == (expected.dtype, expected.stride())
