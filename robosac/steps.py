@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import time
 from collections.abc import Generator
 from typing import Any, TypeVar
 
@@ -18,3 +19,17 @@ def finished(steps: Steps[T]) -> T:
     except StopIteration as stop:
         result: T = stop.value
         return result
+
+
+def done_within(steps: Steps[T], seconds: float) -> tuple[T] | None:
+    """What work comes to that is begun or gone on with for about so long, until the pause after that; None if it is not
+    over by then.
+    """
+    until = time.perf_counter() + seconds
+    try:
+        while True:
+            next(steps)
+            if time.perf_counter() >= until:
+                return None
+    except StopIteration as stop:
+        return (stop.value,)

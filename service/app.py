@@ -114,8 +114,7 @@ def create_app(
     )
     app.state.gateway = gateway
     problems.install(app)
-    parties = Parties(gateway.api_keys, gateway.viewer_tokens, gateway.store.seen, tokens.signed)
-    line = Line(lambda: gateway.admission.busy)
+    parties, line = gateway.parties, Line(lambda: gateway.admission.busy)
     app.add_middleware(GivesWay, line=line, party_of=parties, is_vehicle=parties.is_vehicle)
     app.add_middleware(HangingUp)
     app.add_middleware(BodyLimit, limit=settings.max_body_bytes, timeout_s=settings.body_timeout_s)
@@ -126,8 +125,7 @@ def create_app(
         app.add_middleware(Door, check=check_local)
     app.add_middleware(Traced, tracing=tracing)
     app.add_middleware(Door, check=check_head)
-    pacing = Pacing(parties.of_loop, lambda first: gateway.admission.busy_besides(parties.key_of(first)))
-    app.add_middleware(Metered, pacing=pacing)
+    app.add_middleware(Metered, pacing=gateway.frames.pacing)
     app.add_middleware(Arrival, watch=gateway.watch)
     app.add_middleware(Starting)
     for router in (v1, operations, pages):
@@ -164,6 +162,9 @@ def _built(
     keeping = Keeping(sessions, store, settings.keep_frames)
     deciding = Deciding(sessions, keeping, engine, metrics, admission, tracing, feed)
     of_key = settings.max_inflight_bytes_per_key if len(api_keys) > 1 else None  # one key has all to itself
+    viewer_tokens = ViewerTokens(settings, open_to_all=not api_keys)
+    parties = Parties(api_keys, viewer_tokens, store.seen, tokens.signed)
+    pacing = Pacing(parties.of_loop, lambda first: admission.busy_besides(parties.key_of(first)))
     return Gateway(
         admission=admission,
         keys=keys,
@@ -174,12 +175,13 @@ def _built(
         sessions=sessions,
         teams=Teams(settings, sessions, store, tokens),
         possession=Possession(store, sessions.journal, tokens.clock, settings.public_url),
-        frames=Frames(sessions, deciding, metrics, admission, settings.max_frame_jump),
+        parties=parties,
+        frames=Frames(sessions, deciding, metrics, admission, settings.max_frame_jump, pacing),
         bodies=Room(settings.max_inflight_bytes, of_key, "ROBOSAC_MAX_INFLIGHT_BYTES"),
         api_keys=api_keys,
         watch=LoopWatch(),
         feed=feed,
-        viewer_tokens=ViewerTokens(settings, open_to_all=not api_keys),
+        viewer_tokens=viewer_tokens,
         recorder=recorder,
     )
 

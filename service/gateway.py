@@ -5,6 +5,7 @@ from __future__ import annotations
 from dataclasses import dataclass
 
 from service.arriving.frames import Frames
+from service.arriving.parties import Parties
 from service.deciding.admission import Admission
 from service.engine import Engine
 from service.keeping.gateway_keys import GatewayKeys
@@ -37,6 +38,7 @@ class Gateway:
     sessions: Sessions
     teams: Teams
     possession: Possession
+    parties: Parties
     frames: Frames
     bodies: Room
     api_keys: ApiKeys

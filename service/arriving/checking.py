@@ -1,4 +1,4 @@
-"""Bodies of messages and whole frames, checked: plain functions, for a thread of their own where a body is large."""
+"""Bodies of messages and whole frames, checked: in steps, off the event loop where a body is large."""
 
 from __future__ import annotations
 
@@ -11,6 +11,7 @@ from robosac.defenses import Rejection
 from robosac.detectors import Role
 from robosac.recording.truth import read_truth
 from robosac.signatures import is_valid, read_public_key
+from robosac.steps import Steps
 from service.errors import Kind, Refused, Unusable
 from service.sessions.gathering import Received
 from service.sessions.live import Caller
@@ -42,8 +43,8 @@ class Parts:
     """Those of them who are enrolled."""
 
 
-def read_message(caller: Caller, body: bytes) -> tuple[int, Received]:
-    """A vehicle's own message and its frame's number.
+def read_message(caller: Caller, body: bytes) -> Steps[tuple[int, Received]]:
+    """A vehicle's own message and its frame's number; in one step.
 
     Raises
     ------
@@ -59,10 +60,12 @@ def read_message(caller: Caller, body: bytes) -> tuple[int, Received]:
         return frame, check(caller, caller.vehicle_id, frame, envelope.payload, "")
     except (wire.WireError, Unusable) as error:
         raise InFrame(error, frame) from error
+    yield
 
 
-def read_frame(caller: Caller, body: bytes) -> tuple[int, Parts]:
-    """A whole frame and its number; only what is wrong with the ego's part is wrong with all of it.
+def read_frame(caller: Caller, body: bytes) -> Steps[tuple[int, Parts]]:
+    """A whole frame and its number; only what is wrong with the ego's part is wrong with all of it. It pauses before
+    each teammate's part.
 
     Raises
     ------
@@ -78,6 +81,7 @@ def read_frame(caller: Caller, body: bytes) -> tuple[int, Parts]:
     for name in caller.record.teammates:
         if name not in envelope.teammates and name not in envelope.unreadable:
             continue
+        yield
         try:
             if name in envelope.unreadable:
                 raise envelope.unreadable[name]

@@ -13,9 +13,12 @@ from typing import TypeVar
 
 from robosac import wire
 from robosac.answers import Reason
+from robosac.steps import Steps, done_within, finished
 from service.arriving.bodies import SMALL_BYTES
 from service.arriving.checking import InFrame, read_frame, read_message, reason_of
 from service.arriving.giving_way import Line, Turn
+from service.arriving.pacing import Pacing
+from service.arriving.parties import Parties
 from service.deciding.admission import Admission
 from service.deciding.answering import Deciding
 from service.deciding.asked import Answered, Asked
@@ -36,8 +39,10 @@ SLACK_BYTES = 64 * 1024
 _CORES = len(os.sched_getaffinity(0)) if sys.platform == "linux" else os.cpu_count() or 1
 READ_AT_A_TIME = min(_CORES, 2)
 """Bodies, so that reading does not press fusion out of a single core."""
+READ_S = 0.005
+"""For how long about a body is read before others have their turns: one of many messages may take ten times as long."""
 READING_MOST_S = 5.0
-"""After which reading a body holds up no other: none takes so long."""
+"""After which a turn to read holds up no other: none takes so long."""
 READING_SHARE = 0.5
 """Of its budget, for which a body may wait until it is read: later there is hardly time to answer it."""
 _COMPRESSED = wire.ZSTD.encode()
@@ -54,6 +59,7 @@ class Frames:
     admission: Admission
     max_jump: int
     """By how much a frame's number may exceed the latest answered one."""
+    pacing: Pacing
     reading: Line = field(default_factory=lambda: Line(lambda: False, READ_AT_A_TIME, READING_MOST_S))
     """Bodies that take long to read, by turns of keys, of a key's sessions and of a session's vehicles: else whoever
     sends many at once is read before all others.
@@ -105,24 +111,37 @@ class Frames:
             caller.live.gathering.refuse(caller.vehicle_id, frame, reason, error.detail)
         await self.sessions.journal.refusal(caller, reason, error.detail, frame, error.field or "")
 
-    async def _read(self, caller: Caller, body: bytes, read: Callable[[Caller, bytes], T]) -> T:
+    async def _read(self, caller: Caller, body: bytes, read: Callable[[Caller, bytes], Steps[T]]) -> T:
         """What a body holds, read off the event loop where that takes long; a refusal goes on record."""
+        steps = read(caller, body)
         try:
             if len(body) <= SMALL_BYTES and _COMPRESSED not in body:
-                return read(caller, body)
-            turn = await self._turn(caller)
-            try:
-                return await asyncio.to_thread(read, caller, body)
-            finally:
-                turn.end()
+                return finished(steps)
+            return await self._read_by_turns(caller, steps)
         except InFrame as error:
             await self.refuse(caller, error.what, error.frame)
             raise error.what from error.what.__cause__
 
-    async def _turn(self, caller: Caller) -> Turn:
+    async def _read_by_turns(self, caller: Caller, steps: Steps[T]) -> T:
+        """Read some of a body, and more once others had their turns, and more of the time besides."""
+        party, left_s = Parties.of_token(caller.record, caller.vehicle_id), READING_SHARE * caller.live.budget_s
+        while True:
+            began, took_s = time.perf_counter(), list[float]()
+            turn = await self._turn(caller, party, left_s)
+            left_s -= time.perf_counter() - began
+            try:
+                read = await asyncio.to_thread(_timed, steps, took_s)
+            finally:
+                turn.end()
+                self.pacing.charge(party, sum(took_s) / _CORES)
+            if read is not None:
+                return read[0]
+
+    async def _turn(self, caller: Caller, party: tuple[str, str], within_s: float) -> Turn:
         """A turn to read a body, if it comes in time. For how long the body itself was on its way does not count."""
         try:
-            async with asyncio.timeout(READING_SHARE * caller.live.budget_s):
+            async with asyncio.timeout(within_s):
+                await self.pacing.turn(party)
                 return await self.reading.turn((caller.live.key, caller.record.session_id, caller.vehicle_id))
         except TimeoutError:
             detail = "bodies of other requests took the time that this one had"
@@ -204,6 +223,15 @@ class Frames:
             raise
         self.sessions.moving.message_waits(caller)
         return record
+
+
+def _timed(steps: Steps[T], took_s: list[float]) -> tuple[T] | None:
+    """Some of the steps; and the processor time that they took is appended, whatever comes of them."""
+    began = time.thread_time()
+    try:
+        return done_within(steps, READ_S)
+    finally:
+        took_s.append(time.thread_time() - began)
 
 
 def _expanded_by(asked: Asked, body: bytes) -> int:

@@ -44,12 +44,24 @@ _LOOK_S = 0.002
 
 
 class Paced(Protocol):
-    """A connection."""
+    """A connection, or whatever else has to wait."""
 
     party: Party
 
     def go_on(self, pacing: Pacing) -> None:
         """Take what is kept of it, and read from it again."""
+
+
+class _Pause:
+    """Of whatever is no connection."""
+
+    def __init__(self, party: Party) -> None:
+        self.party = party
+        self.is_over: asyncio.Future[None] = asyncio.get_running_loop().create_future()
+
+    def go_on(self, _: Pacing) -> None:
+        if not self.is_over.done():  # it may have been given up
+            self.is_over.set_result(None)
 
 
 class _Part:
@@ -125,6 +137,13 @@ class Pacing:
             and member in members
             and members[member].value(now) > part / len(members)
         )
+
+    async def turn(self, party: Party) -> None:
+        """Until a party may have more of the time."""
+        if self.is_over(party):
+            pause = _Pause(party)
+            self.wait(pause, 0)
+            await pause.is_over
 
     def wait(self, connection: Paced, kept: int) -> bool:
         """Let a connection of which so many bytes are kept go on (`Paced.go_on`) once its party may. False if too much

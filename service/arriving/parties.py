@@ -53,6 +53,11 @@ class Parties:
         return self._known(_credential(scope)) or (OTHERS, _address(scope))
 
     @staticmethod
+    def of_token(record: SessionRecord, vehicle_id: str) -> tuple[str, str]:
+        """As `of_loop`, of whoever shows a vehicle's token."""
+        return f"{_KEY}{record.key_id}", record.token_ids.get(vehicle_id, "")
+
+    @staticmethod
     def key_of(first: str | None) -> str | None:
         """The id of the API key of which this is the first part of a party."""
         return None if first is None else first.removeprefix(_KEY)
@@ -73,7 +78,7 @@ class Parties:
             return "viewers", credential
         named = claimed(credential)
         record = self._session_of(named)
-        return None if named is None or record is None else (f"{_KEY}{record.key_id}", named.token_id)
+        return None if named is None or record is None else self.of_token(record, named.vehicle_id)
 
     def _session_of(self, named: Claimed | None) -> SessionRecord | None:
         """The session in which a token counts, as it is remembered here."""

@@ -399,6 +399,24 @@ async def test_faults_and_cancelling_pass_through():
     assert len(seen) >= 5
 
 
+async def test_whatever_else_waits_goes_on_once_there_is_time_or_is_given_up():
+    pacing, wrong = Pacing(lambda scope: STRANGER, lambda besides: False), []
+    asyncio.get_running_loop().set_exception_handler(lambda loop, context: wrong.append(context))
+    await pacing.turn(GREEDY)
+    for party, seconds in ((GREEDY, 0.3), (MODEST, 0.01)):
+        pacing.charge(party, seconds)
+    given_up = asyncio.create_task(pacing.turn(GREEDY))
+    turn = asyncio.create_task(pacing.turn(GREEDY))
+    await asyncio.wait_for(pacing.turn(MODEST), 1.0)
+    assert not turn.done()
+    given_up.cancel()
+    await asyncio.wait_for(turn, 10.0)
+    assert not pacing.is_over(GREEDY)
+    assert given_up.cancelled()
+    assert not pacing._waiting
+    assert not wrong
+
+
 async def test_a_keys_own_frames_are_told_from_those_of_others(good_frame):
     async with serve(api_keys=f"{KEY},{OTHER_KEY}", api_key=KEY) as served:
         gateway = served.gateway

@@ -1,13 +1,17 @@
 """Bodies that take long to read are read elsewhere than on the event loop, by turns of keys."""
 
 import asyncio
+import os
 import threading
 import time
 
+import pytest
+
 from clients.client import GatewayClient
 from robosac import wire
-from service.arriving.checking import InFrame
+from service.arriving.checking import InFrame, read_frame
 from service.arriving.frames import READ_AT_A_TIME
+from service.arriving.pacing import OTHERS
 from tests.service.conftest import EGO, TEAM, problem, serve
 from tests.service.credentials import KEY, OTHER_KEY
 
@@ -24,6 +28,7 @@ async def test_bodies_are_read_by_turns_of_keys(monkeypatch, good_frame):
         read.append(caller.live.key)
         time.sleep(0.25)  # the other key's body is in line before the next turn, on a slow machine, too
         raise InFrame(wire.WireError("malformed-msgpack", "", "it is read slowly"), None)
+        yield
 
     monkeypatch.setattr("service.arriving.frames.read_frame", slowly)
     async with serve(api_keys=f"{KEY},{OTHER_KEY}") as served:
@@ -44,6 +49,7 @@ async def test_bodies_of_a_session_are_read_by_turns_of_its_vehicles(monkeypatch
         read.append(caller.vehicle_id)
         time.sleep(0.25)
         raise InFrame(wire.WireError("malformed-msgpack", "", "it is read slowly"), None)
+        yield
 
     for name in ("read_frame", "read_message"):
         monkeypatch.setattr(f"service.arriving.frames.{name}", slowly)
@@ -59,12 +65,101 @@ async def test_bodies_of_a_session_are_read_by_turns_of_its_vehicles(monkeypatch
     assert EGO in read[: 2 * READ_AT_A_TIME + 1]
 
 
+async def test_a_body_that_takes_long_lets_others_be_read_in_between(monkeypatch, good_frame):
+    done, begun = [], []
+
+    def in_parts(caller, body):
+        begun.append(caller.live.key)
+        for _ in range(60 if caller.live.key == begun[0] else 0):
+            time.sleep(0.02)
+            yield
+        done.append(caller.live.key)
+        return (yield from read_frame(caller, body))
+
+    monkeypatch.setattr("service.arriving.frames.read_frame", in_parts)
+    async with serve(api_keys=f"{KEY},{OTHER_KEY}") as served:
+        greedy, other = [await opened_with(served, KEY) for _ in range(4)], await opened_with(served, OTHER_KEY)
+        posts = [asyncio.create_task(served.post(one, "frames", good_frame(0))) for one in greedy]
+        while len(begun) < READ_AT_A_TIME:
+            await asyncio.sleep(0.001)
+        assert (await served.post(other, "frames", good_frame(0))).status_code == 200
+        first = list(done)
+        assert {answer.status_code for answer in await asyncio.gather(*posts)} == {200}
+    assert len(first) == 1
+    assert first[0] != done[-1]
+
+
+@pytest.mark.parametrize("fails", [False, True])
+async def test_the_time_that_reading_takes_is_put_down_to_the_sender(fails, monkeypatch, good_frame):
+    worked_s, charged = 0.03, []
+
+    def works(caller, body):
+        for _ in range(2):
+            until = time.thread_time() + worked_s / 2
+            while time.thread_time() < until:
+                pass
+            yield
+        if fails:
+            raise InFrame(wire.WireError("malformed-msgpack", "", "it is read in vain"), None)
+        return (yield from read_frame(caller, body))
+
+    async with serve() as served:
+        session = await served.open()
+        monkeypatch.setattr("service.arriving.frames.read_frame", works)
+        pacing = served.gateway.frames.pacing
+        monkeypatch.setattr(pacing, "charge", lambda party, seconds: charged.append((party, seconds)))
+        answer = await served.post(session, "frames", good_frame(0))
+        assert answer.status_code == (400 if fails else 200)
+        headers = [(b"authorization", f"Bearer {session.ego_token}".encode())]
+        party = pacing.party_of({"client": ("10.0.0.1", 1), "headers": headers})
+    assert {who for who, _ in charged} == {party}
+    assert party[0] != OTHERS
+    assert sum(seconds for _, seconds in charged) * (os.cpu_count() or 1) >= worked_s
+
+
+async def test_whoever_had_too_much_of_the_time_waits_to_be_read(monkeypatch, good_frame):
+    async with serve() as served:
+        session = await served.open(latency_budget_ms=5000.0)
+        pacing, over, asked = served.gateway.frames.pacing, [True] * 3, []
+
+        def is_over(party):
+            asked.append(party)
+            return bool(over) and over.pop()
+
+        monkeypatch.setattr(pacing, "is_over", is_over)
+        assert (await served.post(session, "frames", good_frame(0))).status_code == 200
+        assert len(asked) > 3
+        monkeypatch.setattr(pacing, "is_over", lambda party: True)
+        hurried = await served.open(latency_budget_ms=100.0, gather_ms=10.0)
+        problem(await served.post(hurried, "frames", good_frame(0)), 503, "overloaded")
+        monkeypatch.setattr(pacing, "is_over", lambda party: False)
+        assert (await served.post(hurried, "frames", good_frame(0))).status_code == 200
+
+
+async def test_all_that_a_body_waits_for_its_turns_counts(monkeypatch, good_frame):
+    def in_parts(caller, body):
+        for _ in range(20):
+            time.sleep(0.006)
+            yield
+        return (yield from read_frame(caller, body))
+
+    async def waits(party):
+        await asyncio.sleep(0.03)
+
+    async with serve() as served:
+        session = await served.open(latency_budget_ms=400.0, gather_ms=10.0)
+        monkeypatch.setattr("service.arriving.frames.read_frame", in_parts)
+        monkeypatch.setattr(served.gateway.frames.pacing, "turn", waits)
+        problem(await served.post(session, "frames", good_frame(0)), 503, "overloaded")
+
+
 async def test_a_small_body_that_may_be_compressed_is_not_read_on_the_event_loop(served, monkeypatch, messages):
     read = []
 
     def where(*_):
         read.append(threading.current_thread() is threading.main_thread())
         raise InFrame(wire.WireError("malformed-msgpack", "", "it is not read"), None)
+        yield
 
     monkeypatch.setattr("service.arriving.frames.read_message", where)
     session = await served.open()
@@ -81,6 +176,7 @@ async def test_a_body_that_waits_for_half_of_its_budget_is_refused_unread(monkey
     def never(*_):
         going_on.wait(10)
         raise InFrame(wire.WireError("malformed-msgpack", "", "it is read for ever"), None)
+        yield
 
     async with serve() as served:
         slow = [await served.open() for _ in range(READ_AT_A_TIME)]
