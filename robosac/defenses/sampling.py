@@ -119,7 +119,7 @@ def search(
         The subset in consensus; empty if there is none.
     """
     draws = _Draws(team, plan, rng, distinct)
-    while draws.left:
+    while draws.left > 0:
         subset = draws.draw()
         tested = yield Batch([subset], draws.coming)
         outcomes.extend(tested)
@@ -153,7 +153,7 @@ class _Draws:
     def coming(self) -> Iterator[Hypothesis]:
         """What will be drawn from now on."""
         for i in range(self.left):
-            if i == len(self._ahead):
+            while i >= len(self._ahead):
                 self._look()
             yield self._ahead[i][0]
 

@@ -31,7 +31,7 @@ MADE_S, BYTE_S = 3e-4, 1e-9
 """Of the event loop's time what is not measured: to make and end a connection, to take a byte from its socket."""
 
 
-_CREDENTIAL = re.compile(rb"\r\nAuthorization:[ \t]*(Bearer [^\r\n]{1,4096})\r\n", re.IGNORECASE)
+_CREDENTIAL = re.compile(rb"\r\nAuthorization:[ \t]*((?:Bearer|DPoP) [^\r\n]{1,4096})\r\n", re.IGNORECASE)
 
 
 class _TooMuch(Exception):
@@ -92,10 +92,13 @@ class BoundedHTTP(HttpToolsProtocol):
         else:
             self.transport.abort()
 
+    @property
+    def is_gone(self) -> bool:
+        """As `service.arriving.pacing.Paced` has it."""
+        return self.transport.is_closing()
+
     def go_on(self, pacing: Pacing) -> None:
         """As `service.arriving.pacing.Paced` has it."""
-        if self.transport.is_closing():
-            return
         data, self._kept = self._kept, b""
         self._waited_s += time.perf_counter() - self._kept_since
         self._take_metered(data, pacing)

@@ -9,6 +9,7 @@ import sys
 import time
 from collections.abc import AsyncIterator, Callable
 from dataclasses import dataclass, field
+from functools import partial
 from typing import TypeVar
 
 from robosac import wire
@@ -129,13 +130,16 @@ class Frames:
             began, took_s = time.perf_counter(), list[float]()
             turn = await self._turn(caller, party, left_s)
             left_s -= time.perf_counter() - began
-            try:
-                read = await asyncio.to_thread(_timed, steps, took_s)
-            finally:
-                turn.end()
-                self.pacing.charge(party, sum(took_s) / _CORES)
-            if read is not None:
+            some = asyncio.create_task(asyncio.to_thread(_timed, steps, took_s))
+            some.add_done_callback(partial(self._read_some, turn, party, took_s))
+            if (read := await asyncio.shield(some)) is not None:  # a thread works on though nobody waits for it
                 return read[0]
+
+    def _read_some(self, turn: Turn, party: tuple[str, str], took_s: list[float], some: asyncio.Task[object]) -> None:
+        turn.end()
+        self.pacing.charge(party, sum(took_s) / _CORES)
+        if not some.cancelled():
+            some.exception()  # it is told to whoever still waits
 
     async def _turn(self, caller: Caller, party: tuple[str, str], within_s: float) -> Turn:
         """A turn to read a body, if it comes in time. For how long the body itself was on its way does not count."""

@@ -40,13 +40,19 @@ MOST_KEPT_BYTES = 2**25
 """Of what came and waits, of all connections together."""
 _FORGOTTEN_S = 1.0
 _LOOK_S = 0.002
-"""How often it is looked whether somebody may be read from again."""
+"""How often it is looked whether somebody may be read from again, and for how long."""
+LOOKED_AT = 64
+"""Members of a party that are looked at each time, by turns."""
 
 
 class Paced(Protocol):
     """A connection, or whatever else has to wait."""
 
     party: Party
+
+    @property
+    def is_gone(self) -> bool:
+        """Whether it waits for nothing any more."""
 
     def go_on(self, pacing: Pacing) -> None:
         """Take what is kept of it, and read from it again."""
@@ -59,9 +65,12 @@ class _Pause:
         self.party = party
         self.is_over: asyncio.Future[None] = asyncio.get_running_loop().create_future()
 
+    @property
+    def is_gone(self) -> bool:
+        return self.is_over.done()
+
     def go_on(self, _: Pacing) -> None:
-        if not self.is_over.done():  # it may have been given up
-            self.is_over.set_result(None)
+        self.is_over.set_result(None)
 
 
 class _Part:
@@ -82,7 +91,7 @@ class Pacing:
 
     That is whoever had more than `SLACK` equal parts of what there is (`LIMIT`, `LIMIT_BUSY`) while all together had as
     much as that: equal parts for API keys, and of a key's for its tokens; others have `OF_OTHERS`, and of that each
-    address an equal part. Who had least goes on first.
+    address an equal part. Whoever had least of its part goes on first, its members by turns.
 
     Parameters
     ----------
@@ -107,7 +116,7 @@ class Pacing:
         self._all = _Part()
         self._first: OrderedDict[str, _Part] = OrderedDict()
         self._members: dict[str, OrderedDict[str, _Part]] = {}
-        self._waiting: dict[Party, deque[tuple[Paced, int]]] = {}
+        self._waiting: dict[str, OrderedDict[str, deque[tuple[Paced, int]]]] = {}
         self._kept = 0
         self._look: asyncio.TimerHandle | None = None
 
@@ -152,7 +161,8 @@ class Pacing:
         if self._kept + kept > MOST_KEPT_BYTES:
             return False
         self._kept += kept
-        self._waiting.setdefault(connection.party, deque()).append((connection, kept))
+        first, member = connection.party
+        self._waiting.setdefault(first, OrderedDict()).setdefault(member, deque()).append((connection, kept))
         self._look_later()
         return True
 
@@ -162,27 +172,46 @@ class Pacing:
 
     def _look_again(self) -> None:
         self._look = None
-        now = self._clock()
-        party = min(self._waiting, key=lambda one: self._had(one, now))
-        connection = None if self.is_over(party) else self._next_of(party)
-        if self._waiting:
-            self._look_later()
-        if connection is not None:
-            connection.go_on(self)
+        until = self._clock() + _LOOK_S
+        try:
+            for first in sorted(self._waiting, key=self._claim):
+                self._let_go_on(first, until)
+        finally:
+            if self._waiting:
+                self._look_later()
 
-    def _next_of(self, party: Party) -> Paced:
-        waiting = self._waiting[party]
-        connection, kept = waiting.popleft()
+    def _let_go_on(self, first: str, until: float) -> None:
+        """Let members of a party go on that are over no part, one thing of each, as long as there is time."""
+        members = self._waiting[first]
+        for _ in range(min(len(members), LOOKED_AT)):
+            member = next(iter(members))
+            if self.is_over((first, member)):
+                members.move_to_end(member)
+            elif (one := self._next_of(first, member)) is not None:
+                one.go_on(self)
+            if not members or self._clock() > until:
+                break
+
+    def _next_of(self, first: str, member: str) -> Paced | None:
+        members = self._waiting[first]
+        waiting, found = members[member], None
+        while waiting and found is None:
+            connection, kept = waiting.popleft()
+            self._kept -= kept
+            found = None if connection.is_gone else connection
+        members.move_to_end(member)
         if not waiting:
-            del self._waiting[party]
-        self._kept -= kept
-        return connection
+            del members[member]
+        if not members:
+            del self._waiting[first]
+        return found
 
-    def _had(self, party: Party, now: float) -> tuple[float, float]:
-        first, member = party
-        if first not in self._first or member not in self._members[first]:
-            return 0.0, 0.0
-        return self._first[first].value(now), self._members[first][member].value(now)
+    def _claim(self, first: str) -> float:
+        """What a party had of its part; who had least of it goes first."""
+        if first not in self._first:
+            return 0.0
+        keys = max(len(self._first) - (OTHERS in self._first), 1)
+        return self._first[first].value(self._clock()) / (OF_OTHERS if first == OTHERS else 1 / keys)
 
 
 def _forget(parts: OrderedDict[str, _Part], now: float) -> list[str]:

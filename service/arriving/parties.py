@@ -54,8 +54,8 @@ class Parties:
 
     @staticmethod
     def of_token(record: SessionRecord, vehicle_id: str) -> tuple[str, str]:
-        """As `of_loop`, of whoever shows a vehicle's token."""
-        return f"{_KEY}{record.key_id}", record.token_ids.get(vehicle_id, "")
+        """As `of_loop`, of whoever shows a vehicle's token, the present one or one before it."""
+        return f"{_KEY}{record.key_id}", f"{record.session_id} {vehicle_id}"
 
     @staticmethod
     def key_of(first: str | None) -> str | None:

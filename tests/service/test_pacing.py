@@ -11,7 +11,7 @@ import uvicorn
 import uvloop
 
 from service.arriving.arrival import Arrival, arrival_of
-from service.arriving.connections import PIPELINED, BoundedHTTP
+from service.arriving.connections import _CREDENTIAL, PIPELINED, BoundedHTTP
 from service.arriving.pacing import (
     LATELY_S,
     LIMIT,
@@ -24,6 +24,7 @@ from service.arriving.pacing import (
     Pacing,
 )
 from service.arriving.parties import Parties
+from service.callers import _SCHEMES
 from service.watching.stalls import LoopWatch
 from tests.service.conftest import serve
 from tests.service.credentials import KEY, OTHER_KEY
@@ -121,6 +122,8 @@ def test_parties_are_forgotten_that_were_away():
 
 
 class Connection:
+    is_gone = False
+
     def __init__(self, party, gone_on):
         self.party, self._gone_on = party, gone_on
 
@@ -139,6 +142,105 @@ async def test_who_had_least_goes_on_first_and_all_do():
         while len(gone_on) < 4:
             await asyncio.sleep(0.001)
     assert gone_on == [MODEST, STRANGER, GREEDY, GREEDY]
+
+
+async def test_whoever_is_over_its_part_holds_up_nobody_who_is_not():
+    """A stranger's part is small, so that it may be over with less than somebody else has who is not."""
+    gone_on, pacing = [], Pacing(lambda scope: STRANGER, lambda besides: True)
+    pacing.charge(MODEST, 0.02)
+    pacing.charge(STRANGER, 0.015)
+    assert pacing.is_over(STRANGER)
+    assert not pacing.is_over(MODEST)
+    for party in (STRANGER, MODEST):
+        assert pacing.wait(Connection(party, gone_on), 1)
+    while len(gone_on) < 2:
+        await asyncio.sleep(0.001)
+    assert gone_on == [MODEST, STRANGER]
+
+
+async def test_who_had_least_of_its_part_goes_before_who_had_least():
+    gone_on, pacing = [], Pacing(lambda scope: STRANGER, lambda besides: False)
+    pacing.charge(STRANGER, 0.001)
+    pacing.charge(MODEST, 0.002)
+    for party in (STRANGER, MODEST):
+        assert pacing.wait(Connection(party, gone_on), 1)
+    while len(gone_on) < 2:
+        await asyncio.sleep(0.001)
+    assert gone_on == [MODEST, STRANGER]
+
+
+async def test_a_member_that_is_over_its_part_holds_up_no_other():
+    gone_on, pacing = [], Pacing(lambda scope: STRANGER, lambda besides: True)
+    other = (OTHERS, "address 10.0.0.2")
+    pacing.charge(other, 0.0001)
+    pacing.charge(STRANGER, 0.03)
+    for party in (STRANGER, other):
+        assert pacing.wait(Connection(party, gone_on), 1)
+    while len(gone_on) < 2:
+        await asyncio.sleep(0.001)
+    assert gone_on == [other, STRANGER]
+
+
+@pytest.mark.parametrize("addresses", [1, 3000])
+async def test_a_crowd_of_strangers_does_not_go_before_a_key(addresses):
+    gone_on, pacing = [], Pacing(lambda scope: STRANGER, lambda besides: True)
+    pacing.charge(MODEST, 0.03)
+    assert pacing.is_over(MODEST)
+    for number in range(6000):
+        assert pacing.wait(Connection((OTHERS, f"address {number % addresses}"), gone_on), 1)
+    turn = asyncio.create_task(pacing.turn(MODEST))
+    while pacing.is_over(MODEST):
+        await asyncio.sleep(0.001)
+    before = len(gone_on)
+    await asyncio.wait_for(turn, 10.0)
+    assert len(gone_on) - before <= 64 * 3
+
+
+async def test_things_of_all_members_go_on_while_there_is_time():
+    gone_on, pacing = [], Pacing(lambda scope: STRANGER, lambda besides: False)
+    for number in range(10_000):
+        assert pacing.wait(Connection((OTHERS, f"address {number}"), gone_on), 1)
+    while len(gone_on) < 10_000:
+        times, before = 0, len(gone_on)
+        while len(gone_on) == before:
+            times += 1
+            assert times < 1000
+            await asyncio.sleep(0.001)
+    assert len(set(gone_on)) == 10_000
+
+
+async def test_what_is_gone_takes_nobodys_place():
+    gone_on, pacing = [], Pacing(lambda scope: STRANGER, lambda besides: False)
+    for number in range(1001):
+        connection = Connection(GREEDY, gone_on)
+        connection.is_gone = number < 1000
+        assert pacing.wait(connection, 1)
+    pacing._look.cancel()
+    pacing._look_again()
+    assert gone_on == [GREEDY]
+    assert (pacing._waiting, pacing._kept) == ({}, 0)
+
+
+@pytest.mark.parametrize("scheme", [*_SCHEMES, "Bearer", "DPoP"])
+def test_a_credential_is_seen_in_the_first_bytes_in_any_scheme_that_counts(scheme):
+    head = f"POST /work HTTP/1.1\r\nHost: x\r\nAuthorization: {scheme} car\r\nContent-Length: 0\r\n\r\n"
+    assert _CREDENTIAL.search(head.encode())[1] == f"{scheme} car".encode()
+
+
+async def test_a_vehicle_is_the_same_party_with_a_new_token(served):
+    session = await served.open()
+    parties, vehicle = served.gateway.parties, served.ego(session)
+
+    def party():
+        headers = [(b"authorization", f"Bearer {vehicle.token}".encode())]
+        return parties.of_loop({"client": ("10.0.0.1", 1), "headers": headers})
+
+    before = party()
+    old = vehicle.token
+    await vehicle.renew()
+    assert vehicle.token != old
+    assert party() == before
+    assert before[0] != OTHERS
 
 
 async def test_what_waits_is_bounded():

@@ -136,6 +136,43 @@ async def test_whoever_had_too_much_of_the_time_waits_to_be_read(monkeypatch, go
         assert (await served.post(hurried, "frames", good_frame(0))).status_code == 200
 
 
+async def test_a_body_that_nobody_waits_for_any_more_keeps_its_turn_while_it_is_read(monkeypatch, good_frame):
+    reading, counts, charged = set(), [], []
+
+    def works(caller, body):
+        me = object()
+        reading.add(me)
+        counts.append(len(reading))
+        until = time.thread_time() + 0.1
+        while time.thread_time() < until:
+            pass
+        reading.remove(me)
+        raise InFrame(wire.WireError("malformed-msgpack", "", "it is read in vain"), None)
+        yield
+
+    async with serve() as served:
+        session = await served.open(latency_budget_ms=5000.0)
+        monkeypatch.setattr("service.arriving.frames.read_frame", works)
+        pacing = served.gateway.frames.pacing
+        monkeypatch.setattr(pacing, "charge", lambda party, seconds: charged.append(seconds))
+        posts = []
+        for number in range(READ_AT_A_TIME):
+            posts.append(asyncio.create_task(served.post(session, "frames", good_frame(0))))
+            async with asyncio.timeout(10.0):
+                while len(counts) <= number:
+                    await asyncio.sleep(0.001)
+        for post in posts:
+            post.cancel()
+        problem(await served.post(session, "frames", good_frame(0)), 400, "malformed-msgpack")
+        ends = await asyncio.gather(*posts, return_exceptions=True)
+        assert all(isinstance(end, asyncio.CancelledError) for end in ends)
+        async with asyncio.timeout(10.0):
+            while len(charged) < len(posts) + 1:
+                await asyncio.sleep(0.001)
+    assert max(counts) <= READ_AT_A_TIME
+    assert min(charged) * (os.cpu_count() or 1) >= 0.1
+
+
 async def test_all_that_a_body_waits_for_its_turns_counts(monkeypatch, good_frame):
     def in_parts(caller, body):
         for _ in range(20):

@@ -4,6 +4,7 @@ import pytest
 from robosac.answers import Reason, Source, Verdict
 from robosac.budget import DomainError
 from robosac.defenses import SampleConsensus
+from robosac.defenses.sampling import search
 from robosac.evaluation.oracle import converse_with_oracle
 from tests.robosac.defenses import conversation
 
@@ -58,6 +59,11 @@ def test_rejections_carry_their_evidence(rng):
 def test_no_subset_is_tested_twice(rng):
     _, tested = converse(SampleConsensus(sampling_budget=50, collaborators=3), [Verdict.DISSENSUS] * 100, rng)
     assert len(tested) == len({o.teammates for o in tested}) == 10
+
+
+@pytest.mark.parametrize("tests", [0, -1])
+def test_a_search_without_a_budget_is_over_at_once(tests, rng):
+    assert list(search(["a", "b", "c"], (1, tests), rng, [])) == []
 
 
 def test_independent_draws_repeat_themselves(rng):
