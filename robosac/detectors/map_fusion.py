@@ -29,7 +29,7 @@ WORTH = 8
 """Subsets that an accelerator decodes at once, unless told otherwise: the ego alone, and seven hypotheses."""
 AT_ONCE = 8
 """Maps warped together: what more of them take in between no longer fits into caches."""
-AT_A_TIME = 8
+PARTS = 8
 """Parts of a map's channels that an accelerator warps at a time: cells alone would not keep it busy."""
 Tensor = np.ndarray[Any, np.dtype[Any]]
 Maps = Sequence[torch.Tensor]
@@ -132,7 +132,7 @@ class MapFusionDetector(ABC):
 
     def _laid_there(self, sent: torch.Tensor, matrices: torch.Tensor) -> Tensors:
         channels, *size = sent.shape[1:]
-        parts = math.gcd(channels, AT_A_TIME)
+        parts = math.gcd(channels, PARTS)
         moves = matrices[:, None].expand(-1, parts, -1, -1).flatten(0, 1)
         laid = warp(sent.float().view(-1, channels // parts, *size), moves).view(sent.shape)
         return ((laid / self.gain).contiguous(memory_format=torch.channels_last),)

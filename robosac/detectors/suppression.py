@@ -76,7 +76,7 @@ def _kernels(device: torch.device) -> tuple[Kernel, Kernel] | None:
     try:
         with torch.cuda.device(device):
             return torch.cuda._compile_kernel(source, "compare"), torch.cuda._compile_kernel(source, "suppress")
-    except (AttributeError, OSError, RuntimeError) as error:  # torch has it since 2.9, and it needs NVRTC
+    except (AttributeError, OSError, RuntimeError) as error:  # not every torch has it, and it needs NVRTC
         logger.warning("boxes are suppressed on %s without a kernel, which takes longer: %s", device, error)
         return None
 

@@ -90,7 +90,7 @@ class Pacing:
     """Knows what everybody had of the event loop's time lately, and whom it is to be kept from.
 
     That is whoever had more than `SLACK` equal parts of what there is (`LIMIT`, `LIMIT_BUSY`) while all together had as
-    much as that: equal parts for API keys, and of a key's for its tokens; others have `OF_OTHERS`, and of that each
+    much as that: equal parts for API keys, and of a key's for its vehicles; others have `OF_OTHERS`, and of that each
     address an equal part. Whoever had least of its part goes on first, its members by turns.
 
     Parameters

@@ -2,6 +2,7 @@
 
 import asyncio
 import contextlib
+import itertools
 import logging
 import socket
 import time
@@ -16,6 +17,7 @@ from service.arriving.pacing import (
     LATELY_S,
     LIMIT,
     LIMIT_BUSY,
+    LOOKED_AT,
     MOST_KEPT_BYTES,
     OF_OTHERS,
     OTHERS,
@@ -144,41 +146,40 @@ async def test_who_had_least_goes_on_first_and_all_do():
     assert gone_on == [MODEST, STRANGER, GREEDY, GREEDY]
 
 
+async def in_order(pacing, *parties):
+    """In which order those go on of whom something waits, once all have."""
+    gone_on = []
+    for party in parties:
+        assert pacing.wait(Connection(party, gone_on), 1)
+    async with asyncio.timeout(10.0):
+        while len(gone_on) < len(parties):
+            await asyncio.sleep(0.001)
+    return gone_on
+
+
 async def test_whoever_is_over_its_part_holds_up_nobody_who_is_not():
     """A stranger's part is small, so that it may be over with less than somebody else has who is not."""
-    gone_on, pacing = [], Pacing(lambda scope: STRANGER, lambda besides: True)
+    pacing = Pacing(lambda scope: STRANGER, lambda besides: True)
     pacing.charge(MODEST, 0.02)
     pacing.charge(STRANGER, 0.015)
     assert pacing.is_over(STRANGER)
     assert not pacing.is_over(MODEST)
-    for party in (STRANGER, MODEST):
-        assert pacing.wait(Connection(party, gone_on), 1)
-    while len(gone_on) < 2:
-        await asyncio.sleep(0.001)
-    assert gone_on == [MODEST, STRANGER]
+    assert await in_order(pacing, STRANGER, MODEST) == [MODEST, STRANGER]
 
 
 async def test_who_had_least_of_its_part_goes_before_who_had_least():
-    gone_on, pacing = [], Pacing(lambda scope: STRANGER, lambda besides: False)
+    pacing = Pacing(lambda scope: STRANGER, lambda besides: False)
     pacing.charge(STRANGER, 0.001)
     pacing.charge(MODEST, 0.002)
-    for party in (STRANGER, MODEST):
-        assert pacing.wait(Connection(party, gone_on), 1)
-    while len(gone_on) < 2:
-        await asyncio.sleep(0.001)
-    assert gone_on == [MODEST, STRANGER]
+    assert await in_order(pacing, STRANGER, MODEST) == [MODEST, STRANGER]
 
 
 async def test_a_member_that_is_over_its_part_holds_up_no_other():
-    gone_on, pacing = [], Pacing(lambda scope: STRANGER, lambda besides: True)
+    pacing = Pacing(lambda scope: STRANGER, lambda besides: True)
     other = (OTHERS, "address 10.0.0.2")
     pacing.charge(other, 0.0001)
     pacing.charge(STRANGER, 0.03)
-    for party in (STRANGER, other):
-        assert pacing.wait(Connection(party, gone_on), 1)
-    while len(gone_on) < 2:
-        await asyncio.sleep(0.001)
-    assert gone_on == [other, STRANGER]
+    assert await in_order(pacing, STRANGER, other) == [other, STRANGER]
 
 
 @pytest.mark.parametrize("addresses", [1, 3000])
@@ -196,17 +197,17 @@ async def test_a_crowd_of_strangers_does_not_go_before_a_key(addresses):
     assert len(gone_on) - before <= 64 * 3
 
 
-async def test_things_of_all_members_go_on_while_there_is_time():
-    gone_on, pacing = [], Pacing(lambda scope: STRANGER, lambda besides: False)
-    for number in range(10_000):
+@pytest.mark.parametrize(("reading_takes_s", "expected"), [(0.0, LOOKED_AT), (1.0, 1)])
+async def test_things_of_several_members_go_on_at_once_while_there_is_time(reading_takes_s, expected):
+    """Each reading of the clock takes so long."""
+    readings, gone_on = itertools.count(), []
+    pacing = Pacing(lambda scope: STRANGER, lambda besides: False, lambda: next(readings) * reading_takes_s)
+    for number in range(1000):
         assert pacing.wait(Connection((OTHERS, f"address {number}"), gone_on), 1)
-    while len(gone_on) < 10_000:
-        times, before = 0, len(gone_on)
-        while len(gone_on) == before:
-            times += 1
-            assert times < 1000
-            await asyncio.sleep(0.001)
-    assert len(set(gone_on)) == 10_000
+    pacing._look.cancel()
+    pacing._look_again()
+    assert len(set(gone_on)) == len(gone_on) == expected
+    pacing._look.cancel()
 
 
 async def test_what_is_gone_takes_nobodys_place():
