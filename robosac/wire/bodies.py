@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import hashlib
-from collections.abc import Mapping
+from collections.abc import Collection, Mapping
 from dataclasses import dataclass, field
 from typing import Any
 
@@ -178,15 +178,18 @@ def read_message(body: bytes) -> MessageEnvelope:
     return MessageEnvelope(_frame(fields), fields.take("vehicle_id", str), fields.value)
 
 
-def read_frame(body: bytes) -> FrameEnvelope:
+def read_frame(body: bytes, team: Collection[str] | None = None) -> FrameEnvelope:
     """The parts of a whole frame; each is left to `check_message`. A teammate's part that breaks msgpack or the limits
     spoils no other.
+
+    If a ``team`` is given, the parts of others count as unreadable where parts are unpacked one by one: a small body
+    may have hundreds that are broken.
     """
     try:
         value: Any = unpack(body)
         unreadable: dict[str, WireError] = {}
     except WireError as error:
-        value, unreadable = _unpack_apart(body, error)
+        value, unreadable = _unpack_apart(body, error, team)
     fields = Fields(value)
     teammates = named(fields.take("teammates", dict), "teammates")
     states = fields.value.get("states")
@@ -194,7 +197,9 @@ def read_frame(body: bytes) -> FrameEnvelope:
     return FrameEnvelope(_frame(fields), fields.take("ego"), teammates, kept, unreadable)
 
 
-def _unpack_apart(body: bytes, fault: WireError) -> tuple[dict[Any, Any], dict[str, WireError]]:
+def _unpack_apart(
+    body: bytes, fault: WireError, team: Collection[str] | None
+) -> tuple[dict[Any, Any], dict[str, WireError]]:
     """A frame with those teammates' parts that can be unpacked by themselves, and what is wrong with the others.
 
     Raises
@@ -213,12 +218,16 @@ def _unpack_apart(body: bytes, fault: WireError) -> tuple[dict[Any, Any], dict[s
     unreadable: dict[str, WireError] = {}
     share = _share(parts)
     for name, part in parts.items():
-        try:
-            read[name] = unpack(part, most_entries=share)
-        except WireError as error:
-            if not isinstance(name, str):
-                raise fault from error
-            unreadable[name] = WireError(error.code, f"teammates.{name}", error.detail)
+        wrong = fault
+        if team is None or name in team:
+            try:
+                read[name] = unpack(part, most_entries=share)
+                continue
+            except WireError as error:
+                wrong = error
+        if not isinstance(name, str):
+            raise fault
+        unreadable[name] = WireError(wrong.code, f"teammates.{name}", wrong.detail)
     return {**frame, "teammates": read}, unreadable
 
 

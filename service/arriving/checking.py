@@ -73,7 +73,7 @@ def read_frame(caller: Caller, body: bytes) -> Steps[tuple[int, Parts]]:
     """
     frame = None
     try:
-        envelope = wire.read_frame(body)
+        envelope = wire.read_frame(body, caller.record.teammates)
         frame = envelope.frame
         parts = Parts(check(caller, caller.vehicle_id, frame, envelope.ego, "ego"))
     except (wire.WireError, Unusable) as error:

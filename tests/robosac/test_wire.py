@@ -234,6 +234,19 @@ def test_a_frame_that_is_unpacked_in_parts_is_bounded_as_a_whole(body):
     assert most < 4 * len(body) + 2**22
 
 
+def test_broken_parts_of_others_than_the_team_are_not_unpacked_one_by_one(monkeypatch):
+    good = msgpack.packb({"frame": 0, "ego": {}})[1:]
+    parts = b"".join(msgpack.packb(f"car-{number}") + b"\xa1\xff" for number in range(400))
+    body = b"\x83" + good + msgpack.packb("teammates") + b"\xde" + (401).to_bytes(2, "big") + b"\xa3rsu\x80" + parts
+    unpacked, unpack = [], wire.bodies.unpack
+    monkeypatch.setattr("robosac.wire.bodies.unpack", lambda body, **how: unpacked.append(body) or unpack(body, **how))
+    frame = wire.read_frame(body, ("rsu", "car-3"))
+    assert frame.teammates == {"rsu": {}}
+    assert len(frame.unreadable) == 400
+    assert frame.unreadable["car-3"].field == "teammates.car-3"
+    assert len(unpacked) == 1 + 2 + 2  # the whole, the frame's other members, the parts of the team
+
+
 plain = st.recursive(
     st.none()
     | st.booleans()
