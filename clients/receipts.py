@@ -38,14 +38,28 @@ class ReceiptBook:
         """The receipt that promises most of a session's log."""
         return self._latest.get(session_id)
 
-    async def take(self, receipt: LogReceipt | None, session_id: str) -> None:
+    def promised(self, session_id: str) -> int:
+        """The number of the latest record of a session's log that was promised; 0 if none was."""
+        latest = self._latest.get(session_id)
+        return 0 if latest is None else latest.seq
+
+    async def take(self, receipt: LogReceipt | None, session_id: str, after: int = 0) -> None:
         """Check a receipt, and keep it.
+
+        Parameters
+        ----------
+        receipt : LogReceipt or None
+            That of an answer, if it has one.
+        session_id : str
+        after : int
+            The record has a higher number than this: what was `promised` before a request that adds a record. A gateway
+            that gives an old receipt again and again promises nothing.
 
         Raises
         ------
         ProtocolError
-            If it was not signed by the gateway, is of another session, contradicts an earlier one, or is missing
-            though keys are pinned.
+            If it was not signed by the gateway, is of another session or of no later record, contradicts an earlier
+            one, or is missing though keys are pinned.
         """
         if receipt is None:
             if self._pinned:
@@ -63,6 +77,8 @@ class ReceiptBook:
         before = self._latest.get(session_id)
         if receipt.session != session_id:
             raise ProtocolError(f"the receipt is of session {receipt.session:.64}")
+        if receipt.seq <= after:
+            raise ProtocolError(f"the receipt is of record {receipt.seq}, and record {after} was promised before")
         if before is not None and before.seq == receipt.seq and before.head != receipt.head:
             raise ProtocolError(f"the gateway signed two heads of record {receipt.seq}: {before.head}, {receipt.head}")
         if before is None or receipt.seq > before.seq:

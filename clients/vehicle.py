@@ -25,10 +25,11 @@ from robosac.signatures import sign
 
 MSGPACK = "application/vnd.msgpack"
 SESSION_HEADER = "X-Session-Id"
-RECEIPT_HEADER = "Audit-Receipt"
+RECEIPT_HEADER, HEAD_HEADER = "Audit-Receipt", "Audit-Head"
 AUDIT_PAGE = 1000
 """Audit records that are asked for at a time."""
 T = TypeVar("T")
+_STATE_RECEIPT = TypeAdapter[LogReceipt | None](LogReceipt | None)
 
 
 class _Accepted(Typed):
@@ -104,10 +105,11 @@ class VehicleClient:
 
     async def renew(self) -> RenewedToken:
         """Take a fresh token and speak with it from now on; the one before is worth nothing any more."""
+        before = self._promised
         response = await self._request("POST", f"{self._path}/token", **self._proven)
         renewed = told(response, RenewedToken)
         self.token = renewed.token
-        await self._keep(renewed.receipt)
+        await self._keep(renewed.receipt, before)
         return renewed
 
     def signature(self, frame: int, message: Message) -> bytes | None:
@@ -188,7 +190,15 @@ class VehicleClient:
 
     async def state(self) -> Mapping[str, Any]:
         """As the ego: the session's state."""
-        return told(await self._request("GET", self._path, headers=self.bearer), dict[str, Any])
+        state = told(await self._request("GET", self._path, headers=self.bearer), dict[str, Any])
+        try:
+            receipt = _STATE_RECEIPT.validate_python(state.get("receipt"))
+        except ValidationError as error:
+            raise ProtocolError(f"the state's receipt is none: {error}") from error
+        await self._keep(receipt)
+        if receipt is not None and (receipt.seq, receipt.head) != (state.get("audit_seq"), state.get("audit_head")):
+            raise ProtocolError("the state's receipt is not of the end of the log that the state tells")
+        return state
 
     async def audit(self, after: int = 0) -> list[Mapping[str, Any]]:
         """As the ego: audit records with a number above ``after``, unpacked (`robosac.audit.expanded`)."""
@@ -225,30 +235,42 @@ class VehicleClient:
 
     async def enrol(self, teammates: Sequence[str], public_keys: Mapping[str, str] | None = None) -> Mapping[str, str]:
         """As the ego: let teammates join; their tokens."""
-        body = {"teammates": list(teammates), "public_keys": dict(public_keys or {})}
+        body, before = {"teammates": list(teammates), "public_keys": dict(public_keys or {})}, self._promised
         response = await self._request("POST", f"{self._path}/teammates", json=body, **self._proven)
         changed = told(response, _ChangedTeam)
-        await self._keep(changed.receipt)
+        await self._keep(changed.receipt, before)
         return changed.teammate_tokens
 
     async def dismiss(self, teammate: str) -> None:
         """As the ego: let a teammate leave."""
-        await self._keep(_promised(await self._request("DELETE", f"{self._path}/teammates/{teammate}", **self._proven)))
+        before = self._promised
+        response = await self._request("DELETE", f"{self._path}/teammates/{teammate}", **self._proven)
+        await self._keep(_receipt(response), before)
 
     async def close(self) -> str:
         """As the ego: end the session; the head of its audit log, to verify it against later."""
         response = await self._request("DELETE", self._path, **self._proven)
-        await self._keep(_promised(response))
-        return str(response.headers.get("audit-head", ""))
+        receipt, head = _receipt(response), response.headers.get(HEAD_HEADER)
+        await self._keep(receipt)
+        if head is None:
+            raise ProtocolError(f"the answer has no {HEAD_HEADER}")
+        if receipt is not None and receipt.head != head:
+            raise ProtocolError(f"{HEAD_HEADER} is {head:.64}, and {RECEIPT_HEADER} promises {receipt.head}")
+        return str(head)
 
     async def _answered(self, what: str, body: bytes) -> FrameAnswer:
+        before = self._promised
         answer = _answer(await self._post(what, body))
-        await self._keep(answer.receipt)
+        await self._keep(answer.receipt, before)
         return answer
 
-    async def _keep(self, receipt: LogReceipt | None) -> None:
+    @property
+    def _promised(self) -> int:
+        return 0 if self._receipts is None else self._receipts.promised(self.session_id)
+
+    async def _keep(self, receipt: LogReceipt | None, after: int = 0) -> None:
         if self._receipts is not None:
-            await self._receipts.take(receipt, self.session_id)
+            await self._receipts.take(receipt, self.session_id, after)
 
     async def _post(self, what: str, body: bytes) -> httpx.Response:
         headers = {**self.bearer, "Content-Type": MSGPACK, "Accept": MSGPACK}
@@ -261,7 +283,7 @@ def bearer(credential: str) -> dict[str, str]:
     return {"Authorization": f"Bearer {credential}"}
 
 
-def _promised(response: httpx.Response) -> LogReceipt | None:
+def _receipt(response: httpx.Response) -> LogReceipt | None:
     """The receipt of an answer without a body."""
     text = response.headers.get(RECEIPT_HEADER)
     try:

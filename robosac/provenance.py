@@ -64,9 +64,9 @@ def best_first(judged: Sequence[JudgedBox], decoded: Decoded) -> tuple[tuple[Jud
 
 
 def by_name(support: Support, ego_id: str) -> Support:
-    """The same support with the ego's id in the place of `robosac.defenses.EGO`."""
+    """The same support with the ego's id in the place of `robosac.defenses.EGO`; all by name, as logs have them."""
 
     def named(ids: Sequence[str]) -> tuple[str, ...]:
-        return tuple(ego_id if name == EGO else name for name in ids)
+        return tuple(sorted(ego_id if name == EGO else name for name in ids))
 
     return Support(status=support.status, witnesses=named(support.witnesses), deniers=named(support.deniers))

@@ -111,6 +111,83 @@ async def test_a_client_refuses_a_changed_or_missing_receipt(good_frame):
                 await client(**changes).post_frame_body(b"")
 
 
+class Lying(httpx.AsyncBaseTransport):
+    """A gateway that changes what it answers."""
+
+    def __init__(self, transport):
+        self._transport = transport
+        self.change = lambda response: response
+
+    async def handle_async_request(self, request):
+        response = await self._transport.handle_async_request(request)
+        await response.aread()
+        return self.change(response)
+
+    def answer(self, **fields):
+        """Put these in the place of what bodies say."""
+
+        def change(response):
+            packed = "json" not in response.headers["content-type"]
+            told = (wire.unpack(response.content, trusted=True) if packed else response.json()) | fields
+            headers = {"content-type": response.headers["content-type"]}
+            content = wire.pack(told) if packed else json.dumps(told).encode()
+            return httpx.Response(response.status_code, headers=headers, content=content)
+
+        self.change = change
+
+
+@pytest.fixture
+async def lied_to(tmp_path):
+    """A gateway that lies, and an ego that pins its key."""
+    async with serve() as served:
+        lying, keys = Lying(served.client._http._transport), await served.client.public_keys()
+        file = tmp_path / "receipts.jsonl"
+        client = GatewayClient("http://gateway", transport=lying, gateway_keys=keys, receipts=file)
+        session = await client.open_session(EGO, TEAM, gather_ms=50, latency_budget_ms=20_000)
+        yield lying, client.vehicle(session.session_id, EGO, session.ego_token), session, file
+
+
+async def test_a_receipt_that_was_given_before_promises_nothing_new(lied_to, good_frame):
+    lying, ego, session, _ = lied_to
+    await ego.post_frame_body(good_frame(0))
+    lying.answer(receipt=session.receipt.model_dump())
+    for ask in (lambda: ego.post_frame_body(good_frame(1)), ego.renew, lambda: ego.enrol(["car-9"])):
+        with pytest.raises(ProtocolError, match="of record 1, and record 2 was promised before"):
+            await ask()
+
+    def change(response):
+        return httpx.Response(204, headers={"Audit-Receipt": session.receipt.model_dump_json()})
+
+    lying.change = change
+    with pytest.raises(ProtocolError, match="of record 1, and record 2 was promised before"):
+        await ego.dismiss("rsu")
+
+
+async def test_an_end_of_the_log_that_is_not_the_promised_one_is_told(lied_to):
+    lying, ego, session, file = lied_to
+    state = await ego.state()
+    assert file.read_text().splitlines() == [session.receipt.model_dump_json()] * 2
+    for wrong, why in (({"audit_head": "0" * 64}, "not of the end"), ({"audit_seq": 2}, "not of the end"),
+                       ({"receipt": None}, "no receipt"), ({"receipt": {}}, "is none"),
+                       ({"receipt": {**state["receipt"], "signature": "AAAA"}}, "proves nothing")):  # fmt: skip
+        lying.answer(**wrong)
+        with pytest.raises(ProtocolError, match=why):
+            await ego.state()
+
+
+@pytest.mark.parametrize(("head", "why"), [("0" * 64, "promises"), (None, "has no Audit-Head")])
+async def test_a_head_that_was_not_promised_is_told_when_a_session_ends(lied_to, head, why):
+    lying, ego, *_ = lied_to
+
+    def change(response):
+        headers = {"Audit-Receipt": response.headers["audit-receipt"], **({} if head is None else {"Audit-Head": head})}
+        return httpx.Response(204, headers=headers)
+
+    lying.change = change
+    with pytest.raises(ProtocolError, match=why):
+        await ego.close()
+
+
 async def test_keys_are_rotated_with_overlap(tmp_path, good_frame):
     file, url = tmp_path / "gateway.key", f"sqlite:///{tmp_path}/robosac.db"
     async with serve(database_url=url, gateway_key_file=file) as served:

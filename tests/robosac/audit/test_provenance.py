@@ -52,6 +52,24 @@ def test_the_log_keeps_it_and_a_replay_compares_it(got, detector):
     assert replay.replay(replay.find(lines, 1), body, detector, KINDS) == []
 
 
+@pytest.mark.parametrize("kind", ["judging", "group_testing"])
+async def test_witnesses_stand_by_name_whatever_the_ego_is_called(kind, detector, ego_message, benign):
+    renamed = dict(zip(("Rsu", "car-2", "Z"), benign.values(), strict=False))
+    async with serve(iter(range(40, 60)), keep_frames=9, extra_defenses="tests.robosac.judging:build") as served:
+        options = {"defense": {"kind": kind}, "latency_budget_ms": 20_000}
+        session = await served.client.open_session("ego", list(renamed), **options)
+        ego = served.client.vehicle(session.session_id, "ego", session.ego_token)
+        answers = [await ego.post_frame(number, ego_message, renamed) for number in range(2)]
+        lines, body = [line.encode() for line in await ego.audit_lines()], await ego.kept_messages(1)
+        told = [support for answer in answers for support in (*answer.support, *answer.contradicted)]
+        assert any("ego" in support.witnesses[1:] for support in told)
+        for support in told:
+            assert list(support.witnesses) == sorted(support.witnesses)
+            assert list(support.deniers) == sorted(support.deniers)
+        assert unpacked(lines[2])["support"] == answers[1].as_json()["support"]
+        assert replay.replay(replay.find(lines, 1), body, detector, KINDS) == []
+
+
 def changed(lines, index=2, **fields):
     """The log of a gateway that lied about a record, and chained it properly; what is None is not in it."""
     records = [unpacked(line) for line in lines]
