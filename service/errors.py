@@ -114,6 +114,13 @@ class SessionOver(Refused):
         super().__init__(Kind.UNKNOWN_SESSION, detail)
 
 
+class SessionLost(SessionOver):
+    """The database lost records that were promised of a session."""
+
+    def __init__(self) -> None:
+        super().__init__("the database lost what was promised of this session: open another one")
+
+
 class FrameDecided(Refused):
     """A frame of this number or a higher one is decided already, perhaps by another process."""
 

@@ -2,10 +2,14 @@
 
 from __future__ import annotations
 
+import logging
 from collections import OrderedDict
 from dataclasses import replace
 
+from service.errors import SessionLost
 from service.keeping.record import SessionRecord
+
+logger = logging.getLogger(__name__)
 
 
 class Seen:
@@ -29,6 +33,23 @@ class Seen:
         """Know nothing of a session any more."""
         self._sessions.pop(session_id, None)
 
+    def check(self, now: SessionRecord) -> None:
+        """Refuse to add to a session that the database, which has it so, has lost records of. Others in their place
+        would contradict what was promised, and be drawn by seeds that were told before.
+
+        Raises
+        ------
+        SessionLost
+        """
+        before = self._sessions.get(now.session_id)
+        if before is not None and has_lost(now, before):
+            logger.error(
+                "the database went back: the log of session %s ends with record %d, and record %d was kept before, or "
+                "another one of its number; was a backup put in its place?",
+                *(now.session_id, now.audit_seq, before.audit_seq),
+            )
+            raise SessionLost
+
     def remember(self, record: SessionRecord) -> SessionRecord:
         """Keep the newest that is known of a session, and give it; of an ended one without what can be long."""
         if record.ended_at is not None:
@@ -41,3 +62,10 @@ class Seen:
         if len(self._sessions) > self._most:
             self._sessions.popitem(last=False)
         return newest
+
+
+def has_lost(now: SessionRecord, before: SessionRecord) -> bool:
+    """Whether a session that is so now has lost records that it had before."""
+    if now.audit_seq == before.audit_seq:
+        return now.audit_head != before.audit_head
+    return now.audit_seq < before.audit_seq

@@ -13,7 +13,7 @@ from sqlalchemy import Connection, Delete, Row, Select, Update, insert, select, 
 
 from robosac.audit import FULL_EVERY, digest
 from robosac.audit.events import DetectorChanged, Event, FrameAnswered, SessionEnded, TeamChanged, TokenRenewed
-from service.errors import AuditFull, FrameDecided, SessionChanged, SessionOver, TokenReplaced
+from service.errors import AuditFull, FrameDecided, SessionChanged, SessionLost, SessionOver, TokenReplaced
 from service.keeping import clock, migrations, once, partitions, purging, usage
 from service.keeping.appending import Change, append, check_revision, check_unused, line_row, renewal
 from service.keeping.database import connect
@@ -22,7 +22,7 @@ from service.keeping.patience import Patience
 from service.keeping.record import SessionRecord
 from service.keeping.rows import ADD_REST, FIELDS, GET, GET_BUT_KNOWN, NO_CHANGE, OPEN, TOUCH, columns, read_row
 from service.keeping.sealing import Draft, Ready, Sealing, drafted, sealed
-from service.keeping.seen import Seen
+from service.keeping.seen import Seen, has_lost
 from service.keeping.shares import Shares
 from service.keeping.tables import audit_lines, kept_messages, sessions
 
@@ -113,9 +113,11 @@ class Store:
         if row is None:
             self._seen.forget(session_id)
             return None
+        record = read_row(row, before)
+        if before is not None and has_lost(record, before):  # what was promised is not forgotten
+            return record
         if self._seen.get(session_id) is before:  # nothing was written meanwhile: the database is right
             self._seen.forget(session_id)
-        record = read_row(row, before)
         newest = self._seen.remember(record)
         return newest if record.ended_at is None else record
 
@@ -356,14 +358,20 @@ class Store:
         if draft is None:
             await asyncio.to_thread(ready.write)
 
+        def checked(now: SessionRecord) -> Mapping[str, Any]:
+            self._seen.check(now)
+            return change(now)
+
         def work(connection: Connection) -> SessionRecord:
             first(connection)
-            after = append(connection, session_id, ready.made.said, change, self.check_room, ready.made.state)
+            after = append(connection, session_id, ready.made.said, checked, self.check_room, ready.made.state)
             keep(connection)
             return after
 
         try:
             after = await (self._database.write(work) if draft is None else self._database.write(work, draft.write))
+        except SessionLost:
+            raise
         except (SessionChanged, SessionOver, TokenReplaced):
             self._seen.forget(session_id)
             await self.get(session_id)

@@ -16,6 +16,7 @@ from service.errors import (
     Refused,
     SessionChanged,
     SessionInUse,
+    SessionLost,
     SessionOver,
     TokenReplaced,
 )
@@ -38,6 +39,7 @@ from tests.service.store.conftest import (
 )
 
 LATER = time.time() + 3600
+OF_SESSION = text("SELECT audit_seq, audit_head FROM sessions WHERE session_id = :sid")
 
 
 async def test_a_session_comes_back_as_it_was_kept(store):
@@ -286,14 +288,24 @@ async def test_many_sessions_are_remembered_but_not_all():
     await store.close()
 
 
-async def test_the_database_is_right_even_where_it_lost_what_was_written(store):
-    """As a standby may have that is promoted."""
-    sid = await added(store)
+async def test_a_session_whose_records_the_database_lost_takes_no_others(store, caplog):
+    """As a standby may have lost them that is promoted, or a backup that was put back."""
+    sid, other = await added(store), await added(store, 1)
+    row = await store._database.read(lambda connection: connection.execute(OF_SESSION, {"sid": sid}).one())
     await store.renew_token(sid, "t1", "t9", A_TOKEN)
-    undone = text("UPDATE sessions SET revision = 0, audit_seq = 1")
-    await store._database.write(lambda connection: connection.execute(undone))
-    assert (await store.get(sid)).revision == 0
-    assert store.seen(sid).revision == 0
+    promised = store.seen(sid)
+    undone = text("UPDATE sessions SET revision = 0, audit_seq = :seq, audit_head = :head WHERE session_id = :sid")
+    for head, seq in ((row.audit_head, 1), ("f" * 64, 2)):
+        changed = {"sid": sid, "seq": seq, "head": head}
+        await store._database.write(lambda connection, changed=changed: connection.execute(undone, changed))
+        assert (await store.get(sid)).audit_head == head
+        assert store.seen(sid) == promised
+        for _ in range(2):
+            with pytest.raises(SessionLost):
+                await store.log(sid, A_TOKEN)
+        assert f"ends with record {seq}, and record 2 was kept before" in caplog.text
+    assert len(await store.audit(sid, 0)) == 2
+    await store.log(other, A_TOKEN)
 
 
 async def test_a_log_is_read_in_pages_and_purged_in_short_transactions(store):
