@@ -3,7 +3,8 @@
 from __future__ import annotations
 
 import hashlib
-from collections.abc import Collection, Mapping
+from collections import Counter
+from collections.abc import Collection, Mapping, Sequence, Sized
 from dataclasses import dataclass, field
 from typing import Any
 
@@ -163,13 +164,22 @@ def unpack(body: bytes, *, trusted: bool = False, most_entries: int = MAX_ENTRIE
             max_map_len=limit if trusted else min(limit, MAX_MAP),
             max_ext_len=limit,
             list_hook=count,
-            object_pairs_hook=lambda pairs: dict(count(pairs)),  # where a name that comes again is still there
+            object_pairs_hook=lambda pairs: named_once(count(pairs)),
         )
     except msgpack.ExtraData as error:
         raise WireError("malformed-msgpack", "", "is no msgpack, or has bytes left over after its one value") from error
     except Exception as error:  # msgpack raises many unrelated types, ValueError and its own among them
         reason = str(error) or type(error).__name__
         raise WireError("malformed-msgpack", "", f"not a whole msgpack value within the limits: {reason}") from error
+
+
+def named_once(pairs: Sequence[tuple[Any, Any]]) -> dict[Any, Any]:
+    """A map of its members; a ValueError where a name comes again: other readers may take the other one."""
+    members = dict(pairs)
+    if len(members) < len(pairs):
+        name, _ = Counter(name for name, _ in pairs).most_common(1)[0]
+        raise ValueError(f"{shown(name)} comes more than once in a map")
+    return members
 
 
 def read_message(body: bytes) -> MessageEnvelope:
@@ -208,8 +218,9 @@ def _unpack_apart(
         The ``fault`` of the frame as a whole, if it is not one of teammates' parts.
     """
     try:
-        members = _members(body)
+        members = named_once(_members(body))
         parts = _members(members.pop("teammates"))
+        times = Counter(name for name, _ in parts)
         share = _share(members)
         frame = {name: unpack(member, most_entries=share) for name, member in members.items()}
     except Exception as error:  # as of `unpack`
@@ -217,9 +228,11 @@ def _unpack_apart(
     read: dict[Any, Any] = {}
     unreadable: dict[str, WireError] = {}
     share = _share(parts)
-    for name, part in parts.items():
+    for name, part in parts:
         wrong = fault
-        if team is None or name in team:
+        if times[name] > 1:
+            wrong = WireError(fault.code, "", "comes more than once in the frame")
+        elif team is None or name in team:
             try:
                 read[name] = unpack(part, most_entries=share)
                 continue
@@ -231,12 +244,12 @@ def _unpack_apart(
     return {**frame, "teammates": read}, unreadable
 
 
-def _share(parts: Mapping[Any, bytes]) -> int:
+def _share(parts: Sized) -> int:
     """Entries that each of some parts may have where they are unpacked one by one."""
     return max(MAX_ENTRIES // max(len(parts), 1), _LEAST_SHARE)
 
 
-def _members(body: bytes) -> dict[Any, bytes]:
+def _members(body: bytes) -> list[tuple[Any, bytes]]:
     """The members of a map, still packed; what is wrong inside them is not looked at. A name is no array and no map."""
     # arrays and maps are bounded among the names alone: what is skipped is not built
     walker = msgpack.Unpacker(
@@ -246,11 +259,11 @@ def _members(body: bytes) -> dict[Any, bytes]:
     size = walker.read_map_header()
     if size > MAX_MAP:
         raise ValueError(f"more than {MAX_MAP} members")
-    members = {}
+    members = []
     for _ in range(size):
         name, start = walker.unpack(), walker.tell()
         walker.skip()
-        members[name] = body[start : walker.tell()]
+        members.append((name, body[start : walker.tell()]))
     if walker.tell() != len(body):
         raise ValueError("bytes are left over")
     return members

@@ -7,12 +7,14 @@ declare none, and read theirs here.
 from __future__ import annotations
 
 import asyncio
+import json
 from typing import Any, TypeVar
 
 from fastapi import Request
 from fastapi.exceptions import RequestValidationError
 from pydantic import BaseModel, ValidationError
 
+from robosac.wire.bodies import named_once
 from service.arriving.limits import read_bounded
 from service.errors import Kind, Refused
 
@@ -45,7 +47,7 @@ async def read_json(request: Request, model: type[Model], context: Any = None) -
     Raises
     ------
     Refused
-        As `check_type` and `service.arriving.limits.read_bounded`.
+        As `check_type` and `service.arriving.limits.read_bounded`; and if a name comes twice in an object.
     RequestValidationError
         If it is not JSON, or not what the model says.
     """
@@ -65,9 +67,14 @@ def described(model: type[BaseModel]) -> dict[str, Any]:
 
 def _parsed(body: bytes, model: type[Model], context: Any) -> Model:
     try:
-        return model.model_validate_json(body, context=context)
+        parsed = model.model_validate_json(body, context=context)
     except ValidationError as error:
         raise RequestValidationError(error.errors(include_url=False, include_input=False)) from None
+    try:
+        json.loads(body, object_pairs_hook=named_once)
+    except ValueError as error:
+        raise Refused(Kind.MALFORMED_JSON, f"not JSON: {error}") from None
+    return parsed
 
 
 def _in_full(node: Any, definitions: dict[str, Any]) -> Any:

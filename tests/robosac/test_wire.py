@@ -177,13 +177,6 @@ def test_a_body_that_is_no_msgpack_within_limits_is_refused(body):
     assert (caught.value.code, caught.value.field) == ("malformed-msgpack", "")
 
 
-def test_a_name_that_comes_again_in_a_map_counts_again():
-    again = b"\xde\x04\x00" + b"\x00\xc0" * 1024
-    assert wire.unpack(again) == {0: None}
-    with pytest.raises(wire.WireError, match=f"more than {wire.MAX_ENTRIES} entries"):
-        wire.unpack(b"\xdc\x00\x40" + again * 64)
-
-
 @pytest.mark.parametrize("body", [GOOD + b"\x00", b"hello", b'{"frame": 0}'])
 def test_bytes_after_the_value_are_told_as_such(body):
     with pytest.raises(wire.WireError, match="is no msgpack, or has bytes left over after its one value"):
@@ -245,6 +238,28 @@ def test_broken_parts_of_others_than_the_team_are_not_unpacked_one_by_one(monkey
     assert len(frame.unreadable) == 400
     assert frame.unreadable["car-3"].field == "teammates.car-3"
     assert len(unpacked) == 1 + 2 + 2  # the whole, the frame's other members, the parts of the team
+
+
+@pytest.mark.parametrize("body", [b"\x82\xa1a\x01\xa1a\x02", b"\x81\xa1b\x82\xa1a\x01\xa1a\x01"], ids=["top", "inside"])
+def test_a_name_that_comes_twice_is_refused(body):
+    with pytest.raises(wire.WireError, match="'a' comes more than once in a map") as caught:
+        wire.unpack(body)
+    assert caught.value.code == "malformed-msgpack"
+
+
+@pytest.mark.parametrize("team", [None, ("rsu", "car-3")])
+def test_a_teammate_that_comes_twice_in_a_frame_is_unreadable_and_no_other(team):
+    good = msgpack.packb({"frame": 0, "ego": {}})[1:]
+    body = b"\x83" + good + msgpack.packb("teammates") + b"\x83\xa3rsu\x80\xa5car-3\x80\xa5car-3\x81\x00\x00"
+    frame = wire.read_frame(body, team)
+    assert frame.teammates == {"rsu": {}}
+    assert str(frame.unreadable["car-3"]) == "teammates.car-3: comes more than once in the frame"
+
+
+def test_a_frame_with_a_member_twice_is_refused():
+    body = b"\x84" + msgpack.packb({"frame": 0, "ego": {}, "teammates": {}})[1:] + msgpack.packb("frame") + b"\x01"
+    with pytest.raises(wire.WireError, match="'frame' comes more than once"):
+        wire.read_frame(body)
 
 
 plain = st.recursive(

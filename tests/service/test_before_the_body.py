@@ -196,6 +196,8 @@ async def test_json_is_asked_for_by_name(served, path, headers, slug):
         (b'"\\ud800"', 400, "malformed-json", None),
         (b"[" * 100_000, 400, "malformed-json", None),
         (b'{"ego_id": "a", "teammates": []} []', 400, "malformed-json", None),
+        (b'{"ego_id": "a", "ego_id": "b", "teammates": []}', 400, "malformed-json", None),
+        (b'{"ego_id": "a", "teammates": [], "defense": {"kind": "a2cp", "kind": "a2cp"}}', 400, "malformed-json", None),
         (b"null", 422, "invalid-request", "body"),
         (b'{"ego_id": "a"}', 422, "invalid-request", "teammates"),
         (b'{"ego_id": "a", "teammates": ["b", 3]}', 422, "invalid-request", "teammates.1"),
