@@ -125,8 +125,13 @@ def check_proof(proof: str, key: Ed25519PublicKey, call: Call, now: float, publi
     _check_url(claims["htu"], call.path, public_url)
     if claims["ath"] != _hash(call.token):
         raise ProofError("ath must be the base64url SHA-256 of the token that the request came with")
-    if isinstance(made_at, bool) or not isinstance(made_at, int | float) or made_at != made_at:  # noqa: PLR0124 (NaN)
-        raise ProofError("iat must be a number, Unix time in seconds")
+    for name in ("iat", *(name for name in ("exp", "nbf") if name in claims)):
+        if not _is_time(claims[name]):
+            raise ProofError(f"{name} must be a number, Unix time in seconds")
+    if claims.get("exp", now) <= now - LEEWAY_S:
+        raise ProofError("exp is in the past by the gateway's clock")
+    if claims.get("nbf", now) > now + LEEWAY_S:
+        raise ProofError("nbf is in the future by the gateway's clock")
     if made_at < now - MAX_AGE_S - LEEWAY_S:
         raise ProofError(f"iat is more than {MAX_AGE_S:g} s ago by the gateway's clock")
     if made_at > now + LEEWAY_S:
@@ -178,6 +183,10 @@ def _signed_claims(proof: str, key: Ed25519PublicKey) -> Mapping[str, Any]:
     except (jwt.PyJWTError, ValueError, RecursionError) as error:
         raise ProofError("it is not a JWT with claims") from error
     return claims
+
+
+def _is_time(value: object) -> bool:
+    return isinstance(value, int | float) and not isinstance(value, bool) and value == value  # noqa: PLR0124 (NaN)
 
 
 def _is_id(value: object) -> bool:

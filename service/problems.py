@@ -15,6 +15,7 @@ from fastapi import FastAPI, Request
 from fastapi.exceptions import RequestValidationError
 from fastapi.responses import JSONResponse
 from starlette.exceptions import HTTPException
+from starlette.routing import Match
 from starlette.types import Receive, Scope, Send
 
 from robosac.defenses import shipped
@@ -136,14 +137,26 @@ def install(app: FastAPI) -> None:
         return response(Refused(Kind.INVALID_REQUEST, in_words(first), ".".join(where) or "body"))
 
     @app.exception_handler(HTTPException)
-    async def _http(_: Request, error: HTTPException) -> JSONResponse:
+    async def _http(request: Request, error: HTTPException) -> JSONResponse:
         slug = HTTPStatus(error.status_code).phrase.lower().replace(" ", "-")  # of 404 and 405, where no route fits
-        return _problem(error.status_code, slug, _UNROUTED.get(error.status_code, error.detail), headers=error.headers)
+        headers = error.headers
+        if error.status_code == HTTPStatus.METHOD_NOT_ALLOWED:  # Starlette tells those of the first route that fits
+            headers = {"Allow": ", ".join(_methods(app, request.scope))}
+        return _problem(error.status_code, slug, _UNROUTED.get(error.status_code, error.detail), headers=headers)
 
     @app.exception_handler(Exception)
     async def _internal(request: Request, error: Exception) -> JSONResponse:
         logger.error("unhandled error", method=request.method, path=request.url.path, exc_info=error)
         return response(Refused(Kind.INTERNAL_ERROR, "the gateway failed to handle this request"))
+
+
+def _methods(app: FastAPI, scope: Scope) -> list[str]:
+    """What may be asked for at a request's path."""
+
+    def fits(method: str) -> bool:
+        return any(route.matches({**scope, "method": method})[0] is Match.FULL for route in app.routes)
+
+    return [method for method in ("DELETE", "GET", "HEAD", "PATCH", "POST", "PUT") if fits(method)]
 
 
 class _Problem(JSONResponse):

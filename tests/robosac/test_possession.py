@@ -104,6 +104,10 @@ WRONG = {
     "NaN": (proof(iat=float("nan")), "iat must"),
     "for ever": (proof(iat=float("inf")), "iat is in the future"),
     "never": (proof(iat=float("-inf")), "iat is more than"),
+    "over": (proof(exp=NOW - 10), "exp is in the past"),
+    "not yet": (proof(nbf=NOW + 11), "nbf is in the future"),
+    "over at a time of a wrong kind": (proof(exp="1"), "exp must"),
+    "not before NaN": (proof(nbf=float("nan")), "nbf must"),
     "a huge time": (proof(iat=10**400), "iat is in the future"),
     "a list of claims": (with_payload(b"[1]"), "claims"),
     "a deep claim": (with_payload(b"{" + b'"a":[' * 400), "claims"),
@@ -124,7 +128,7 @@ def test_clocks_may_be_a_little_apart(age):
 
 def test_members_that_the_standard_allows_besides_do_no_harm():
     more = proof(
-        header={"jwk": {**jwk_of(KEY), "kid": "k", "use": "sig"}, "kid": "k"}, exp=1, nbf=2**40, aud="x", sub=7
+        header={"jwk": {**jwk_of(KEY), "kid": "k", "use": "sig"}, "kid": "k"}, exp=NOW + 1, nbf=NOW, aud="x", sub=7
     )
     assert check_proof(more, KEY.public_key(), CALL, NOW).proof_id == "one"
 

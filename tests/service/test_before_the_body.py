@@ -220,8 +220,10 @@ async def test_what_is_wrong_is_told_in_plain_words(served):
     unknown = problem(await served.http.post("/v1/sessions", json={"ego_id": "a", **body}), 422, "invalid-request")
     assert (unknown["field"], unknown["detail"]) == ("ego", "there is no such field")
     assert problem(await served.http.get("/v1/session"), 404, "not-found")["detail"] == "there is nothing at this path"
-    told = problem(await served.http.put("/v1/sessions"), 405, "method-not-allowed")["detail"]
-    assert told == "this path does not take this method"
+    refused = await served.http.put("/v1/sessions")
+    assert problem(refused, 405, "method-not-allowed")["detail"] == "this path does not take this method"
+    assert refused.headers["allow"] == "POST"
+    assert (await served.http.put("/v1/sessions/x")).headers["allow"] == "DELETE, GET"
 
 
 async def test_the_description_says_what_to_send(served):
