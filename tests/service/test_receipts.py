@@ -149,17 +149,17 @@ async def lied_to(tmp_path):
 
 async def test_a_receipt_that_was_given_before_promises_nothing_new(lied_to, good_frame):
     lying, ego, session, _ = lied_to
-    await ego.post_frame_body(good_frame(0))
-    lying.answer(receipt=session.receipt.model_dump())
-    for ask in (lambda: ego.post_frame_body(good_frame(1)), ego.renew, lambda: ego.enrol(["car-9"])):
-        with pytest.raises(ProtocolError, match="of record 1, and record 2 was promised before"):
-            await ask()
-
-    def change(response):
-        return httpx.Response(204, headers={"Audit-Receipt": session.receipt.model_dump_json()})
-
-    lying.change = change
-    with pytest.raises(ProtocolError, match="of record 1, and record 2 was promised before"):
+    old = (await ego.post_frame_body(good_frame(0))).receipt
+    for receipt in (session.receipt, old):
+        why = f"of record {receipt.seq}, and record 2 was promised before"
+        lying.answer(receipt=receipt.model_dump())
+        for ask in (ego.renew, lambda name=f"car-{receipt.seq}9": ego.enrol([name])):
+            with pytest.raises(ProtocolError, match=why):
+                await ask()
+        with pytest.raises(ProtocolError, match=why):
+            await ego.post_frame_body(good_frame(receipt.seq))
+    lying.change = lambda _: httpx.Response(204, headers={"Audit-Receipt": old.model_dump_json()})
+    with pytest.raises(ProtocolError, match="of record 2, and record 2 was promised before"):
         await ego.dismiss("rsu")
 
 
