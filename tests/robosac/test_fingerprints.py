@@ -1,6 +1,7 @@
 import numpy as np
 import pytest
 
+from robosac.scenes import IntersectionScene
 from robosac.screening.fingerprints import SKETCH, fingerprints, likeness, packed, unpacked
 
 
@@ -59,18 +60,20 @@ def test_the_digest_is_of_all_tensors_by_their_names(rng):
     assert both.digest == one(y=b, x=a).digest
 
 
-def test_a_map_that_is_the_same_everywhere_is_blank(rng):
+def test_a_map_that_is_the_same_nearly_everywhere_is_blank(rng):
     flat = np.full((64, 32, 32), 0.5, np.float16)
     flat += rng.normal(size=(64, 1, 1)).astype(np.float16)
     rimmed = flat.copy()
     rimmed[:, :4], rimmed[..., -4:] = rng.normal(size=(64, 4, 32)), rng.normal(size=(64, 32, 4))
-    for blank in (flat, rimmed, np.zeros_like(flat), np.full((5, 3), 2.0), np.zeros((0, 4, 4))):
+    for blank in (flat, rimmed, np.zeros_like(flat), np.full((5, 3), 2.0), np.zeros((0, 4, 4)), np.zeros((3, 0))):
         assert one(blank).blank
         assert not one(blank).sketch.any()
-    for row, column in ((7, 7), (4, 4), (27, 27), (4, 20)):
-        almost = rimmed.copy()
-        almost[7, row, column] += 0.75
-        assert not one(almost).blank
+    for rows, is_blank in ((4, True), (5, False)):  # of 24 within the rims
+        filled = rimmed.copy()
+        filled[7, 28 - rows : 28] += 0.75
+        assert one(filled).blank == is_blank
+        filled[8, 4:28, 4:28] = np.arange(24)
+        assert not one(filled).blank
     assert not one(np.array([[1.0, 1.0, 2.0]])).blank
     assert not one(x=flat, y=a_map(rng)).blank
 
@@ -78,6 +81,21 @@ def test_a_map_that_is_the_same_everywhere_is_blank(rng):
 def test_the_message_of_an_empty_scan_is_blank(detector):
     tensors = detector.encode(np.zeros((0, 3)), np.eye(4)).tensors
     assert fingerprints({"a": tensors})["a"].blank
+
+
+@pytest.mark.parametrize("off_m", [0.5, 1.0, 2.0])
+def test_the_message_of_a_covered_scanner_is_blank(detector, rng, off_m):
+    angle, tilt = rng.uniform(-np.pi, np.pi, 3000), rng.uniform(-0.5, 0.1, 3000)
+    off = off_m + rng.normal(0.0, 0.03, 3000)
+    cover = off[:, None] * np.column_stack([np.cos(angle), np.sin(angle), np.sin(tilt)])
+    assert fingerprints({"a": detector.encode(cover, np.eye(4)).tensors})["a"].blank
+
+
+def test_no_message_of_a_scanner_that_sees_is_blank(detector):
+    for number in (1600, 1601):
+        views = IntersectionScene(number).frame(0).views.values()
+        prints = fingerprints({str(i): detector.encode(v.points, v.pose).tensors for i, v in enumerate(views)})
+        assert not any(one.blank for one in prints.values())
 
 
 def test_likeness_is_the_correlation_of_the_maps(rng):
