@@ -22,7 +22,7 @@ from robosac.scenes.base import Frame, SceneAround, View
 
 _STREAM = 7_000_000
 """Frames of generated scenes draw from streams that begin with the scene's and the frame's number."""
-_DROPPED, _LATE, _RAIN, _NOISE, _NOISY, _BIAS, _JUMP = range(_STREAM, _STREAM + 7)
+_DROPPED, _LATE, _RAIN, _NOISE, _NOISY, _BIAS, _JUMP, _COVERED, _COVER = range(_STREAM, _STREAM + 9)
 
 
 @dataclass(frozen=True)
@@ -127,14 +127,18 @@ class Late(Disturbed):
     """
     frames: int = 1
     """How late."""
+    every: int = 1
+    """Only one frame in so many is sensed anew; what it holds is sent again in those after it."""
+    slower_every: int = 0
+    """After so many frames it is one frame later than before, as a clock that goes slower; 0: never."""
     _last: dict[int, Frame] = field(default_factory=dict, init=False, repr=False, compare=False)
     """The frames that the next one will ask for again."""
 
     def views(self, frame: Frame) -> Mapping[str, View]:
         late = self.teammates if self.everybody else self.one_of_them(_LATE)
         disturbed = dict(frame.views)
-        if frame.index >= self.frames:
-            earlier = self._earlier(frame.index - self.frames).views
+        if 0 <= self._sensed(frame.index) < frame.index:
+            earlier = self._earlier(self._sensed(frame.index)).views
             for name in late:
                 if name in disturbed and name in earlier:
                     old = earlier[name]
@@ -142,14 +146,41 @@ class Late(Disturbed):
         self._keep(frame)
         return disturbed
 
+    def _sensed(self, index: int) -> int:
+        """The frame that is sent in the one of this index, if there is such a frame."""
+        lag = self.frames + (index // self.slower_every if self.slower_every else 0)
+        return index - index % self.every - lag
+
     def _earlier(self, index: int) -> Frame:
         kept = self._last.get(index)
         return self.scene.frame(index) if kept is None else kept
 
     def _keep(self, frame: Frame) -> None:
         self._last[frame.index] = frame
-        for index in [index for index in self._last if not 0 <= frame.index - index < self.frames]:
+        needed = range(self._sensed(frame.index + 1), frame.index + 1)
+        for index in [index for index in self._last if index not in needed]:
             del self._last[index]
+
+
+@dataclass(frozen=True)
+class Covered(Disturbed):
+    """One teammate's scanner is covered for a while: all its returns come from the cover."""
+
+    first: int = 5
+    """The frame in which it is covered."""
+    frames: int = 10
+    """For how long."""
+    off_m: float = 1.0
+    """How far the cover is from the scanner, metres; each return by itself is wrong by 3 cm, standard deviation."""
+
+    def views(self, frame: Frame) -> Mapping[str, View]:
+        disturbed = dict(frame.views)
+        if self.first <= frame.index < self.first + self.frames:
+            for name, view in scans(frame, self.one_of_them(_COVERED)):
+                off = self.off_m + self.rng(_COVER, frame.index).normal(0.0, 0.03, len(view.points))
+                away = np.maximum(np.linalg.norm(view.points, axis=1), 0.1)
+                disturbed[name] = View(view.pose, view.points * (off / away)[:, None].astype(view.points.dtype))
+        return disturbed
 
 
 @dataclass(frozen=True)

@@ -2,13 +2,13 @@ import numpy as np
 import pytest
 
 from robosac.scenes import IntersectionScene, encoded
-from robosac.scenes.disturbances import _LATE, Biased, Dropped, JumpingEgo, Late, NarrowEgo, NoisyScanner, Rain
+from robosac.scenes.disturbances import _LATE, Biased, Covered, Dropped, JumpingEgo, Late, NarrowEgo, NoisyScanner, Rain
 from robosac.scenes.recorded import Recording
 from tests.recorded import write
 
 SCENE = IntersectionScene(4)
 TEAM = SCENE.agents[1:]
-EVERYTHING = (Rain, NoisyScanner, Late, Dropped, Biased, JumpingEgo, NarrowEgo)
+EVERYTHING = (Covered, Rain, NoisyScanner, Late, Dropped, Biased, JumpingEgo, NarrowEgo)
 
 
 def changed(scene, index, what):
@@ -88,6 +88,35 @@ def test_all_teammates_may_be_late_by_several_frames():
             old, sent = SCENE.frame(index - 3).views[name], scene.frame(index).views[name]
             np.testing.assert_array_equal(sent.points, old.points)
             np.testing.assert_array_equal(sent.pose, old.pose)
+
+
+@pytest.mark.parametrize(
+    ("how", "sensed"),
+    [
+        ({"frames": 0, "every": 3}, [0, 0, 0, 3, 3, 3, 6, 6]),
+        ({"frames": 0, "slower_every": 2}, [0, 1, 1, 2, 2, 3, 3, 4]),
+        ({"frames": 1, "every": 2}, [0, 1, 1, 1, 3, 3, 5, 5]),
+    ],
+    ids=["again", "slower", "both"],
+)
+def test_a_teammate_may_send_the_same_again_or_be_later_and_later(how, sensed):
+    scene = Late(SCENE, fresh_pose=False, **how)
+    (late,) = scene.one_of_them(_LATE)
+    for order in (range(8), reversed(range(8))):
+        for index in order:
+            view = scene.frame(index).views[late]
+            expected = SCENE.frame(sensed[index]).views[late]
+            assert np.array_equal(view.points, expected.points)
+            assert np.array_equal(view.pose, expected.pose)
+
+
+def test_a_covered_scanner_sees_its_cover_alone():
+    scene = Covered(SCENE, first=2, frames=3)
+    for index in range(7):
+        off = {name: np.linalg.norm(view.points, axis=1) for name, view in scene.frame(index).views.items()}
+        covered = [name for name, far in off.items() if far.max() < 1.3]
+        assert len(covered) == (2 <= index < 5)
+        assert all(np.std(off[name]) == pytest.approx(0.03, rel=0.2) for name in covered)
 
 
 def test_frames_that_are_late_are_not_made_twice():

@@ -11,7 +11,17 @@ from robosac.defenses import EGO, Outcome
 from robosac.defenses.group_testing.findings import Findings
 from robosac.defenses.group_testing.geometry import followed
 from robosac.defenses.group_testing.knowledge import Knowledge
-from robosac.defenses.group_testing.lateness import SENT_FRAMES, late, motions, moved_since, senders, sent, turned_since
+from robosac.defenses.group_testing.lateness import (
+    LATER,
+    LATEST,
+    SENT_FRAMES,
+    late,
+    motions,
+    moved_since,
+    senders,
+    sent,
+    turned_since,
+)
 from robosac.defenses.group_testing.lies import Lies
 from robosac.defenses.group_testing.memory import Memory
 from robosac.defenses.group_testing.posterior import Posterior
@@ -33,10 +43,10 @@ def shown_at(places, true=PLACES):
     return wrong + [(*place, YES) for place in places]
 
 
-def told(places, moved=STILL, centres=PLACES, speeds=SPEED):
+def told(places, moved=STILL, centres=PLACES, speeds=SPEED, latest=LATEST):
     """Whether a message is late that shows vehicles in these places."""
     heard = saying({EGO: [], "a": [], "d": shown_at(places, centres if len(centres) else PLACES)})
-    return late(heard, "d", np.asarray(moved), centres, np.broadcast_to(speeds, centres.shape))
+    return late(heard, "d", np.asarray(moved), centres, np.broadcast_to(speeds, centres.shape), latest=latest)
 
 
 @pytest.mark.parametrize(("frames", "is_late"), [(0, False), (1, True), (2, True), (2.5, True), (3, False), (5, False)])
@@ -44,6 +54,11 @@ def told(places, moved=STILL, centres=PLACES, speeds=SPEED):
 def test_a_message_is_late_if_it_fits_best_where_vehicles_were(frames, is_late, moved):
     """With the pose of now, what it shows has moved along with its sender."""
     assert told(PLACES + frames * (moved - SPEED), moved) == is_late
+
+
+@pytest.mark.parametrize(("frames", "is_late"), [(3, True), (4, True), (4.5, False), (5, False)])
+def test_whoever_was_late_may_be_later(frames, is_late):
+    assert told(PLACES - frames * SPEED, latest=LATER) == is_late
 
 
 @pytest.mark.parametrize(("frames", "is_late"), [(1, True), (2, True), (5, False)])
@@ -102,13 +117,14 @@ def cars(centres):
 
 
 def drive(frames, delay, shown=False, every=1):
-    """Decisions in traffic, where one teammate's message is so many frames old, and shown or not where it is fused. It
-    sends one in every so many frames.
+    """Decisions in traffic, where one teammate's message is so many frames old, or as old as it is in each frame, and
+    shown or not where it is fused. It sends one in every so many frames.
     """
+    delays = delay if callable(delay) else lambda frame: min(delay, frame)
     state, rng, found = DEFENSE.initial_state(TEAM), np.random.default_rng(0), []
     for frame in range(frames):
         true = PLACES + frame * SPEED
-        old = true - min(delay, frame) * SPEED
+        old = true - delays(frame) * SPEED
         honest = [(*place, NO) for place in old if delay] + [(*place, YES) for place in true]
         team = tuple(name for name in TEAM if name != LIAR or frame % every == 0)
         said = {**dict.fromkeys((EGO, *TEAM), honest), LIAR: shown_at(old, true)}
@@ -135,9 +151,24 @@ def test_who_is_late_is_not_named_and_who_replays_is(delay, names, shown, every)
     found = drive(6 + 4 * every, delay, shown and delay > 0, every)
     assert {name for decision in found for name in decision.named} == names
     levels = found[-1].state["memory"]["lies"]["levels"].get(LIAR, {})
-    assert ("late" in levels) == (0 < delay < 5)
+    assert ("late" in levels) == (0 < delay < 5) or delay == 5  # it was, while it had nothing older
     assert ("conflict" in levels) == (delay == 5)
     assert ("ghost" in levels) == (delay == 5 and shown)
+
+
+@pytest.mark.parametrize(
+    ("delay", "names"),
+    [
+        (lambda frame: min(frame // 3, 4), set()),  # a clock that goes slower
+        (lambda frame: frame % 5, set()),  # one message in five frames, sent again and again
+        (lambda frame: 4 * (frame >= 4), {LIAR}),
+        (lambda frame: min(frame // 2, 6), {LIAR}),
+    ],
+    ids=["slower", "again", "at once", "too late"],
+)
+def test_who_gets_later_and_later_is_not_named_up_to_a_bound(delay, names):
+    found = drive(16, delay, shown=True)
+    assert {name for decision in found for name in decision.named} == names
 
 
 def test_where_senders_were_is_known_for_some_frames():
