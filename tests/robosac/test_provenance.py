@@ -71,11 +71,14 @@ def test_the_answer_is_the_judged_boxes_best_first_with_their_support():
 
 def test_the_answer_calls_the_ego_by_its_id():
     result = run(Scored(), Scripted([("a", "b")], (judged(("a", "b"), 0),), (judged(("a", "b"), 1, DENIED),)))
-    for answer, ego in ((result.answer(7, {}, {}), "ego"), (result.answer(7, {}, {}, "car-1"), "car-1")):
+    for answer, witnesses, deniers in (
+        (result.answer(7, {}, {}), ("a", "ego"), ("d", "ego")),
+        (result.answer(7, {}, {}, "car-1"), ("a", "car-1"), ("car-1", "d")),
+    ):
         (support,) = answer.support
-        assert (support.status, support.witnesses, support.deniers) == (Standing.CONFIRMED, (ego, "a"), ())
+        assert (support.status, support.witnesses, support.deniers) == (Standing.CONFIRMED, witnesses, ())
         (left_out,) = answer.contradicted
-        assert (left_out.status, left_out.witnesses, left_out.deniers) == (Standing.CONTRADICTED, ("c",), (ego, "d"))
+        assert (left_out.status, left_out.witnesses, left_out.deniers) == (Standing.CONTRADICTED, ("c",), deniers)
         np.testing.assert_allclose(left_out.box, [10, 5, 4, 2, 0, 0.78])
 
 
