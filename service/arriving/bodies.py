@@ -39,6 +39,9 @@ def check_type(request: Request, *types: str) -> None:
         raise Refused(Kind.UNSUPPORTED_MEDIA_TYPE, detail, "content-type")
     if "content-encoding" in request.headers:
         raise Refused(Kind.UNSUPPORTED_ENCODING, "bodies must not be compressed", "content-encoding")
+    if any(coding.lower() != "chunked" for coding in request.headers.getlist("transfer-encoding")):
+        detail = "bodies may come chunked, and not otherwise encoded"  # servers undo no other coding, and do not say so
+        raise Refused(Kind.UNSUPPORTED_ENCODING, detail, "transfer-encoding")
 
 
 async def read_json(request: Request, model: type[Model], context: Any = None) -> Model:

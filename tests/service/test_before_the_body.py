@@ -174,6 +174,7 @@ async def test_large_json_is_parsed_off_the_event_loop(length, on_the_loop):
         ({"Content-Type": "text/plain"}, "unsupported-media-type"),
         ({"Content-Type": "application/vnd.msgpack"}, "unsupported-media-type"),
         (JSON | {"Content-Encoding": "gzip"}, "unsupported-encoding"),
+        (JSON | {"Transfer-Encoding": "gzip, chunked"}, "unsupported-encoding"),
     ],
 )
 async def test_json_is_asked_for_by_name(served, path, headers, slug):
