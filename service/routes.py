@@ -245,11 +245,13 @@ async def post_frame(
     request: Request, caller: Ego, gateway: GatewayDep, accept: Annotated[str | None, Header()] = None
 ) -> Response:
     """A whole frame in one request by the ego."""
-    limit = gateway.frames.body_limit(caller, whole_frame=True)
-    gateway.frames.check_waiting(caller)
-    with (room := _room(gateway, caller)).holding(expected_bytes(request, limit)):
+    limit, arrived = gateway.frames.body_limit(caller, whole_frame=True), arrival_of(request.scope)
+    with (
+        gateway.frames.coming(caller, arrived) as expected,
+        (room := _room(gateway, caller)).holding(expected_bytes(request, limit)),
+    ):
         body = await _read_body(request, caller, gateway, limit)
-        answer = await gateway.frames.post_frame(caller, body, arrival_of(request.scope), room)
+        answer = await gateway.frames.post_frame(caller, body, arrived, room, expected)
     return _handed_over(answer, accept, gateway)
 
 

@@ -11,6 +11,7 @@ from starlette.datastructures import Headers
 from starlette.types import ASGIApp, Receive, Scope, Send
 
 from service import problems
+from service.arriving.arrival import arrival_of
 from service.arriving.paths import path_of
 from service.deciding.admission import Admission
 from service.errors import Kind, Refused
@@ -134,6 +135,6 @@ def capacity_check(admission: Admission, in_use: Callable[[str], LiveSession | N
         found = _FRAMES_PATH.fullmatch(path_of(scope)) if scope["method"] == "POST" else None
         live = in_use(found[1]) if found else None
         if found and live is not None:
-            admission.check(live.key, found[1], live.budget_s)
+            admission.check(live.key, found[1], arrival_of(scope) + live.budget_s)
 
     return check

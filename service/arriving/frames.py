@@ -8,6 +8,7 @@ import os
 import sys
 import time
 from collections.abc import AsyncIterator, Callable
+from contextlib import AbstractContextManager
 from dataclasses import dataclass, field
 from functools import partial
 from typing import TypeVar
@@ -31,6 +32,7 @@ from service.sessions.gathering import Contradiction, Received
 from service.sessions.live import Caller
 from service.sessions.room import Share
 from service.sessions.sessions import Sessions
+from service.turns import Work
 from service.watching.metrics import Metrics
 
 T = TypeVar("T")
@@ -80,17 +82,22 @@ class Frames:
         with self.admission.waiting(caller.record.session_id), room.holding(_expanded_by(asked, body)):
             return await self._answer(asked, gather=True)
 
-    async def post_frame(self, caller: Caller, body: bytes, arrived: float, room: Share) -> Answered:
+    async def post_frame(self, caller: Caller, body: bytes, arrived: float, room: Share, expected: Work) -> Answered:
         """A whole frame from the ego, whose request came then. A teammate whose part is malformed is left out, and the
-        frame is answered. ``room`` as for `post_message`.
+        frame is answered. ``room`` as for `post_message`, ``expected`` of `coming`.
         """
         frame, parts = await self._read(caller, body, read_frame)
+        expected.over = True
         for name in parts.malformed:
             self.metrics.refused(parts.unusable[name].reason.value)
         asked = Asked(caller, frame, parts.ego, arrived, parts.messages, parts.unusable, whole=True)
         asked.spent("receive", arrived)
         with self.admission.waiting(caller.record.session_id), room.holding(_expanded_by(asked, body)):
             return await self._answer(asked, gather=False)
+
+    def coming(self, caller: Caller, arrived: float) -> AbstractContextManager[Work]:
+        """As `service.deciding.admission.Admission.coming`, for an ego's frame whose request came then."""
+        return self.admission.coming(caller.live.key, caller.record.session_id, arrived + caller.live.budget_s)
 
     def check_waiting(self, caller: Caller) -> None:
         """Refuse one frame of an ego too many before its body is read. It counts only once it is read and checked, so

@@ -23,6 +23,10 @@ away (`service.turns.CREDIT_S`), more than what equals differ by.
 """
 SESSION_FRAMES = 3
 """Frames of one session in hand or waiting at a time."""
+COMING_S = 0.05
+"""For how long a frame that is to be read counts as if it were in hand: its link holds up one that takes longer."""
+DOUBT_S = 10.0
+"""For how long frames of a session do not count so, after one that did not come."""
 FIRST_GUESS_S = 0.02
 LATEST = 9
 """Measurements of which the median counts, so that one stall, or four, teach nothing."""
@@ -81,6 +85,10 @@ class Admission:
         self._turns = Turns() if turns is None else turns
         self._in_hand: set[Work] = set()
         self._waiting: Counter[str] = Counter()
+        self._coming: dict[str, tuple[float, Work]] = {}
+        """By session, with when it was let in."""
+        self._doubted: OrderedDict[str, float] = OrderedDict()
+        """Until when."""
         self._store, self._frame = Typical(0.0), Typical(FIRST_GUESS_S)
         self._of_session: OrderedDict[str, Needs] = OrderedDict()
 
@@ -93,8 +101,8 @@ class Admission:
         """Whether frames are in hand of others than this key; of anybody for None."""
         return any(work.key != key for work in self._in_hand)
 
-    def check(self, key: str, session_id: str, left_s: float) -> None:
-        """Refuse a frame that is not expected to be answered in the time that it has left.
+    def check(self, key: str, session_id: str, due: float) -> None:
+        """Refuse a whole frame, of which nothing is read yet, that is not expected to be answered in time.
 
         Raises
         ------
@@ -102,7 +110,38 @@ class Admission:
             With the kind ``overloaded``.
         """
         self.check_waiting(session_id)
-        self._check_time(self._work(key, session_id, time.perf_counter() + left_s), left_s)
+        self._check_time(self._work(key, session_id, due), due, self._to_come(key))
+
+    @contextmanager
+    def coming(self, key: str, session_id: str, due: float) -> Iterator[Work]:
+        """Let a whole frame be read for the length of a block, or refuse it as `check` does. Once it is there, its work
+        is to be marked as over.
+        """
+        self.check(key, session_id, due)
+        began, work = time.perf_counter(), self._work(key, session_id, due)
+        if session_id in self._coming or began < self._doubted.get(session_id, began):
+            yield work
+            return
+        self._coming[session_id] = began, work
+        try:
+            yield work
+        except Refused as refused:
+            work.over = work.over or refused.kind is Kind.OVERLOADED
+            raise
+        finally:
+            del self._coming[session_id]
+            if not work.over:
+                self._doubt(session_id)
+
+    def _doubt(self, session_id: str) -> None:
+        self._doubted[session_id] = time.perf_counter() + DOUBT_S
+        self._doubted.move_to_end(session_id)
+        if len(self._doubted) > SESSIONS_KNOWN:
+            self._doubted.popitem(last=False)
+
+    def _to_come(self, key: str) -> list[Work]:
+        since = time.perf_counter() - COMING_S
+        return [work for began, work in self._coming.values() if work.key == key and began > since]
 
     def check_waiting(self, session_id: str) -> None:
         """Refuse a frame of a session of which enough wait, as `check` does."""
@@ -141,7 +180,7 @@ class Admission:
             Of the detector's thread.
         """
         work = self._work(key, session_id, due - min(self._store.value, SHARE * budget_s))
-        self._check_time(work, due - time.perf_counter())
+        self._check_time(work, due)
         self._in_hand.add(work)
         try:
             yield work
@@ -186,9 +225,10 @@ class Admission:
     def _work(self, key: str, session_id: str, due: float) -> Work:
         return Work(key, session_id, due, self._cost(session_id))
 
-    def _check_time(self, new: Work, left_s: float) -> None:
-        works = [work for work in self._in_hand if not work.over]
-        end, others_s, is_after = time.perf_counter(), 0.0, False
+    def _check_time(self, new: Work, due: float, to_come: Iterable[Work] = ()) -> None:
+        works = [work for work in (*self._in_hand, *to_come) if not work.over]
+        now, others_s, is_after = time.perf_counter(), 0.0, False
+        end = now
         for work in self._turns.order([*works, new]):
             if work is new:
                 is_after = True
@@ -198,8 +238,8 @@ class Admission:
             else:
                 end += work.left_s
                 if end <= work.due < end + new.expected_s and self._turns.lead(new, work) < MARGIN_S:
-                    raise _overloaded("frames in hand would be answered late for it", end - time.perf_counter())
-        if others_s > max(0.0, SHARE * (left_s - new.expected_s - self._needs(new.session_id).rest.value)):
+                    raise _overloaded("frames in hand would be answered late for it", end - now)
+        if others_s > max(0.0, SHARE * (due - now - new.expected_s - self._needs(new.session_id).rest.value)):
             raise _overloaded("the gateway has more frames in hand than it can answer in time", others_s)
 
 

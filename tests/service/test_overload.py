@@ -1,12 +1,13 @@
 import asyncio
 import math
 import time
-from contextlib import ExitStack
+from contextlib import ExitStack, suppress
 
 import pytest
 
 from robosac import wire
-from service.deciding.admission import MARGIN_S, SESSION_FRAMES, Admission
+from service.arriving.doors import capacity_check
+from service.deciding.admission import COMING_S, DOUBT_S, MARGIN_S, SESSION_FRAMES, SESSIONS_KNOWN, Admission
 from service.engine import Engine
 from service.errors import Kind, Refused
 from service.jobs import Job
@@ -14,9 +15,13 @@ from service.turns import Turns, Work
 from tests.service.conftest import EGO, problem, serve
 
 
+def due(left_s):
+    return time.perf_counter() + left_s
+
+
 def taking(admission, key, session_id, left_s):
     """Take a frame on that has so much time left."""
-    return admission.frame(key, session_id, time.perf_counter() + left_s, left_s)
+    return admission.frame(key, session_id, due(left_s), left_s)
 
 
 def test_frames_are_admitted_as_long_as_they_can_be_answered_in_time():
@@ -60,7 +65,7 @@ def test_a_frame_that_cannot_be_in_time_anyway_is_admitted_if_nothing_else_is_in
     for _ in range(200):
         admission.learn("any", 1.0, 0.002, 0.001)
     with taking(admission, "", "slow", 0.1), pytest.raises(Refused):
-        admission.check("", "other", 0.1)
+        admission.check("", "other", due(0.1))
 
 
 async def test_no_ego_takes_the_share_of_the_others(served, good_frame, messages, benign):
@@ -90,6 +95,117 @@ async def test_beyond_capacity_a_frame_is_refused_before_it_is_read(served, good
         assert refused.headers["retry-after"]
         problem(refused, 503, "overloaded")
     assert (await served.post(session, "frames", good_frame(0))).status_code == 200
+
+
+async def test_a_frame_that_waited_long_to_be_seen_has_less_time():
+    async with serve() as served:
+        session = await served.open(latency_budget_ms=200.0, gather_ms=0)
+        admission = served.gateway.admission
+        for _ in range(200):
+            admission.learn("any", 0.02, 0.0, 0.0)
+        check = capacity_check(admission, served.gateway.sessions.in_use)
+        scope = {"type": "http", "method": "POST", "path": f"/v1/sessions/{session.session_id}/frames", "state": {}}
+        with taking(admission, "", "another", 10.0):
+            check(scope)
+            with pytest.raises(Refused, match="more frames in hand"):
+                check(scope | {"robosac.arrived": time.perf_counter() - 0.16})
+
+
+async def test_no_more_frames_are_read_at_a_time_than_can_be_answered(served, good_frame):
+    """All come at once, before any of them is in hand."""
+    sessions = [await served.open(latency_budget_ms=200.0, gather_ms=0) for _ in range(12)]
+    for _ in range(200):
+        served.gateway.admission.learn("any", 0.03, 0.0, 0.0)
+    body, asked_for = good_frame(0), 0
+
+    async def reading():
+        nonlocal asked_for
+        asked_for += 1
+        await asyncio.sleep(0.02)
+        yield body
+
+    answers = await asyncio.gather(*(served.post(session, "frames", reading()) for session in sessions))
+    refused = [answer for answer in answers if answer.status_code == 503]
+    assert 1 <= asked_for <= 3
+    assert len(refused) >= len(sessions) - asked_for
+    for answer in refused:
+        problem(answer, 503, "overloaded")
+    for session in sessions:
+        assert (await served.post(session, "frames", good_frame(1))).status_code == 200
+
+
+def of_80_ms():
+    """An admission that knows frames of so long."""
+    admission = Admission()
+    for _ in range(200):
+        admission.learn("any", 0.08, 0.0, 0.0)
+    return admission
+
+
+def test_a_frame_that_is_to_be_read_counts_for_others_of_its_key():
+    admission = of_80_ms()
+    with admission.coming("key", "one", due(0.2)) as expected:
+        admission.check("another", "its session", due(0.2))
+        with taking(admission, "key", "whose body is there", 0.2):
+            pass
+        for check in (admission.check, lambda *frame: admission.coming(*frame).__enter__()):
+            with pytest.raises(Refused, match="more frames in hand"):
+                check("key", "two", due(0.2))
+        expected.over = True
+        admission.check("key", "two", due(0.2))
+    admission.check("key", "two", due(0.2))
+
+
+def test_a_frame_that_is_to_be_read_counts_for_a_moment_and_once_a_session():
+    admission = of_80_ms()
+    with ExitStack() as coming:
+        for _ in range(50):
+            coming.enter_context(admission.coming("key", "one", due(10.0)))
+        admission.check("key", "two", due(0.3))  # .08 s of .22 that it can spare: of two there would be too much
+        with pytest.raises(Refused):
+            admission.check("key", "two", due(0.2))
+        time.sleep(COMING_S)
+        admission.check("key", "two", due(0.2))
+        coming.enter_context(admission.coming("key", "one", due(10.0)))  # still for the first of them
+        admission.check("key", "two", due(0.2))
+
+
+@pytest.mark.parametrize(
+    ("ended_by", "counts_again"),
+    [
+        (None, False),
+        (ConnectionResetError(), False),
+        (Refused(Kind.SLOW_BODY, "too slow"), False),
+        (Refused(Kind.OVERLOADED, "no room"), True),
+        ("it came", True),
+    ],
+)
+def test_who_is_waited_for_in_vain_is_not_waited_for_again(ended_by, counts_again, monkeypatch):
+    def counts():
+        with admission.coming("key", "one", due(0.2)):
+            try:
+                admission.check("key", "two", due(0.2))
+            except Refused:
+                return True
+            return False
+
+    admission = of_80_ms()
+    with suppress(ConnectionResetError, Refused), admission.coming("key", "one", due(0.2)) as expected:
+        expected.over = ended_by == "it came"
+        if isinstance(ended_by, Exception):
+            raise ended_by
+    assert counts() is counts_again
+    later = time.perf_counter() + DOUBT_S
+    monkeypatch.setattr(time, "perf_counter", lambda: later)
+    assert counts()
+
+
+def test_of_whom_was_waited_in_vain_for_not_all_are_remembered():
+    admission = Admission()
+    for number in range(SESSIONS_KNOWN + 10):
+        with admission.coming("key", f"session {number}", due(0.2)):
+            pass
+    assert len(admission._doubted) == SESSIONS_KNOWN
 
 
 async def test_a_slow_body_is_cut_off(messages, benign):
@@ -152,9 +268,9 @@ def test_a_short_frame_is_not_refused_for_a_long_one():
         admission.learn("long", 10.0, 0.002, 0.001)
         admission.learn("short", 0.05, 0.002, 0.001)
     with taking(admission, "key", "long", 60.0):
-        admission.check("key", "short", 0.06)
+        admission.check("key", "short", due(0.06))
     with taking(admission, "key", "short", 0.06):
-        admission.check("key", "long", 60.0)
+        admission.check("key", "long", due(60.0))
 
 
 def test_many_sessions_of_a_key_add_no_more_to_a_frame_of_another_than_one_of_them():
@@ -164,9 +280,9 @@ def test_many_sessions_of_a_key_add_no_more_to_a_frame_of_another_than_one_of_th
     with ExitStack() as taken:
         for number in range(12):
             taken.enter_context(taking(admission, "many", f"session {number}", 20.0))
-        admission.check("one", "its session", 0.16)
+        admission.check("one", "its session", due(0.16))
         with pytest.raises(Refused):
-            admission.check("many", "one more", 0.2)
+            admission.check("many", "one more", due(0.2))
 
 
 @pytest.mark.parametrize("led_by_s", [0.0, MARGIN_S + 0.01])
@@ -183,10 +299,10 @@ def test_a_frame_in_hand_is_made_late_only_by_who_had_much_less(led_by_s):
         admission.learn("long", 0.05, 0.0, 0.0)
     with taking(admission, "greedy", "long", 0.08):
         if led_by_s:
-            admission.check("modest", "short", 20.0)
+            admission.check("modest", "short", due(20.0))
         else:
             with pytest.raises(Refused, match="would be answered late for it"):
-                admission.check("modest", "short", 20.0)
+                admission.check("modest", "short", due(20.0))
 
 
 def test_who_had_less_than_the_others_is_admitted_beside_them():
@@ -201,10 +317,10 @@ def test_who_had_less_than_the_others_is_admitted_beside_them():
     for _ in range(200):
         admission.learn("any", 0.05, 0.002, 0.001)
     with taking(admission, "greedy", "one", 20.0):
-        admission.check("modest", "its session", 0.06)
-        admission.check("modest", "its session", 0.01)  # late by itself, and by nobody's fault
+        admission.check("modest", "its session", due(0.06))
+        admission.check("modest", "its session", due(0.01))  # late by itself, and by nobody's fault
     with taking(admission, "modest", "its session", 0.2), pytest.raises(Refused):
-        admission.check("greedy", "one", 0.1)
+        admission.check("greedy", "one", due(0.1))
 
 
 def test_a_frame_that_waits_for_its_teammates_costs_the_others_nothing():
@@ -212,11 +328,11 @@ def test_a_frame_that_waits_for_its_teammates_costs_the_others_nothing():
     with ExitStack() as taken:
         for number in range(100):
             taken.enter_context(admission.waiting(f"session {number}"))
-        admission.check("", "another", 0.05)
+        admission.check("", "another", due(0.05))
     for _ in range(SESSION_FRAMES):
         taken.enter_context(admission.waiting("greedy"))
     with pytest.raises(Refused):
-        admission.check("", "greedy", 20.0)
+        admission.check("", "greedy", due(20.0))
 
 
 def test_one_stall_teaches_nothing():
@@ -225,7 +341,7 @@ def test_one_stall_teaches_nothing():
         stalled = number == 15
         admission.learn("any", *((0.9, 5.0, 5.0) if stalled else (0.01, 0.002, 0.001)))
     with taking(admission, "", "one", 0.2):
-        admission.check("", "any", 0.1)
+        admission.check("", "any", due(0.1))
     with admission.frame("", "one", 100.0, 0.2) as work:
         assert work.due == pytest.approx(99.999)
 
