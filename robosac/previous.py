@@ -62,7 +62,8 @@ class PreviousAnswer:
         """What `as_json` gave; `ValueError` for anything else."""
         try:
             boxes = np.array(fields["boxes"], dtype=np.float64).reshape(-1, 6)
-            return cls(int(fields["frame"]), boxes, np.array(fields["motion"], dtype=np.float64).reshape(-1, 2))
+            motion = np.array(fields["motion"], dtype=np.float64).reshape(len(boxes), 2)
+            return cls(int(fields["frame"]), boxes, motion)
         except (KeyError, TypeError, ValueError) as error:
             raise ValueError(f"no previous answer: {type(error).__name__}: {error}") from error
 

@@ -12,6 +12,7 @@ import torch
 import typer
 from rich.console import Console
 from rich.table import Table
+from rich.text import Text
 
 from robosac import attacks
 from robosac.attacks import CAMPAIGN_HELP, AttackError
@@ -84,7 +85,7 @@ def run(  # the options of a command line
 
 def _print(console: Console, report: BoundsReport, attack: str, attackers: int) -> None:
     table = Table(
-        title=f"{report.frames} test frames, {attackers} attacker(s): {attack}",
+        title=Text(f"{report.frames} test frames, {attackers} attacker(s): {attack}"),
         title_justify="left",
     )
     for heading in ("perception", "AP50", "AP70", "steps", "success", "infiltrated"):

@@ -17,6 +17,7 @@ from robosac.defenses import Defense, Rejection, build, read_settings
 from robosac.defenses.registry import Kinds
 from robosac.detectors import Detector, Message
 from robosac.detectors.base import for_role
+from robosac.recording.content import Before
 from robosac.recording.reading import RecordedFrame, RecordedSession, RecordingError
 from robosac.scenes import SceneError, View, encoded
 from robosac.session import Session
@@ -65,8 +66,7 @@ def replay(
         decided = frame.decided
         file = frame.file.path if as_it_was else None  # what a frame goes on from is in its own file
         if as_it_was and decided.before is not None:
-            saved = {"state": decided.before.state, "previous": decided.before.previous}
-            going[file] = Session(detector, decided.team, chosen, saved), decided.team
+            going[file] = _went_on_from(frame, decided.before, detector, chosen), decided.team
         if file not in going:
             going[file] = Session(detector, decided.team, chosen), decided.team
         running, team = going[file]
@@ -80,6 +80,14 @@ def replay(
         running.remember(result)
         answer = result.answer(frame.number, _left_out(frame), {}, session.opening.ego_id)
         yield Replayed(frame, answer, tuple(differing(answer, frame.answer)))
+
+
+def _went_on_from(frame: RecordedFrame, before: Before, detector: Detector, defense: Defense) -> Session:
+    saved = {"state": before.state, "previous": before.previous}
+    try:
+        return Session(detector, frame.decided.team, defense, saved)
+    except ValueError as error:
+        raise RecordingError(f"{frame.file.path}, frame {frame.number}: before.previous: {error}") from error
 
 
 def differing(made: FrameAnswer, recorded: FrameAnswer) -> Iterator[str]:

@@ -8,6 +8,7 @@ import pytest
 
 from clients.errors import GatewayUnavailable
 from robosac import wire
+from service import routes
 from service.keeping.patience import GRACE_S
 from tests.service.conftest import EGO, TEAM, problem, serve
 
@@ -176,6 +177,26 @@ async def test_an_answer_that_waited_for_the_store_until_it_was_late_says_so(on_
     records = [r for r in await on_disk.ego(session).audit() if r["event"] == "frame_answered"]
     told = {record["frame"]: (record["deadline_met"], record.get("late", [])) for record in records}
     assert told == {0: (True, []), 1: (True, []), 3: (True, [1]), 4: (True, [])}
+
+
+async def test_an_answer_that_took_until_it_was_late_to_be_written_out_says_so(on_disk, good_frame, monkeypatch):
+    session = await on_disk.open(latency_budget_ms=BUDGET_MS, gather_ms=0)
+    written_out = routes._negotiated
+
+    def slowly(*answer):
+        response = written_out(*answer)
+        time.sleep(BUDGET_MS / 1e3)
+        return response
+
+    with monkeypatch.context() as slow:
+        slow.setattr(routes, "_negotiated", slowly)
+        answer = (await on_disk.post(session, "frames", good_frame(0))).json()
+    assert not answer["deadline_met"]
+    assert answer["timings_ms"]["total"] > BUDGET_MS
+    await asyncio.sleep(0.1)  # what comes right after the event loop stood still may have come before
+    assert (await on_disk.post(session, "frames", good_frame(1))).json()["deadline_met"]
+    records = [record for record in await on_disk.ego(session).audit() if record["event"] == "frame_answered"]
+    assert [(record["deadline_met"], record.get("late", [])) for record in records] == [(True, []), (True, [0])]
 
 
 async def test_the_end_of_a_session_tells_of_its_last_late_frame(on_disk, good_frame):

@@ -51,6 +51,26 @@ def test_a_recording_that_was_changed_does_not(session, detector):
     assert only.differing == ("boxes",)
 
 
+@pytest.mark.parametrize(
+    "previous",
+    [{}, {"frame": 0, "boxes": [[1, 2]], "motion": []}, {"frame": 0, "boxes": [[0, 0, 4, 2, 0, 0.9]], "motion": []}],
+)
+def test_what_was_remembered_and_cannot_be_is_told_with_its_frame(session, detector, previous):
+    frame = session.frames[0]
+    before = frame.decided.before.model_copy(update={"previous": previous})
+    changed = dataclasses.replace(frame, decided=frame.decided.model_copy(update={"before": before}))
+    with pytest.raises(RecordingError, match=r"one\.mcap, frame 0: before\.previous: no previous answer"):
+        list(replay(dataclasses.replace(session, frames=[changed]), detector))
+
+
+def test_a_state_that_no_defence_left_makes_another_answer(session, detector):
+    frame = session.frames[0]
+    before = frame.decided.before.model_copy(update={"state": {"log_ratios": "none"}})
+    changed = dataclasses.replace(frame, decided=frame.decided.model_copy(update={"before": before}))
+    (only,) = replay(dataclasses.replace(session, frames=[changed]), detector)
+    assert only.differing
+
+
 def test_another_defence_decides_otherwise(session, detector):
     undefended = build(read_settings({"kind": "none"}), None)
     compared = Compared()
