@@ -50,8 +50,12 @@ class Door:
 
 
 def check_head(scope: Scope) -> None:
-    """Refuse an absurdly long path, query or headers, since all that looks at them costs time."""
+    """Refuse an absurdly long path, query or headers, since all that looks at them costs time; and two names of the
+    gateway, of which a proxy may have looked at the other one (RFC 9112, section 3.2).
+    """
     headers = scope["headers"]
+    if sum(name == b"host" for name, _ in headers) > 1:
+        raise Refused(Kind.FOREIGN_HOST, "a request names its host once", "Host")
     if len(scope["path"]) + len(scope["query_string"]) > TARGET_BYTES:
         raise Refused(Kind.URI_TOO_LONG, f"a path and its query may have {TARGET_BYTES} bytes")
     if len(headers) > HEADERS or sum(len(name) + len(value) for name, value in headers) > HEADER_BYTES:

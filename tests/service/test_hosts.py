@@ -52,6 +52,14 @@ async def test_two_names_or_none_are_no_name(local):
         assert response.status_code == 421
 
 
+async def test_a_request_names_its_host_once_where_keys_are_set_too():
+    async with serve(allowed_hosts="", api_keys=KEY) as served:
+        request = httpx.Request("GET", "http://localhost/readyz")
+        for hosts, status in ((["localhost"], 200), (["any.example"], 200), (["localhost", "any.example"], 421)):
+            request.headers = httpx.Headers([("Host", host) for host in hosts])
+            assert (await served.http._transport.handle_async_request(request)).status_code == status
+
+
 async def test_pages_of_other_hosts_are_refused(local):
     for origin in ("null", "", "http://[", *(f"http://{host}" for host in FOREIGN if host[-1:] != "/")):
         refused = await opened(local, Host="localhost:8000", Origin=origin)
