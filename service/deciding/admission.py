@@ -7,6 +7,7 @@ import time
 from collections import Counter, OrderedDict, deque
 from collections.abc import Iterable, Iterator
 from contextlib import contextmanager
+from itertools import takewhile
 from typing import Protocol
 
 from robosac.deadline import Deadline
@@ -23,6 +24,9 @@ away (`service.turns.CREDIT_S`), more than what equals differ by.
 """
 SESSION_FRAMES = 3
 """Frames of one session in hand or waiting at a time."""
+KEY_FRAMES = 64
+"""Those of one API key, that are to be read included: to find out whose turn it is takes the longer the more there are.
+"""
 COMING_S = 0.05
 """For how long a frame that is to be read counts as if it were in hand: its link holds up one that takes longer."""
 DOUBT_S = 10.0
@@ -141,7 +145,8 @@ class Admission:
 
     def _to_come(self, key: str) -> list[Work]:
         since = time.perf_counter() - COMING_S
-        return [work for began, work in self._coming.values() if work.key == key and began > since]
+        lately = takewhile(lambda came: came[0] > since, reversed(self._coming.values()))
+        return [work for _, work in lately if work.key == key]
 
     def check_waiting(self, session_id: str) -> None:
         """Refuse a frame of a session of which enough wait, as `check` does."""
@@ -227,6 +232,8 @@ class Admission:
 
     def _check_time(self, new: Work, due: float, to_come: Iterable[Work] = ()) -> None:
         works = [work for work in (*self._in_hand, *to_come) if not work.over]
+        if sum(work.key == new.key for work in works) >= KEY_FRAMES:
+            raise _overloaded(f"{KEY_FRAMES} frames of this API key are in hand", new.expected_s)
         now, others_s, is_after = time.perf_counter(), 0.0, False
         end = now
         for work in self._turns.order([*works, new]):

@@ -264,8 +264,15 @@ class Store:
         query = select(kept_messages.c.body).where(*of_frame)
         return await self._database.read(lambda connection: connection.execute(query).scalar())
 
-    async def end(self, session_id: str, event: SessionEnded, unused_since: float | None = None) -> None:
-        """End a session; its log stays until it is purged. What nobody reads any more is forgotten.
+    async def end(
+        self,
+        session_id: str,
+        event: SessionEnded,
+        unused_since: float | None = None,
+        *checks: Callable[[SessionRecord], None],
+    ) -> None:
+        """End a session, unless one of the ``checks`` of it as it is then raises. Its log stays until it is purged;
+        what nobody reads any more is forgotten.
 
         Raises
         ------
@@ -273,12 +280,17 @@ class Store:
             If it was used since then (Unix time), where that is given.
         """
 
+        def change(now: SessionRecord) -> Mapping[str, Any]:
+            for check in checks:
+                check(now)
+            return {"ended_at": event.time, "state": {}}
+
         def keep(connection: Connection) -> None:
             connection.execute(ADD_REST, {"this": session_id})
             connection.execute(once.forget_proofs(session_id))
 
         first = partial(check_unused, session_id=session_id, since=unused_since)
-        await self._append(session_id, event, lambda _: {"ended_at": event.time, "state": {}}, keep, first=first)
+        await self._append(session_id, event, change, keep, first=first)
         self._sealing.forget(session_id)
 
     async def unused_since(self, moment: float) -> list[str]:

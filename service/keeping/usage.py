@@ -10,7 +10,7 @@ from sqlalchemy import Connection, Select, func, select
 
 from service.errors import Kind, Refused
 from service.keeping.rows import ENDED, IN_ROW, OPEN
-from service.keeping.tables import sessions
+from service.keeping.tables import kept_messages, sessions
 
 _LOCK = 0x0D5EAD
 """First number of the advisory locks of keys in PostgreSQL, chosen at random."""
@@ -39,10 +39,14 @@ def check_room(connection: Connection, key_id: str, most: int) -> None:
 
 
 def of_keys(connection: Connection) -> Counter[str]:
-    """Bytes that are kept of the sessions of each API key, open or ended."""
+    """Bytes that are kept of the sessions of each API key, open or ended; of open ones the messages kept now, too."""
     kept: Counter[str] = Counter()
-    nbytes = sessions.c.kept_bytes
-    for some, kept_of in ((OPEN, nbytes + IN_ROW), (ENDED, nbytes)):  # many may have ended: an index alone sums those
-        query = select(sessions.c.key_id, func.sum(kept_of)).where(some).group_by(sessions.c.key_id)
+    nbytes, messages = sessions.c.kept_bytes, func.length(kept_messages.c.body)
+    for some, kept_of, of in (
+        (OPEN, nbytes + IN_ROW, sessions),
+        (OPEN, messages, sessions.join(kept_messages, kept_messages.c.session_id == sessions.c.session_id)),
+        (ENDED, nbytes, sessions),  # of whom there may be many: an index alone sums those
+    ):
+        query = select(sessions.c.key_id, func.sum(kept_of)).select_from(of).where(some).group_by(sessions.c.key_id)
         kept.update({key_id: int(total) for key_id, total in connection.execute(query)})
     return kept

@@ -167,7 +167,7 @@ class Sessions:
         async with caller.live.lock:
             with contextlib.suppress(SessionOver):  # somebody else has just ended it
                 caller.check_token(await self.current(caller))
-            await self._end(caller.record.session_id, "closed")
+            await self._end(caller.record.session_id, "closed", None, caller.check_token)
         record = await self.store.get(caller.record.session_id)
         if record is None:
             raise SessionOver
@@ -304,11 +304,17 @@ class Sessions:
         if record is None or record.ended_at is not None or moved:
             self._forget(session_id)
 
-    async def _end(self, session_id: str, why: str, unused_since: float | None = None) -> None:
+    async def _end(
+        self,
+        session_id: str,
+        why: str,
+        unused_since: float | None = None,
+        *checks: Callable[[SessionRecord], None],
+    ) -> None:
         live = self._live.get(session_id)
         ended = SessionEnded(why=why, late=() if live is None else tuple(live.late))
         with contextlib.suppress(SessionOver):
-            await self.store.end(session_id, ended, unused_since)
+            await self.store.end(session_id, ended, unused_since, *checks)
             logger.info("session ended", session_id=session_id, why=why)
         self._forget(session_id)  # not before: if the store fails, the session goes on with the messages that wait
         self.on_end(session_id)

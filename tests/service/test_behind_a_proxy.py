@@ -74,6 +74,14 @@ async def test_sessions_go_on_while_one_process_is_restarted_and_the_other_is_ki
             for path in ("/metrics", "/%6detrics", "/metric%73?a=b"):  # which are all one to a gateway
                 refused = await client._http.get(path)
                 assert refused.status_code == 404, path
+            session = await client.open_session("ego", ["rsu"])
+            token, statuses = session.ego_token, []
+            for number in range(18):  # one process counts them, however their path is written
+                path = f"/v1/{('sessions', '%73essions')[number % 2]}/{session.session_id}/token"
+                answer = await client._http.post(path, headers={"Authorization": f"Bearer {token}"})
+                statuses.append(answer.status_code)
+                token = answer.json().get("token", token)
+            assert statuses == [201] * 16 + [429] * 2
             traffic = Traffic(gateways.client, prepare(2), rate_hz=3.0, budget_ms=20_000.0)
             await traffic.open(4, DEFENSE)
             traffic.begin("both")

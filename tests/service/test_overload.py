@@ -7,7 +7,15 @@ import pytest
 
 from robosac import wire
 from service.arriving.doors import capacity_check
-from service.deciding.admission import COMING_S, DOUBT_S, MARGIN_S, SESSION_FRAMES, SESSIONS_KNOWN, Admission
+from service.deciding.admission import (
+    COMING_S,
+    DOUBT_S,
+    KEY_FRAMES,
+    MARGIN_S,
+    SESSION_FRAMES,
+    SESSIONS_KNOWN,
+    Admission,
+)
 from service.engine import Engine
 from service.errors import Kind, Refused
 from service.jobs import Job
@@ -134,6 +142,35 @@ async def test_no_more_frames_are_read_at_a_time_than_can_be_answered(served, go
         assert len(refused) >= len(sessions) - asked_for
         for answer in refused:
             problem(answer, 503, "overloaded")
+
+
+def test_a_body_that_takes_long_hides_none_that_comes_after_it():
+    admission = of_80_ms()
+    with admission.coming("key", "slow", due(10.0)):
+        time.sleep(COMING_S)
+        with admission.coming("key", "one", due(0.2)), pytest.raises(Refused):
+            admission.check("key", "two", due(0.2))
+
+
+def test_a_key_has_so_many_frames_in_hand_and_no_more():
+    """However much time they have: whoever sends next pays for finding out whose turn it is."""
+    admission = Admission()
+    with ExitStack() as taken:
+        for number in range(KEY_FRAMES - 2):
+            taken.enter_context(taking(admission, "many", f"session {number}", 1e4))
+        for number in (1, 2):
+            taken.enter_context(admission.coming("many", f"that comes {number}", due(1e4)))
+        for _ in range(3):
+            with pytest.raises(Refused, match=f"{KEY_FRAMES} frames of this API key") as refused:
+                taken.enter_context(admission.coming("many", "one more", due(1e4)))
+            assert refused.value.kind is Kind.OVERLOADED
+        admission.check("another", "its session", due(1e4))
+        with taking(admission, "many", "that comes 1", 1e4), taking(admission, "many", "that comes 2", 1e4):
+            with pytest.raises(Refused), taking(admission, "many", "one more", 1e4):
+                pass
+            with taking(admission, "another", "its session", 1e4):
+                pass
+    admission.check("many", "one more", due(1e4))
 
 
 def of_80_ms():

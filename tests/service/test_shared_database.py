@@ -55,6 +55,23 @@ async def test_a_gateway_goes_on_where_the_one_before_was(url, messages, benign)
         await ego.close()
 
 
+async def test_a_token_that_another_process_renewed_ends_no_session(two):
+    one, other = two
+    session = await one.open()
+    path = f"/v1/sessions/{session.session_id}"
+    old = {"Authorization": f"Bearer {session.ego_token}"}
+    async with one.gateway.sessions.in_use(session.session_id).lock:  # as that of a frame in hand
+        ending = asyncio.create_task(one.http.delete(path, headers=old))
+        await asyncio.sleep(0.2)
+        renewed = await other.http.post(f"{path}/token", headers=old)
+        assert renewed.status_code == 201
+    problem(await ending, 401, "unauthenticated")
+    new = {"Authorization": f"Bearer {renewed.json()['token']}"}
+    for served in two:
+        assert (await served.http.get(path, headers=new)).status_code == 200
+    assert (await one.http.delete(path, headers=new)).status_code == 204
+
+
 async def test_two_gateways_take_turns(two, messages, benign):
     one, other = two
     session = await one.open()

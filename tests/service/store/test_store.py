@@ -332,11 +332,15 @@ async def test_it_is_known_what_is_kept_for_each_key(store):
     for frame, messages in enumerate([b"m" * 1000, b"m" * 3000]):
         seed, record = f"{frame:064x}", await store.get(ended)
         await store.decide(record, a_decision(frame), seed, messages, keep_frames=1)
+    open_ones = (await store.kept_bytes())["a"]
+    memory = row_bytes(await store.get(ended))
     await store.end(ended, THE_END)
     lines = {sid: sum(len(line.encode()) for line in await store.audit(sid, 0)) for sid in (open_one, ended, of_other)}
     rows = {sid: row_bytes(await store.get(sid)) for sid in lines}
     kept = {sid: lines[sid] + rows[sid] for sid in lines}
     assert await store.kept_bytes() == {"a": kept[open_one] + kept[ended] + 3000, "b": kept[of_other]}
+    (*_, last) = await store.audit(ended, 0)
+    assert open_ones == kept[open_one] + lines[ended] - len(last.encode()) + memory + 3000  # before it was ended
     assert (await store.get(open_one)).kept_bytes == lines[open_one]
     await store.purge(time.time() + 1)
     assert await store.kept_bytes() == {"a": kept[open_one], "b": kept[of_other]}
