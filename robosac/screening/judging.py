@@ -44,7 +44,9 @@ NEAR = 0.9
 ALIKE = 0.8
 """The same for the maps of two vehicles; honest ones in traffic reach .6."""
 NAMED_AFTER = 3
-"""Refused messages from which on their sender is named as an attacker, while it sends such."""
+"""Refused messages from which on their sender is named as an attacker, while it sends such; but for those that it sent
+itself less than `robosac.screening.past.KEPT_FRAMES` ago.
+"""
 MOST_TOLD = 16
 """Likenesses of a frame that are told, the greatest first."""
 
@@ -123,12 +125,16 @@ class Screening:
         bound = self._repeating(differs)
         silent = {name: past for name, past in memory.items() if name not in seen and recent(past, frame)}
         known = {**pasts, **{name: Past.from_json(past) for name, past in silent.items()}}
-        refused, earlier = {}, _earlier(known, {one.digest for one in prints.values()})
+        refused, blamed, earlier = {}, set[str](), _earlier(known, {one.digest for one in prints.values()})
         for name, one in seen.items():
             if name != EGO and (why := self._implausible(one) or _copied(name, seen, earlier) or _repeated(one, bound)):
-                often = one.past.refused + 1 >= NAMED_AFTER
-                refused[name] = replace(why, distrust=Distrust.NAMED) if often else why
-        kept = {name: one.remembered(bound, name in refused, name == EGO) for name, one in seen.items()}
+                refused[name] = why
+                if why.reason is Reason.REPEATED and one.has_nothing_new:
+                    continue
+                blamed.add(name)
+                if one.past.refused + 1 >= NAMED_AFTER:
+                    refused[name] = replace(why, distrust=Distrust.NAMED)
+        kept = {name: one.remembered(bound, name in blamed, name == EGO) for name, one in seen.items()}
         return Screened(refused, _alike(seen), {**silent, **kept})
 
     def _implausible(self, seen: _Seen) -> Rejection | None:
@@ -169,6 +175,11 @@ class _Seen:
         """The frame in which the vehicle sent this very message first."""
         return min((each.first for each in self.past.sent if each.digest == self.print.digest), default=self.frame)
 
+    @property
+    def has_nothing_new(self) -> bool:
+        """Whether the vehicle sent this very message not long ago: it may repeat it until it has another one."""
+        return self.first_sent != self.frame and is_kept(self.first_sent, self.frame)
+
     def sent_in(self, frame: int) -> bool:
         """Whether it is known that the vehicle sent something in a frame before."""
         return any(frame in (each.first, each.last) for each in self.past.sent)
@@ -189,7 +200,7 @@ class _Seen:
         """The same of its latest map whose anchor was from elsewhere."""
         return self.past.differs if self.differs is None else round(self.differs, 6)
 
-    def remembered(self, bound: float, refused: bool, is_ego: bool) -> dict[str, Any]:
+    def remembered(self, bound: float, blamed: bool, is_ego: bool) -> dict[str, Any]:
         digest, again = self.print.digest, False
         sent = []
         for each in self.past.sent:
@@ -201,7 +212,7 @@ class _Seen:
         if not again and not self.print.blank:
             sent.append(Sent(digest, self.frame, self.frame, self.place))
         differs = self.differing if is_ego else None
-        return Past(tuple(sent), self._anchor(bound), self.past.refused + refused, differs).as_json()
+        return Past(tuple(sent), self._anchor(bound), self.past.refused + blamed, differs).as_json()
 
     def _anchor(self, bound: float) -> Anchor:
         """The one of before while it is recent and not far; one that repeats itself is kept, to be found out again."""

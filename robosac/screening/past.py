@@ -41,7 +41,7 @@ class Past:
     sent: tuple[Sent, ...] = ()
     anchor: Anchor | None = None
     refused: int = 0
-    """Messages that were refused."""
+    """Messages that were refused, and count for its being named."""
     differs: float | None = None
     """Of the ego: 1 less the correlation of its latest two maps from different places; None before there are such."""
 

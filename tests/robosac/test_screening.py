@@ -5,7 +5,7 @@ import json
 import numpy as np
 import pytest
 
-from robosac.answers import Reason
+from robosac.answers import Distrust, Reason
 from robosac.boxes import pose_matrix
 from robosac.defenses import EGO
 from robosac.detectors import Message
@@ -81,6 +81,29 @@ def test_the_same_map_from_elsewhere_is_repeated(screening, draw):
     assert [reason for reason, _ in found[2:]] == [Reason.REPEATED] * 7
     assert found[2][1] == {"of_frame": 0, "moved_m": 4.0, "correlation": 1.0}
     assert found[8][1]["moved_m"] == 16.0
+
+
+@pytest.mark.parametrize(("every", "named_in"), [(100, [7, 8, 9, 10, 11]), (KEPT_FRAMES, []), (KEPT_FRAMES + 2, [])])
+def test_who_has_nothing_new_for_a_moment_is_left_out_and_not_named(draw, every, named_in):
+    play, maps = Frames(draw), [draw() for _ in range(12)]
+    found = [play(a=at(4.0 * frame, maps[frame // every])).refused.get("a") for frame in range(12)]
+    assert [frame for frame, why in enumerate(found) if why is not None] == [f for f in range(12) if f % every]
+    assert [frame for frame, why in enumerate(found) if why and why.distrust is Distrust.NAMED] == named_in
+
+
+def test_who_sends_a_near_repetition_is_named_whenever_it_sent_the_map_first(draw, rng):
+    play, frozen = Frames(draw), draw()
+    found = [play(a=at(4.0 * frame, noisy(frozen, 0.02, rng))).refused.get("a") for frame in range(9)]
+    named = [frame for frame, why in enumerate(found) if why and why.distrust is Distrust.NAMED]
+    assert named[0] == 3
+
+
+def test_who_sends_a_copy_again_is_named(draw):
+    play, copied = Frames(draw), draw()
+    play(a=at(0.0, draw()), b=at(9.0, copied))
+    found = [play(a=at(4.0 * frame, copied), b=at(9.0, draw())).refused["a"] for frame in range(1, 5)]
+    assert {why.reason for why in found} == {Reason.COPIED}
+    assert [why.distrust is Distrust.NAMED for why in found] == [False, False, True, True]
 
 
 def test_a_slow_vehicle_that_repeats_itself_is_found_once_it_is_elsewhere(draw):

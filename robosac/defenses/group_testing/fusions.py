@@ -13,8 +13,6 @@ from robosac.defenses.group_testing.geometry import WITNESS_SCORE, followed
 from robosac.defenses.group_testing.hearing import Hearing
 from robosac.defenses.group_testing.knowledge import Knowledge
 from robosac.defenses.group_testing.lateness import (
-    LATER,
-    LATEST,
     TURNING,
     WHILE_S,
     Place,
@@ -244,5 +242,4 @@ class Fusions:
             centres, moved = np.vstack([centres, np.zeros(2)]), np.vstack([moved, ego @ turn])
         frames = WHILE_S / self.known.period_s
         turned = frames * self._turned(sender)
-        latest = LATER if memory.lies.was_late(sender) else LATEST
-        return late(self._testimony, sender, frames * (own @ turn), centres, frames * moved, turned, latest)
+        return late(self._testimony, sender, frames * (own @ turn), centres, frames * moved, turned)

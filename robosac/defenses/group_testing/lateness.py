@@ -22,8 +22,8 @@ WHILE_S = 0.2
 DELAYS = np.array([0.0, 0.5, 1.0, 1.5, 2.0, 2.5, 3.0, 3.5, 4.0, 4.5, 5.0, 6.0])
 """How late a message may be."""
 _A_WHILE = DELAYS.tolist().index(1.0)
-LATEST, LATER = 2.5, 4.0
-"""What is later than half a second is no late message, but a replay; or than .8 s, of whoever was late lately."""
+LATEST = 4.0
+"""What is later than .8 s is no late message, but a replay."""
 MOVED_M = 1.0
 """Vehicles tell how late a message is that it would show so far off if it were `WHILE_S` late."""
 FITS = 6.0
@@ -53,7 +53,6 @@ def late(
     centres: FloatArray,
     motions: FloatArray,
     turned: float = 0.0,
-    latest: float = LATEST,
 ) -> bool:
     """Whether a sender's message is late.
 
@@ -67,11 +66,9 @@ def late(
         Where vehicles are that others see, and how far each moves in that time.
     turned : float
         How far the sender turns in it, radians.
-    latest : float
-        What is later is not late.
     """
     said_by, delays = testimony.of({sender}), DELAYS[:, None, None]
-    if any(_fits(said_by, centres, centres + delays * off, latest) for off in (moved - motions, -motions)):
+    if any(_fits(said_by, centres, centres + delays * off) for off in (moved - motions, -motions)):
         return True
     if abs(turned) < TURNING:
         return False
@@ -79,10 +76,10 @@ def late(
     about = centres - origin + delays * (moved - motions)
     c, s = np.cos(delays * turned), np.sin(delays * turned)
     x, y = about[..., :1], about[..., 1:]
-    return _fits(said_by, centres, origin + np.concatenate([c * x - s * y, s * x + c * y], axis=2), latest)
+    return _fits(said_by, centres, origin + np.concatenate([c * x - s * y, s * x + c * y], axis=2))
 
 
-def _fits(testimony: Testimony, centres: FloatArray, places: FloatArray, latest: float) -> bool:
+def _fits(testimony: Testimony, centres: FloatArray, places: FloatArray) -> bool:
     """Whether one sender's testimony fits a late message best, which shows vehicles in ``places`` (delays, n, 2)."""
     telling = np.hypot(*(places[_A_WHILE] - centres).T) >= MOVED_M
     places = places[:, telling]
@@ -92,7 +89,7 @@ def _fits(testimony: Testimony, centres: FloatArray, places: FloatArray, latest:
     gain = said[best] - said[0]
     better, worse = int((gain >= CLEAR).sum()), int((gain <= -CLEAR).sum())
     enough = bool(sums[best] >= FITS and gain.sum() >= FITS and better >= max(FEWEST, 2 * worse))
-    return enough and bool(DELAYS[best] <= latest)
+    return enough and bool(DELAYS[best] <= LATEST)
 
 
 def senders(testimony: Testimony, pose: FloatArray) -> dict[str, Place]:

@@ -187,10 +187,6 @@ class Lies:
         """Whether it seemed to lie lately, by more than one word against its own."""
         return any(kind != "alone" for kind in self.levels.get(teammate, ()))
 
-    def was_late(self, teammate: str) -> bool:
-        """Whether its messages were late lately, or what they told counted so."""
-        return "late" in self.levels.get(teammate, ())
-
     def guilt(self, teammate: str, frame: int) -> float:
         """The same of the kinds that somebody is named for: at 1 it is. It takes more words of which nothing came for
         long: a sensor may be mounted as no other is.

@@ -12,8 +12,6 @@ from robosac.defenses.group_testing.findings import Findings
 from robosac.defenses.group_testing.geometry import followed
 from robosac.defenses.group_testing.knowledge import Knowledge
 from robosac.defenses.group_testing.lateness import (
-    LATER,
-    LATEST,
     SENT_FRAMES,
     late,
     motions,
@@ -43,22 +41,22 @@ def shown_at(places, true=PLACES):
     return wrong + [(*place, YES) for place in places]
 
 
-def told(places, moved=STILL, centres=PLACES, speeds=SPEED, latest=LATEST):
+def told(places, moved=STILL, centres=PLACES, speeds=SPEED):
     """Whether a message is late that shows vehicles in these places."""
     heard = saying({EGO: [], "a": [], "d": shown_at(places, centres if len(centres) else PLACES)})
-    return late(heard, "d", np.asarray(moved), centres, np.broadcast_to(speeds, centres.shape), latest=latest)
+    return late(heard, "d", np.asarray(moved), centres, np.broadcast_to(speeds, centres.shape))
 
 
-@pytest.mark.parametrize(("frames", "is_late"), [(0, False), (1, True), (2, True), (2.5, True), (3, False), (5, False)])
+@pytest.mark.parametrize(("frames", "is_late"), [(0, False), (1, True), (2.5, True), (3, True), (5, False)])
 @pytest.mark.parametrize("moved", [(0.0, 0.0), (-2.0, 0.0), (0.0, 3.0)])
 def test_a_message_is_late_if_it_fits_best_where_vehicles_were(frames, is_late, moved):
     """With the pose of now, what it shows has moved along with its sender."""
     assert told(PLACES + frames * (moved - SPEED), moved) == is_late
 
 
-@pytest.mark.parametrize(("frames", "is_late"), [(3, True), (4, True), (4.5, False), (5, False)])
-def test_whoever_was_late_may_be_later(frames, is_late):
-    assert told(PLACES - frames * SPEED, latest=LATER) == is_late
+@pytest.mark.parametrize(("frames", "is_late"), [(3.5, True), (4, True), (4.5, False)])
+def test_a_message_is_late_up_to_a_bound(frames, is_late):
+    assert told(PLACES - frames * SPEED) == is_late
 
 
 @pytest.mark.parametrize(("frames", "is_late"), [(1, True), (2, True), (5, False)])
@@ -161,12 +159,13 @@ def test_who_is_late_is_not_named_and_who_replays_is(delay, names, shown, every)
     [
         (lambda frame: min(frame // 3, 4), set()),  # a clock that goes slower
         (lambda frame: frame % 5, set()),  # one message in five frames, sent again and again
-        (lambda frame: 4 * (frame >= 4), {LIAR}),
+        (lambda frame: 4 * (frame >= 4), set()),
+        (lambda frame: 5 * (frame >= 5), {LIAR}),
         (lambda frame: min(frame // 2, 6), {LIAR}),
     ],
-    ids=["slower", "again", "at once", "too late"],
+    ids=["slower", "again", "at once", "at once too late", "too late"],
 )
-def test_who_gets_later_and_later_is_not_named_up_to_a_bound(delay, names):
+def test_who_is_late_is_not_named_up_to_a_bound(delay, names):
     found = drive(16, delay, shown=True)
     assert {name for decision in found for name in decision.named} == names
 
