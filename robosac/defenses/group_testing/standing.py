@@ -12,7 +12,7 @@ from robosac.answers import Standing, Support
 from robosac.boxes import BoolArray, FloatArray, IntArray, pairwise_iou
 from robosac.defenses.group_testing.claims import DENIES, LEANS, NEARLY_SUPPORTS, SUPPORTS, two_witnesses
 from robosac.defenses.group_testing.differences import AWAY_EFFECT, carried, gone, gone_alone
-from robosac.defenses.group_testing.objects import SHOWN_SCORE, Shown
+from robosac.defenses.group_testing.objects import IN_PLACE, SHOWN_SCORE, Shown
 from robosac.defenses.protocol import Hypothesis, Judged, JudgedBox
 
 SAME_M = 2.5
@@ -31,7 +31,7 @@ def judge(answer: Shown, decoded: Sequence[Shown], reshaped: Sequence[tuple[int,
     1. A contradicted box is left out.
     2. A box that is out of place is taken from the part of the answer that has it nearest to its place; one that was
        carried off (`differences.carried`), from the part that has it where others say; and one that is ``reshaped``,
-       from the part that has it in the shape that others show.
+       from the part that has it in the shape that others show. One that is still out of place there is ``disputed``.
     3. A vehicle that a part of the answer shows, and the answer has lost although it stands by testimony, is taken from
        there. Of the answer without one teammate that of the others is enough, and the word of one witness, if nobody
        else denies it: then it stands as any other box. No vehicle is there twice by it.
@@ -80,7 +80,7 @@ def judge(answer: Shown, decoded: Sequence[Shown], reshaped: Sequence[tuple[int,
     repairs, kept = _each_once(repairs, answer, kept)
     objects = _judged(answer, np.flatnonzero(kept))
     for part, at in repairs:
-        objects += _judged(part, np.array([at]), None if (part.teammates, at) in by_one else Standing.REPAIRED)
+        objects += _judged(part, np.array([at]), None if (part.teammates, at) in by_one else _repaired(part, at))
     return tuple(objects), tuple(_judged(answer, np.flatnonzero(contradicted), Standing.CONTRADICTED))
 
 
@@ -137,6 +137,11 @@ def _judged(shown: Shown, which: IntArray, status: Standing | None = None) -> li
 @lru_cache(maxsize=4096)  # most boxes have the same few witnesses
 def _support(status: Standing, witnesses: Hypothesis, deniers: Hypothesis) -> Support:
     return Support(status=status, witnesses=witnesses, deniers=deniers)
+
+
+def _repaired(part: Shown, at: int) -> Standing:
+    """How a box stands that is taken from a part; it may be less out of place there, and still be so."""
+    return Standing.DISPUTED if part.away()[at] > IN_PLACE else Standing.REPAIRED
 
 
 def _in_place(box: FloatArray, away: float, parts: Sequence[Shown]) -> Repair | None:

@@ -85,6 +85,17 @@ def test_with_the_liar_in_the_answer_a_box_is_repaired(world, inspections):
     np.testing.assert_array_equal(row, TRUE[world])
 
 
+@pytest.mark.parametrize(("off_m", "status"), [(0.5, Standing.REPAIRED), (1.6, Standing.DISPUTED)])
+def test_what_is_less_out_of_place_and_still_is_so_is_not_repaired(off_m, status):
+    said = {EGO: YES, "car-2": YES, "car-3": YES, LIAR: NO}
+    world = World(said, lambda subset: CAR + [3.3 if LIAR in subset else off_m, 0, 0, 0, 0, 0])
+    decision, tested = world.play(1, GroupTesting(MODEL, GroupTestingSettings(inspections=4)), quiet=6)[0]
+    assert LIAR in decision.accepted
+    ((judged, row),) = there(decision, tested, decision.objects)
+    np.testing.assert_array_equal(row, CAR[0] + [off_m, 0, 0, 0, 0, 0])
+    assert (judged.support.status, LIAR in judged.subset) == (status, False)
+
+
 @pytest.mark.parametrize(
     ("said", "status"),
     [
