@@ -87,7 +87,7 @@ def _went_on_from(frame: RecordedFrame, before: Before, detector: Detector, defe
     try:
         return Session(detector, frame.decided.team, defense, saved)
     except ValueError as error:
-        raise RecordingError(f"{frame.file.path}, frame {frame.number}: before.previous: {error}") from error
+        raise RecordingError(f"{frame.file.path}, frame {frame.number}: {error}") from error
 
 
 def differing(made: FrameAnswer, recorded: FrameAnswer) -> Iterator[str]:
