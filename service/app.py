@@ -27,7 +27,7 @@ from service.arriving.hanging_up import HangingUp  # noqa: E402
 from service.arriving.limits import BodyLimit  # noqa: E402
 from service.arriving.pacing import Metered, Pacing  # noqa: E402
 from service.arriving.parties import Parties  # noqa: E402
-from service.deciding.admission import Admission  # noqa: E402
+from service.deciding.admission import KEY_FRAMES, Admission  # noqa: E402
 from service.deciding.answering import Deciding  # noqa: E402
 from service.deciding.keeping import Keeping  # noqa: E402
 from service.description import AT_THE_DOORS, TAGS, completed  # noqa: E402
@@ -146,7 +146,7 @@ def _built(
     settings: Settings, api_keys: ApiKeys, tokens: Tokens, seeds: Callable[[], str], tracing: Tracing
 ) -> Gateway:
     engine, metrics = Engine(settings.torch_threads, settings.extra_detectors, settings.device), Metrics()
-    admission = Admission(settings.max_hypotheses, engine)
+    admission = Admission(settings.max_hypotheses, engine, KEY_FRAMES if len(api_keys) > 1 else None)
     with asked_by("ROBOSAC_DATABASE_URL"):
         store = Store(
             settings.database_url,

@@ -24,8 +24,9 @@ away (`service.turns.CREDIT_S`), more than what equals differ by.
 """
 SESSION_FRAMES = 3
 """Frames of one session in hand or waiting at a time."""
-KEY_FRAMES = 64
-"""Those of one API key, that are to be read included: to find out whose turn it is takes the longer the more there are.
+KEY_FRAMES = 32
+"""Those of one of several API keys, that are to be read included. More keep the thread no busier, and to find out whose
+turn it is takes all the longer.
 """
 COMING_S = 0.05
 """For how long a frame that is to be read counts as if it were in hand: its link holds up one that takes longer."""
@@ -82,10 +83,15 @@ class Admission:
         Of one frame.
     turns : Ordering, optional
         Those of the thread.
+    key_frames : int, optional
+        The most of one key, where there are several; one has all to itself.
     """
 
-    def __init__(self, max_hypotheses: int = 1000, turns: Ordering | None = None) -> None:
+    def __init__(
+        self, max_hypotheses: int = 1000, turns: Ordering | None = None, key_frames: int | None = None
+    ) -> None:
         self._max_hypotheses = max_hypotheses
+        self._key_frames = key_frames
         self._turns = Turns() if turns is None else turns
         self._in_hand: set[Work] = set()
         self._waiting: Counter[str] = Counter()
@@ -232,8 +238,8 @@ class Admission:
 
     def _check_time(self, new: Work, due: float, to_come: Iterable[Work] = ()) -> None:
         works = [work for work in (*self._in_hand, *to_come) if not work.over]
-        if sum(work.key == new.key for work in works) >= KEY_FRAMES:
-            raise _overloaded(f"{KEY_FRAMES} frames of this API key are in hand", new.expected_s)
+        if self._key_frames is not None and sum(work.key == new.key for work in works) >= self._key_frames:
+            raise _overloaded(f"{self._key_frames} frames of this API key are in hand", new.expected_s)
         now, others_s, is_after = time.perf_counter(), 0.0, False
         end = now
         for work in self._turns.order([*works, new]):

@@ -154,7 +154,7 @@ def test_a_body_that_takes_long_hides_none_that_comes_after_it():
 
 def test_a_key_has_so_many_frames_in_hand_and_no_more():
     """However much time they have: whoever sends next pays for finding out whose turn it is."""
-    admission = Admission()
+    admission = Admission(key_frames=KEY_FRAMES)
     with ExitStack() as taken:
         for number in range(KEY_FRAMES - 2):
             taken.enter_context(taking(admission, "many", f"session {number}", 1e4))
@@ -171,6 +171,20 @@ def test_a_key_has_so_many_frames_in_hand_and_no_more():
             with taking(admission, "another", "its session", 1e4):
                 pass
     admission.check("many", "one more", due(1e4))
+
+
+@pytest.mark.parametrize("keys", [("one",), ("one", "another")])
+async def test_one_key_has_all_to_itself_where_there_is_no_other(keys):
+    async with serve(api_keys=",".join(f"a-long-key-of-{key}" for key in keys)) as served:
+        admission = served.gateway.admission
+        with ExitStack() as taken:
+            for number in range(KEY_FRAMES):
+                taken.enter_context(taking(admission, "key", f"session {number}", 1e4))
+            if len(keys) == 1:
+                admission.check("key", "one more", due(1e4))
+            else:
+                with pytest.raises(Refused):
+                    admission.check("key", "one more", due(1e4))
 
 
 def of_80_ms():
