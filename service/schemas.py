@@ -111,7 +111,9 @@ def _check_signers(keys: dict[str, str], vehicles: Collection[str]) -> None:
 class EnrolmentRequest(_Request):
     """Teammates that join a session."""
 
-    teammates: Annotated[list[VehicleId], AfterValidator(_check_distinct)] = Field(min_length=1, max_length=1024)
+    teammates: Annotated[list[VehicleId], AfterValidator(_check_distinct)] = Field(
+        min_length=1, max_length=1024, fail_fast=True
+    )
     public_keys: PublicKeys = {}
 
     @field_validator("public_keys")
@@ -125,7 +127,7 @@ class SessionRequest(_Request):
     """Opens a session of one ego with its teammates."""
 
     ego_id: VehicleId
-    teammates: list[VehicleId] = Field(max_length=1024)
+    teammates: list[VehicleId] = Field(max_length=1024, fail_fast=True)
     detector: str | None = None
     defense: ChosenDefense | None = Field(
         None, description="By default group_testing where the detector is calibrated for it, else sample_consensus."

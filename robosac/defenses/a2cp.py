@@ -7,7 +7,7 @@ from copy import deepcopy
 from functools import partial
 from itertools import islice
 from math import comb
-from typing import ClassVar, Literal
+from typing import Annotated, ClassVar, Literal
 
 import numpy as np
 from pydantic import Field
@@ -42,7 +42,7 @@ class A2CP(ConsensusSettings):
     """
 
     kind: Literal["a2cp"] = "a2cp"
-    ratios: tuple[float, ...] | None = Field(
+    ratios: Annotated[tuple[float, ...], Field(fail_fast=True)] | None = Field(
         None,
         min_length=1,
         max_length=64,

@@ -38,7 +38,7 @@ class Conformal(Memoryless):
     false_discovery_rate: float = Field(
         DEFAULT_RATE, gt=0, lt=1, description="Expected share of honest teammates among the accused, at most."
     )
-    calibration: tuple[Annotated[float, Field(ge=0, le=1)], ...] | None = Field(
+    calibration: Annotated[tuple[Annotated[float, Field(ge=0, le=1)], ...], Field(fail_fast=True)] | None = Field(
         None,
         min_length=1,
         max_length=2000,

@@ -8,6 +8,7 @@ from __future__ import annotations
 
 import asyncio
 import json
+import time
 from typing import Any, TypeVar
 
 from fastapi import Request
@@ -16,11 +17,16 @@ from pydantic import BaseModel, ValidationError
 
 from robosac.wire.bodies import named_once
 from service.arriving.limits import read_bounded
+from service.arriving.pacing import METER
 from service.errors import Kind, Refused
 
 JSON = "application/json"
 JSON_BYTES = 256 * 1024
 """The largest JSON body: a team of 1024 with keys, or a defence's calibration, with room to spare."""
+MOST_VALUES = 4096
+"""In a JSON body: no request has more. To tell what is wrong with each of many would take long."""
+MOST_MEMBERS = 1100
+"""Of an object in it: for each that is not known there is an error."""
 SMALL_BYTES = 4 * 1024
 """What is parsed on the event loop: for less than it costs to change threads."""
 STREAMED = {"Cache-Control": "no-cache", "X-Accel-Buffering": "no"}
@@ -50,15 +56,21 @@ async def read_json(request: Request, model: type[Model], context: Any = None) -
     Raises
     ------
     Refused
-        As `check_type` and `service.arriving.limits.read_bounded`; and if a name comes twice in an object.
+        As `check_type` and `service.arriving.limits.read_bounded`; and if it is not JSON, a name comes twice in an
+        object, or there are more than `MOST_VALUES`.
     RequestValidationError
-        If it is not JSON, or not what the model says.
+        If it is not what the model says.
     """
     check_type(request, JSON)
     body = await read_bounded(request, JSON_BYTES)
     if len(body) <= SMALL_BYTES:
         return _parsed(body, model, context)
-    return await asyncio.to_thread(_parsed, body, model, context)
+    took_s = list[float]()
+    try:
+        return await asyncio.to_thread(_timed, took_s, body, model, context)
+    finally:  # hardly anything goes on meanwhile
+        if (meter := request.scope.get("state", {}).get(METER)) is not None:
+            meter(sum(took_s))
 
 
 def described(model: type[BaseModel]) -> dict[str, Any]:
@@ -68,16 +80,44 @@ def described(model: type[BaseModel]) -> dict[str, Any]:
     return {"requestBody": {"required": True, "content": {JSON: {"schema": _in_full(schema, definitions)}}}}
 
 
+def _timed(took_s: list[float], body: bytes, model: type[Model], context: Any) -> Model:
+    began = time.thread_time()
+    try:
+        return _parsed(body, model, context)
+    finally:
+        took_s.append(time.thread_time() - began)
+
+
 def _parsed(body: bytes, model: type[Model], context: Any) -> Model:
     try:
-        parsed = model.model_validate_json(body, context=context)
+        plain = json.loads(body, object_pairs_hook=named_once)
+    except (ValueError, RecursionError) as error:
+        raise Refused(Kind.MALFORMED_JSON, f"not JSON: {error}") from None
+    _check_number(plain)
+    try:
+        return model.model_validate_json(body, context=context)
     except ValidationError as error:
         raise RequestValidationError(error.errors(include_url=False, include_input=False)) from None
-    try:
-        json.loads(body, object_pairs_hook=named_once)
-    except ValueError as error:
-        raise Refused(Kind.MALFORMED_JSON, f"not JSON: {error}") from None
-    return parsed
+
+
+def _check_number(plain: Any) -> None:
+    left, number = [("", plain)], 0
+    while left:
+        field, value = left.pop()
+        if isinstance(value, dict):
+            if len(value) > MOST_MEMBERS:
+                detail = f"an object may have {MOST_MEMBERS} members, got {len(value)}"
+                raise Refused(Kind.INVALID_REQUEST, detail, field or "body")
+            parts = [(f"{field}.{name}" if field else name, part) for name, part in value.items()]
+        elif isinstance(value, list):
+            parts = [] if len(value) > MOST_VALUES else [(field, part) for part in value]
+        else:
+            continue
+        number += len(value)
+        if number > MOST_VALUES:
+            detail = f"at most {MOST_VALUES} values are allowed"
+            raise Refused(Kind.INVALID_REQUEST, detail, field or "body")
+        left += parts
 
 
 def _in_full(node: Any, definitions: dict[str, Any]) -> Any:

@@ -6,18 +6,23 @@ of day 0. A part can be dropped when no session whose log can still be read has 
 
 from __future__ import annotations
 
+import logging
 import re
 import time
 from datetime import UTC, datetime
 
 from sqlalchemy import Connection, TextClause, text
+from sqlalchemy.exc import DBAPIError
 
+from robosac.faults import describe
 from service.keeping import migrations
+
+logger = logging.getLogger(__name__)
 
 DAY_S = 86_400
 AHEAD = 3
 """Days after today for which there are parts already."""
-LOCK_MS = 200
+LOCK_MS = 50
 """How long a change of parts waits for a lock, while others wait for it; then the next sweep tries again."""
 _NAME = re.compile(r"audit_lines_(\d{8})")
 BEFORE = "audit_lines_before"
@@ -36,19 +41,35 @@ def are_there(connection: Connection) -> bool:
 
 
 def make_ahead(connection: Connection) -> None:
-    """Make the parts of today and the next days, where they are missing."""
+    """Make the parts of today and the next days, where they are missing.
+
+    A part is made apart and attached then: that waits for no reader of the log, such as a backup that takes hours. What
+    fails all the same is only told as long as today has a part: lines are kept, and the next sweep tries again.
+    """
     if not are_there(connection):
         return
-    numbers = range(day(), day() + AHEAD + 1)
-    if set(connection.execute(_PARTS).scalars()) >= {name_of(number) for number in numbers}:
+    wanted = [name_of(day() + ahead) for ahead in range(AHEAD + 1)]
+    if set(connection.execute(_PARTS).scalars()) >= set(wanted):
         return
     migrations.lock(connection)
     known = set(connection.execute(_PARTS).scalars())
-    _wait_briefly(connection)
-    for number in numbers:
-        if (name := name_of(number)) not in known:
-            values = f"FOR VALUES FROM ({number}) TO ({number + 1})"
-            connection.execute(text(f"CREATE TABLE {name} PARTITION OF audit_lines {values}"))
+    try:
+        with connection.begin_nested():
+            _wait_briefly(connection)
+            for name in wanted:
+                if name not in known:
+                    _make(connection, name)
+    except DBAPIError as error:
+        if wanted[0] not in known or error.connection_invalidated:
+            raise
+        logger.warning("no part of the audit log was made for the next days: %s", describe(error.orig or error))
+
+
+def _make(connection: Connection, name: str) -> None:
+    number = int(_day_of(name))
+    values = f"FOR VALUES FROM ({number}) TO ({number + 1})"
+    connection.execute(text(f"CREATE TABLE {name} (LIKE audit_lines INCLUDING DEFAULTS)"))
+    connection.execute(text(f"ALTER TABLE audit_lines ATTACH PARTITION {name} {values}"))
 
 
 def old(connection: Connection, before: float) -> list[str]:

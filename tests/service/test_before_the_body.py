@@ -7,15 +7,17 @@ import threading
 
 import pytest
 from cryptography.hazmat.primitives.asymmetric.ed25519 import Ed25519PrivateKey
+from fastapi.exceptions import RequestValidationError
 from pydantic import BaseModel, field_validator
 from starlette.requests import Request
 from starlette.responses import StreamingResponse
 
 from robosac.signatures import show_public_key
 from service.app import create_app
-from service.arriving import bodies
+from service.arriving import bodies, pacing
 from service.arriving.doors import HEADER_BYTES, HEADERS, TARGET_BYTES
 from service.arriving.limits import UNREAD_BYTES, BodyLimit
+from service.schemas import SessionRequest
 from service.settings import Settings
 from tests.service.conftest import problem, serve
 from tests.service.test_identity import ANYBODY, EGO_ONLY, KEY, KEY_HOLDER, OTHER_KEY, RULES, bearer
@@ -188,6 +190,31 @@ async def test_json_is_asked_for_by_name(served, path, headers, slug):
     assert (await served.http.post("/v1/sessions", content=body, headers=charset)).status_code == 201
 
 
+def _conformal(calibration):
+    defense = '{"kind": "conformal", "calibration": [' + calibration + "]}"
+    return ('{"ego_id": "a", "teammates": [], "defense": ' + defense + "}").encode()
+
+
+def test_of_many_wrong_numbers_few_are_told():
+    """To tell what is wrong with each of 120,000 took two seconds, and let nothing else go on meanwhile."""
+    with pytest.raises(RequestValidationError) as refused:
+        bodies._parsed(_conformal("2," * 1999 + "2"), SessionRequest, None)
+    assert len(refused.value.errors()) <= 2
+
+
+async def test_what_is_read_on_a_thread_counts_as_its_senders():
+    async def receive():
+        return {"type": "http.request", "body": json.dumps({"text": ["x"] * 2000}).encode()}
+
+    took = []
+    state = {pacing.METER: took.append}
+    request = Request({"type": "http", "headers": [(b"content-type", b"application/json")], "state": state}, receive)
+    with pytest.raises(RequestValidationError):
+        await bodies.read_json(request, Noting)
+    assert len(took) == 1
+    assert took[0] > 0
+
+
 @pytest.mark.parametrize(
     ("body", "status", "slug", "field"),
     [
@@ -207,6 +234,13 @@ async def test_json_is_asked_for_by_name(served, path, headers, slug):
          422, "invalid-request", "defense.ratios"),
         (json.dumps({"ego_id": "a", "teammates": ["b"], "public_keys": {str(i): "" for i in range(2000)}}).encode(),
          422, "invalid-request", "public_keys"),
+        (_conformal("2," * 2500 + "2"), 422, "invalid-request", "defense.calibration.0"),
+        (_conformal("2," * 120_000 + "2"), 422, "invalid-request", "defense.calibration"),
+        (_conformal("[" + "[0]," * 3000 + "0]"), 422, "invalid-request", "defense.calibration"),
+        (json.dumps({"ego_id": "a", "teammates": ["#"] * 2000}).encode(), 422, "invalid-request", "teammates.0"),
+        (json.dumps({"ego_id": "a", "teammates": [], **{f"x{i}": 0 for i in range(20_000)}}).encode(),
+         422, "invalid-request", "body"),
+        (json.dumps([[] for _ in range(50_000)]).encode(), 422, "invalid-request", "body"),
     ],
 )  # fmt: skip
 async def test_bad_json_is_told_where(served, body, status, slug, field):

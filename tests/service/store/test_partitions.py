@@ -205,6 +205,62 @@ async def test_readiness_makes_the_part_of_a_day_that_has_none(url):
         await store.log(sid, note())
 
 
+@pytest.mark.parametrize(
+    ("mode", "made"),
+    [("ACCESS SHARE", True), ("SHARE UPDATE EXCLUSIVE", False), ("ACCESS EXCLUSIVE", False)],
+    ids=["backup", "vacuum", "change"],
+)
+async def test_a_day_begins_while_somebody_has_the_log_locked(url, mode, made, caplog):
+    last = name_of(day() + AHEAD)
+    other = await asyncpg.connect(url.replace("+asyncpg", ""))
+    try:
+        async with opened(url) as store:
+            sid = await added(store)
+            await run(url, f"DROP TABLE {last}")  # as if the day before had just ended
+            async with other.transaction():
+                await other.execute(f"LOCK TABLE ONLY audit_lines IN {mode} MODE")
+                await store.make_ahead()
+                assert not store._database.failed
+                if mode != "ACCESS EXCLUSIVE":  # nobody reads or writes then
+                    await store.ping()
+                    await store.log(sid, note())
+                async with opened(url):  # another process starts
+                    pass
+            assert (last in await parts(url)) is made
+            assert ("no part of the audit log was made for the next days" in caplog.text) is not made
+            await store.make_ahead()
+            assert last in await parts(url)
+    finally:
+        await other.close()
+
+
+async def test_without_a_part_for_today_there_is_no_start(url):
+    async with opened(url):
+        pass
+    await run(url, f"DROP TABLE {name_of(day())}")
+    other = await asyncpg.connect(url.replace("+asyncpg", ""))
+    try:
+        async with other.transaction():
+            await other.execute("LOCK TABLE ONLY audit_lines IN SHARE UPDATE EXCLUSIVE MODE")
+            with pytest.raises(StoreUnavailable):
+                async with opened(url):
+                    pass
+    finally:
+        await other.close()
+    async with opened(url):
+        pass
+
+
+async def test_a_part_that_is_attached_is_as_the_others(url):
+    async with opened(url) as store:
+        sid = await added(store)
+        keys = "SELECT count(*) FROM pg_constraint WHERE conrelid = '{}'::regclass AND contype = ANY('{{p,f}}'::char[])"
+        for name in (name_of(day()), name_of(day() + AHEAD)):
+            assert (await run(url, keys.format(name)))[0][0] == 2  # its key, and that of its session
+        await run(url, f"DELETE FROM sessions WHERE session_id = '{sid}'")
+        assert (await run(url, f"SELECT count(*) FROM {name_of(day())}"))[0][0] == 0
+
+
 async def test_a_part_of_young_lines_is_kept_though_nobody_reads_it(url):
     async with opened(url) as store:
         sid = await added(store)
