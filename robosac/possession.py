@@ -65,7 +65,7 @@ class Proof:
 
     @property
     def ends_at(self) -> float:
-        """From when on no gateway takes it any more, whatever its clock."""
+        """From when on no gateway takes it any more whose clock is right to `LEEWAY_S`."""
         return self.made_at + MAX_AGE_S + 2 * LEEWAY_S
 
 

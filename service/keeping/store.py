@@ -13,7 +13,15 @@ from sqlalchemy import Connection, Delete, Row, Select, Update, insert, select, 
 
 from robosac.audit import FULL_EVERY, digest
 from robosac.audit.events import DetectorChanged, Event, FrameAnswered, SessionEnded, TeamChanged, TokenRenewed
-from service.errors import AuditFull, FrameDecided, SessionChanged, SessionLost, SessionOver, TokenReplaced
+from service.errors import (
+    AuditFull,
+    FrameDecided,
+    SessionChanged,
+    SessionLost,
+    SessionOver,
+    StoreUnavailable,
+    TokenReplaced,
+)
 from service.keeping import clock, migrations, once, partitions, purging, usage
 from service.keeping.appending import Change, append, check_revision, check_unused, line_row, renewal
 from service.keeping.database import connect
@@ -68,6 +76,8 @@ class Store:
         self.shares = Shares(most_records)
         self._sealing = Sealing(full_every, remembered)
         self._seen = Seen(remembered)
+        self._room = once.LINE_BYTES
+        """What it takes to keep the largest decision that was not kept."""
 
     async def start(self) -> None:
         """Bring the database to this version's schema."""
@@ -182,7 +192,11 @@ class Store:
             patience.commit()
 
         draft = self._sealing.decision(record.session_id, event, record.last_frame)
-        kept = await self._append(record.session_id, event, change, keep, draft)
+        try:
+            kept = await self._append(record.session_id, event, change, keep, draft)
+        except StoreUnavailable:
+            self._room = max(self._room, len(messages or b"") + once.LINE_BYTES)
+            raise
         self._sealing.follow(record.session_id, draft.made.following)
         return kept
 
@@ -328,8 +342,8 @@ class Store:
         """
         if self._database.failed:
             await self.make_ahead()
-            await self._database.write(once.change)
-            self._database.failed = False
+            await self._database.write(partial(once.change, room=self._room))
+            self._database.failed, self._room = False, once.LINE_BYTES
         else:
             await self._execute(NO_CHANGE)
 

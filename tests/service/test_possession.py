@@ -150,6 +150,24 @@ async def test_a_used_proof_stays_used_after_a_restart_and_for_another_gateway(t
         problem(fresh, 404, "unknown-teammate")
 
 
+async def test_a_gateway_whose_clock_is_ahead_forgets_no_proof_that_counts_elsewhere(tmp_path):
+    database = f"sqlite:///{tmp_path}/robosac.db"
+    now = time.time()
+    at = [now]  # by the first one's clock
+    behind = serve(clock=lambda: at[0], database_url=database)
+    ahead = serve(clock=lambda: at[0] + 55, database_url=database)
+    async with behind as one, ahead as two:
+        session = await one.open(defense=NONE, public_keys=SHOWN)
+        path = f"/v1/sessions/{session.session_id}/teammates/rsu"
+        used = make_proof(KEYS[EGO], "DELETE", f"http://gateway{path}", session.ego_token, at[0])
+        assert (await call(one, session, "dismiss", used)).status_code == 204
+        at[0] = now + 45
+        other = await call(two, session, "dismiss", key=KEYS[EGO], made_at=at[0])
+        problem(other, 404, "unknown-teammate")
+        at[0] = now + 46
+        refused(await call(one, session, "dismiss", used), "used before")
+
+
 async def test_used_proofs_are_bounded_and_forgotten_once_they_would_not_count():
     late = [0.0]
     async with serve(clock=lambda: time.time() + late[0]) as served:

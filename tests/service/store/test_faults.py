@@ -174,6 +174,24 @@ async def test_a_disk_that_is_full(tmp_path, good_frame):
         await on_a_full_disk(folder / "robosac.db", no_space_left, good_frame)
 
 
+@pytest.mark.parametrize("room", [0.25, 1.0])
+async def test_a_disk_with_room_for_little_is_told_as_long_as_frames_are_refused(tmp_path, good_frame, room):
+    with a_small_disk(tmp_path / "disk", "64m") as folder:
+        path = folder / "robosac.db"
+        async with serve(database_url=f"sqlite:///{path}", keep_frames=2) as served:
+            ego = await Ego.of(served, good_frame)
+            with contextlib.closing(sqlite3.connect(path)) as other:  # what is there already has to be in the file
+                other.execute("PRAGMA wal_checkpoint(TRUNCATE)")
+            with no_space_left(folder / "some"):
+                filler = folder / "filler"
+                os.truncate(filler, filler.stat().st_size - int(room * 2**20))
+                for _ in range(4):
+                    assert not await ego.post()
+                    assert (await served.http.get("/readyz")).status_code == 503
+            assert (await served.http.get("/readyz")).status_code == 200
+            await ego.check()
+
+
 async def test_a_full_disk_of_a_server_is_told_as_long_as_frames_are_refused(postgres, good_frame):
     with a_small_disk(postgres.folder / "disk", "32m") as disk:
         place = disk / "tables"

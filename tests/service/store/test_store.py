@@ -20,7 +20,7 @@ from service.errors import (
     SessionOver,
     TokenReplaced,
 )
-from service.keeping.once import MOST_PROOFS
+from service.keeping.once import CLOCKS_APART_S, MOST_PROOFS
 from service.keeping.record import SessionRecord
 from service.keeping.rows import ROW_BYTES
 from service.keeping.store import PAGE, Store
@@ -154,11 +154,15 @@ async def test_a_proof_is_new_once_for_its_vehicle_until_it_is_forgotten(store):
     assert await store.use_proof(sid, "b", "p", 80.0, 0.0)
     assert await store.use_proof(other, "a", "p", 80.0, 0.0)
     assert not await store.use_proof(sid, "a", "p", 80.0, 80.0)
-    assert await store.use_proof(sid, "a", "p", 200.0, 81.0)
+    assert not await store.use_proof(sid, "a", "p", 80.0, 80.0 + CLOCKS_APART_S)  # another's clock may be behind
+    now, until = 81.0 + CLOCKS_APART_S, 200.0 + CLOCKS_APART_S
+    assert await store.use_proof(sid, "a", "p", until, now)
     for n in range(MOST_PROOFS - 1):
-        assert await store.use_proof(sid, "a", f"{n}", 200.0, 81.0)
+        assert await store.use_proof(sid, "a", f"{n}", until, now)
     with pytest.raises(Refused, match="256"):
-        await store.use_proof(sid, "a", "one more", 200.0, 81.0)
+        await store.use_proof(sid, "a", "one more", until, now)
+    assert await store.use_proof(sid, "a", "later", until + 80.0, until + 1.0)  # those are remembered, and do not count
+    assert not await store.use_proof(sid, "a", "0", until, until + 1.0)
     await store.end(sid, THE_END)
     await store.purge(LATER)
     assert await store.get(sid) is None
