@@ -5,6 +5,8 @@ from __future__ import annotations
 import hashlib
 import json
 import os
+from collections.abc import Mapping
+from contextlib import suppress
 from dataclasses import replace
 from functools import lru_cache
 from pathlib import Path
@@ -14,7 +16,7 @@ from robosac.detectors import DetectorInfo
 from robosac.detectors.base import Precision
 from robosac.detectors.weights_file import WeightsError
 from robosac.detectors.witness import Witness
-from robosac.screening import Bounds, Screening
+from robosac.screening import FRAME_PERIOD_S, Bounds, Screening
 
 
 def calibration_of(info: DetectorInfo) -> Calibration:
@@ -108,17 +110,16 @@ def _open(path: Path, changed: int, info: DetectorInfo) -> Witness:
     return known[2]
 
 
-def screening_for(info: DetectorInfo) -> Screening:
-    """The tests of messages, with what the file beside a detector's weights says of honest ones.
+def screening_for(info: DetectorInfo, frame_period_s: float = FRAME_PERIOD_S) -> Screening:
+    """The tests of messages for frames so far apart, with what the file beside a detector's weights says of honest ones.
 
     Where it says nothing, or there is none that belongs to the weights, nothing is known of them.
     """
-    if info.calibration is None:
-        return Screening()
-    try:
-        return Screening(_bounds(info.calibration, info.calibration.stat().st_mtime_ns, info.weights_digest))
-    except (OSError, KeyError, TypeError, ValueError):
-        return Screening()
+    known: Mapping[str, Bounds] = {}
+    if info.calibration is not None:
+        with suppress(OSError, KeyError, TypeError, ValueError):
+            known = _bounds(info.calibration, info.calibration.stat().st_mtime_ns, info.weights_digest)
+    return Screening(known, frame_period_s)
 
 
 @lru_cache(maxsize=16)

@@ -16,7 +16,7 @@ from robosac.defenses.group_testing import GroupTestingSettings
 from robosac.detectors import Detector, DetectorInfo, Message, Preparer
 from robosac.fusion import FrameRun, FusionResult
 from robosac.previous import PreviousAnswer
-from robosac.screening import Screening, joined, separated
+from robosac.screening import FRAME_PERIOD_S, Screening, joined, separated
 from robosac.steps import Steps, finished
 from robosac.verified import first_state, state_of_team
 
@@ -66,8 +66,8 @@ class Session:
     rng : numpy.random.Generator, optional
         All randomness of the defence; seeded by the operating system by default, so that nobody can foresee it.
     screening : Screening, optional
-        Tests of messages before any of them is fused; by default those that the detector is calibrated for. None for
-        no such tests.
+        Tests of messages before any of them is fused; by default those that the detector is calibrated for, at the
+        period of frames that the defence is for. None for no such tests.
 
     Raises
     ------
@@ -111,8 +111,9 @@ class Session:
     ) -> None:
         check_session(team, defense, saved, rng, screening)
         self.detector = detector
-        self.screening = screening_for(detector.info) if screening == "calibrated" else screening
         self.defense = defense or _default(detector)
+        period_s = _period_s(self.defense)
+        self.screening = screening_for(detector.info, period_s) if screening == "calibrated" else screening
         kind = None if saved is None else saved.get("defense")  # a log tells it elsewhere
         if kind not in (None, self.defense.kind):
             raise ValueError(f"saved by a session of the defence {kind}, this one has {self.defense.kind}")
@@ -209,6 +210,12 @@ class Session:
         """
         previous = None if self.previous is None else self.previous.as_json()
         return {"defense": self.defense.kind, "state": dict(self.state), "previous": previous}
+
+
+def _period_s(defense: Defense) -> float:
+    """Time from frame to frame, where a defence was told."""
+    told: float | None = getattr(getattr(defense, "settings", None), "frame_period_ms", None)
+    return FRAME_PERIOD_S if told is None else told / 1e3
 
 
 def _default(detector: Preparer) -> Defense:

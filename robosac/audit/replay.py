@@ -164,7 +164,8 @@ def _screening(decision: LoggedDecision) -> Screening | None:
     if not _was_screened(decision):
         return None
     known = decision.session.screening or {}
-    return Screening({name: Bounds.from_json(dict(bounds)) for name, bounds in known.items()})
+    bounds = {name: Bounds.from_json(dict(fields)) for name, fields in known.items()}
+    return Screening(bounds, decision.session.frame_period_ms / 1e3)
 
 
 def _was_screened(decision: LoggedDecision) -> bool:

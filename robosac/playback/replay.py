@@ -11,7 +11,7 @@ import numpy as np
 
 from robosac.answers import FrameAnswer
 from robosac.audit.replay import agree
-from robosac.calibrated import calibration_of
+from robosac.calibrated import calibration_of, screening_for
 from robosac.deadline import Recorded
 from robosac.defenses import Defense, Rejection, build, read_settings
 from robosac.defenses.registry import Kinds
@@ -20,6 +20,7 @@ from robosac.detectors.base import for_role
 from robosac.recording.content import Before
 from robosac.recording.reading import RecordedFrame, RecordedSession, RecordingError
 from robosac.scenes import SceneError, View, encoded
+from robosac.screening import Screening
 from robosac.session import Session
 
 NOT_COMPARED = frozenset({"timings_ms", "deadline_met", "receipt"})
@@ -61,14 +62,15 @@ def replay(
     for frame in session.frames[:1]:  # a detector of another layout lacks more than what the defence needs
         _messages(frame, detector, session.opening.ego_id)
     chosen = _recorded_defense(session, detector, kinds) if defense is None else defense
+    screening = screening_for(detector.info, session.opening.frame_period_ms / 1e3)
     going: dict[Path | None, tuple[Session, tuple[str, ...]]] = {}
     for frame in session.frames:
         decided = frame.decided
         file = frame.file.path if as_it_was else None  # what a frame goes on from is in its own file
         if as_it_was and decided.before is not None:
-            going[file] = _went_on_from(frame, decided.before, detector, chosen), decided.team
+            going[file] = _went_on_from(frame, decided.before, detector, chosen, screening), decided.team
         if file not in going:
-            going[file] = Session(detector, decided.team, chosen), decided.team
+            going[file] = Session(detector, decided.team, chosen, screening=screening), decided.team
         running, team = going[file]
         if team != decided.team:
             running.change_team(decided.team)
@@ -82,10 +84,12 @@ def replay(
         yield Replayed(frame, answer, tuple(differing(answer, frame.answer)))
 
 
-def _went_on_from(frame: RecordedFrame, before: Before, detector: Detector, defense: Defense) -> Session:
+def _went_on_from(
+    frame: RecordedFrame, before: Before, detector: Detector, defense: Defense, screening: Screening
+) -> Session:
     saved = {"state": before.state, "previous": before.previous}
     try:
-        return Session(detector, frame.decided.team, defense, saved)
+        return Session(detector, frame.decided.team, defense, saved, screening=screening)
     except ValueError as error:
         raise RecordingError(f"{frame.file.path}, frame {frame.number}: {error}") from error
 

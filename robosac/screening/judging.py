@@ -9,9 +9,11 @@ A message is refused only on evidence that cannot be turned against somebody hon
 - it is what its sender sent from another place, byte for byte or closer than two scans of one unchanged place ever are
   (``repeated``). A parked vehicle cannot fail that. Nor can one in a tunnel, where all places look the same: it has to
   be closer, too, than what the ego itself sends from two places;
-- it is, byte for byte, what another vehicle had sent first in a frame of which it is remembered that this one sent
-  something else in it, or what the ego has sent (``copied``). Whoever was silent then may have been overheard, and its
-  message sent in its place.
+- it is, byte for byte, what the ego has sent (``copied``).
+
+What another teammate had sent first, in a frame of which it is remembered that this one sent something else in it, is
+refused as well, and names nobody: it may be its own, sent late, and overheard by the other. Whoever was silent then
+stays in. So is what a vehicle sent itself not long ago: it may have nothing new.
 
 Two messages that are merely alike are told, and stay in. Nobody can know from the maps who copied. And the maps of an
 honest vehicle that drives on an empty road, between walls or in a platoon are as alike as .99.
@@ -31,8 +33,10 @@ from robosac.boxes import FloatArray
 from robosac.defenses import EGO, Rejection
 from robosac.detectors import Message
 from robosac.screening.fingerprints import SKETCH, Fingerprint, fingerprints, likeness, packed, unpacked
-from robosac.screening.past import Anchor, Past, Place, Sent, is_kept, recent
+from robosac.screening.past import KEPT_FRAMES, Anchor, Past, Place, Sent, is_kept, recent
 
+FRAME_PERIOD_S = 0.2
+"""By default."""
 MARGIN = 2.0
 """A message may be so many times as large as the largest of the calibration: other worlds have other maps."""
 MOVED_M = 3.0
@@ -44,9 +48,11 @@ NEAR = 0.9
 ALIKE = 0.8
 """The same for the maps of two vehicles; honest ones in traffic reach .6."""
 NAMED_AFTER = 3
-"""Refused messages from which on their sender is named as an attacker, while it sends such; but for those that it sent
-itself less than `robosac.screening.past.KEPT_FRAMES` ago.
+"""Refused messages from which on their sender is named as an attacker, while it sends such; but for those that may be
+honest.
 """
+NOTHING_NEW_S = 1.0
+"""What was sent less long ago may be sent again; but for `robosac.screening.past.KEPT_FRAMES` at least."""
 MOST_TOLD = 16
 """Likenesses of a frame that are told, the greatest first."""
 
@@ -93,9 +99,12 @@ class Screening:
     bounds : mapping of tensor name to Bounds
         By default nothing is known: then no message is implausible, and only one that is the same byte for byte is
         refused as a repetition.
+    frame_period_s : float
+        Time from frame to frame.
     """
 
     bounds: Mapping[str, Bounds] = field(default_factory=dict)
+    frame_period_s: float = FRAME_PERIOD_S
 
     def screen(self, memory: Mapping[str, Any], frame: int, ego: Message, teammates: Mapping[str, Message]) -> Screened:
         """Test the messages of a frame.
@@ -127,15 +136,31 @@ class Screening:
         known = {**pasts, **{name: Past.from_json(past) for name, past in silent.items()}}
         refused, blamed, earlier = {}, set[str](), _earlier(known, {one.digest for one in prints.values()})
         for name, one in seen.items():
-            if name != EGO and (why := self._implausible(one) or _copied(name, seen, earlier) or _repeated(one, bound)):
+            if name != EGO and (why := self._why_refused(name, seen, earlier, bound)):
                 refused[name] = why
-                if why.reason is Reason.REPEATED and one.has_nothing_new:
+                if self._may_be_honest(why, one):
                     continue
                 blamed.add(name)
                 if one.past.refused + 1 >= NAMED_AFTER:
                     refused[name] = replace(why, distrust=Distrust.NAMED)
         kept = {name: one.remembered(bound, name in blamed, name == EGO) for name, one in seen.items()}
         return Screened(refused, _alike(seen), {**silent, **kept})
+
+    def _why_refused(
+        self, name: str, seen: Mapping[str, _Seen], earlier: Mapping[str, Sequence[tuple[str, int]]], bound: float
+    ) -> Rejection | None:
+        one = seen[name]
+        copied = _copied(name, seen, earlier)
+        if copied is not None and copied.evidence["of"] == EGO:
+            return self._implausible(one) or copied
+        return self._implausible(one) or _repeated(one, bound) or copied
+
+    def _may_be_honest(self, why: Rejection, seen: _Seen) -> bool:
+        """Whether somebody honest may have sent what is refused."""
+        if why.reason is Reason.COPIED:
+            return bool(why.evidence["of"] != EGO)
+        newest = max(KEPT_FRAMES, math.ceil(NOTHING_NEW_S / self.frame_period_s))
+        return why.reason is Reason.REPEATED and 0 < abs(seen.frame - seen.first_sent) < newest
 
     def _implausible(self, seen: _Seen) -> Rejection | None:
         for name, bounds in self.bounds.items():
@@ -174,11 +199,6 @@ class _Seen:
     def first_sent(self) -> int:
         """The frame in which the vehicle sent this very message first."""
         return min((each.first for each in self.past.sent if each.digest == self.print.digest), default=self.frame)
-
-    @property
-    def has_nothing_new(self) -> bool:
-        """Whether the vehicle sent this very message not long ago: it may repeat it until it has another one."""
-        return self.first_sent != self.frame and is_kept(self.first_sent, self.frame)
 
     def sent_in(self, frame: int) -> bool:
         """Whether it is known that the vehicle sent something in a frame before."""

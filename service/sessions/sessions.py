@@ -14,6 +14,7 @@ from robosac.answers import LogReceipt, Reason
 from robosac.audit import commitment
 from robosac.audit.events import SessionEnded
 from robosac.budget import DomainError
+from robosac.calibrated import screening_for
 from robosac.defenses import DefenseSettings, known, read_settings, suspicion_in
 from robosac.session import Session, defense_for
 from service.engine import Engine
@@ -255,8 +256,9 @@ class Sessions:
         except DomainError as error:
             detail = f"the session's detector {record.detector} no longer serves its defence: {error}"
             raise Refused(Kind.DETECTOR_UNAVAILABLE, detail) from error
+        screening = screening_for(detector.info, record.frame_period_ms / 1e3)
         return LiveSession(
-            Session(detector, record.teammates, defense, {"state": record.state}),
+            Session(detector, record.teammates, defense, {"state": record.state}, screening=screening),
             kept,
             detector,
             record.teammates,

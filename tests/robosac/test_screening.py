@@ -1,6 +1,7 @@
 """Tests of messages before any is fused, by what vehicles send in successive frames."""
 
 import json
+from dataclasses import replace
 
 import numpy as np
 import pytest
@@ -98,12 +99,36 @@ def test_who_sends_a_near_repetition_is_named_whenever_it_sent_the_map_first(dra
     assert named[0] == 3
 
 
-def test_who_sends_a_copy_again_is_named(draw):
+@pytest.mark.parametrize(("every", "named"), [(100, [22, 23]), (8, []), (22, []), (23, [22])])
+def test_at_twenty_frames_a_second_nothing_new_may_come_for_a_second_too(draw, every, named):
+    play, maps = Frames(draw, replace(KNOWN, frame_period_s=0.05)), [draw() for _ in range(24)]
+    found = [play(a=at(4.0 * frame, maps[frame // every])).refused.get("a") for frame in range(24)]
+    assert [frame for frame, why in enumerate(found) if why and why.distrust is Distrust.NAMED] == named
+
+
+def test_who_is_late_and_overheard_is_left_out_and_not_named(draw):
+    play, maps = Frames(draw), [draw() for _ in range(9)]
+    for frame in range(1, 9):
+        refused = play(late=at(4.0 * frame, maps[frame - 1]), thief=at(4.0 * frame + 2, maps[frame])).refused
+        if frame > 1:
+            assert {name: (why.reason, why.distrust) for name, why in refused.items()} == {"late": (Reason.COPIED, None)}
+
+
+def test_who_sends_what_the_ego_sent_is_named(draw):
+    play, found = Frames(draw), []
+    for frame in range(5):
+        own = draw()
+        found.append(play(own, a=at(4.0 * frame, own)).refused["a"])
+    assert {why.reason for why in found} == {Reason.COPIED}
+    assert [why.distrust is Distrust.NAMED for why in found] == [False, False, True, True, True]
+
+
+def test_who_sends_a_copy_again_and_again_is_named_for_repeating_it(draw):
     play, copied = Frames(draw), draw()
     play(a=at(0.0, draw()), b=at(9.0, copied))
-    found = [play(a=at(4.0 * frame, copied), b=at(9.0, draw())).refused["a"] for frame in range(1, 5)]
-    assert {why.reason for why in found} == {Reason.COPIED}
-    assert [why.distrust is Distrust.NAMED for why in found] == [False, False, True, True]
+    found = [play(a=at(4.0 * frame, copied), b=at(9.0, draw())).refused["a"] for frame in range(1, 10)]
+    assert [why.reason for why in found] == [Reason.COPIED] + [Reason.REPEATED] * 8
+    assert [frame for frame, why in enumerate(found, 1) if why.distrust is Distrust.NAMED] == [8, 9]
 
 
 def test_a_slow_vehicle_that_repeats_itself_is_found_once_it_is_elsewhere(draw):
