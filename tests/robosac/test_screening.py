@@ -111,7 +111,9 @@ def test_who_is_late_and_overheard_is_left_out_and_not_named(draw):
     for frame in range(1, 9):
         refused = play(late=at(4.0 * frame, maps[frame - 1]), thief=at(4.0 * frame + 2, maps[frame])).refused
         if frame > 1:
-            assert {name: (why.reason, why.distrust) for name, why in refused.items()} == {"late": (Reason.COPIED, None)}
+            assert {name: (why.reason, why.distrust) for name, why in refused.items()} == {
+                "late": (Reason.COPIED, None)
+            }
 
 
 def test_who_sends_what_the_ego_sent_is_named(draw):

@@ -27,9 +27,10 @@ HEAD = """# Defences against attacks
 `{command}`: {scenes} test sequences of {frames} frames at {rate:g} Hz, {ego} the ego, attackers drawn among its
 teammates{poses}. In each setting all defences meet the same frames. *Oracle* fuses everybody who is honest in the
 frame. `sample_consensus` and `static_team` test hypotheses of three teammates, or of as many as can be honest, and at
-most seven a frame. Passes are fused ones; that of the ego alone comes on top. Standard errors (+-) are over sequences,
-by the jackknife; those of differences and ratios to the oracle take both on the same sequences. All figures are in
-`comparison.csv`. {made_by}
+most seven a frame. `group_testing` expects exact poses; a session's default is `group_testing, expecting .2 m`, where
+the detector is calibrated for that. Passes are fused ones; that of the ego alone comes on top. Standard errors (+-) are
+over sequences, by the jackknife; those of differences and ratios to the oracle take both on the same sequences. All
+figures are in `comparison.csv`. {made_by}
 """
 REPORT = "comparison.md"
 PRECISION, PASSES = "precision.png", "passes.png"
