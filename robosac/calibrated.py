@@ -113,7 +113,8 @@ def _open(path: Path, changed: int, info: DetectorInfo) -> Witness:
 def screening_for(info: DetectorInfo, frame_period_s: float = FRAME_PERIOD_S) -> Screening:
     """The tests of messages for frames so far apart.
 
-    They know of honest messages what the file beside a detector's weights says. Where it says nothing, or there is none that belongs to the weights, nothing is known of them.
+    They know of honest messages what the file beside a detector's weights says. Where it says nothing, or there is none
+    that belongs to the weights, nothing is known.
     """
     known: Mapping[str, Bounds] = {}
     if info.calibration is not None:
