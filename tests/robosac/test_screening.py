@@ -125,6 +125,13 @@ def test_who_sends_what_the_ego_sent_is_named(draw):
     assert [why.distrust is Distrust.NAMED for why in found] == [False, False, True, True, True]
 
 
+def test_who_sends_what_the_ego_sent_again_and_again_has_no_grace(draw):
+    play, own = Frames(draw), draw()
+    found = [play(own if frame == 0 else None, a=at(4.0 * frame, own)).refused["a"] for frame in range(4)]
+    assert {why.reason for why in found} == {Reason.COPIED}
+    assert [why.distrust is Distrust.NAMED for why in found] == [False, False, True, True]
+
+
 def test_who_sends_a_copy_again_and_again_is_named_for_repeating_it(draw):
     play, copied = Frames(draw), draw()
     play(a=at(0.0, draw()), b=at(9.0, copied))
