@@ -45,10 +45,6 @@ async def _vehicle(sid: str, gateway: GatewayDep, token: Token) -> Caller:
     return await gateway.sessions.authenticate(sid, token)
 
 
-async def _renewing(sid: str, gateway: GatewayDep, token: Token) -> Caller:
-    return await gateway.sessions.authenticate(sid, token, renewing=True)
-
-
 async def _ego(sid: str, gateway: GatewayDep, token: Token) -> Caller:
     return await gateway.sessions.authenticate_ego(sid, token)
 
@@ -64,12 +60,8 @@ async def _check_possession(request: Request, gateway: GatewayDep, caller: Calle
     return caller
 
 
-async def _proven_renewing(
-    request: Request,
-    gateway: GatewayDep,
-    caller: Annotated[Caller, Depends(_renewing)],
-    token: Token,
-    _: Annotated[str | None, _PROOF] = None,
+async def _proven_vehicle(
+    request: Request, gateway: GatewayDep, caller: Vehicle, token: Token, _: Annotated[str | None, _PROOF] = None
 ) -> Caller:
     return await _check_possession(request, gateway, caller, token)
 
@@ -80,6 +72,6 @@ async def _proven_ego(
     return await _check_possession(request, gateway, caller, token)
 
 
-ProvenRenewing = Annotated[Caller, Depends(_proven_renewing)]
-"""For another token, for which a stolen one must not be enough."""
+ProvenVehicle = Annotated[Caller, Depends(_proven_vehicle)]
+"""For what a stolen token must not be enough for."""
 ProvenEgo = Annotated[Caller, Depends(_proven_ego)]

@@ -15,7 +15,7 @@ from robosac.audit.packing import packed_state
 from robosac.defenses import State
 from robosac.fusion import FusionResult
 from service.deciding.asked import Asked, Present
-from service.errors import GivenUp, StoreTooSlow, StoreUnavailable
+from service.errors import GivenUp, StoreTooSlow
 from service.keeping.patience import GRACE_S, Patience, ask_for_the_exception
 from service.keeping.record import SessionRecord
 from service.keeping.store import Store
@@ -47,7 +47,6 @@ class Keeping:
             As `service.keeping.store.Store.decide`. Nothing is remembered then.
         """
         live = asked.caller.live
-        live.unsure = None
         write = _Write(self, asked, present, result, live.count_anew(), tuple(live.late))
         live.late.clear()
         task = asyncio.create_task(write.run(record, answer))
@@ -101,12 +100,10 @@ class _Write:
             self.kept = await keeping.store.decide(record, event, next_seed, body, patience, keep_frames)
         except GivenUp:  # whoever gave up has undone it
             return
-        except BaseException as error:
+        except BaseException:
             with contextlib.suppress(GivenUp):
                 self.patience.check()
                 self.undo()
-            if isinstance(error, StoreUnavailable) and answer.deadline_met:  # it may be kept all the same
-                asked.caller.live.unsure = asked.frame
             raise
         self._remember()
         if self.is_too_late and answer.deadline_met:

@@ -16,14 +16,11 @@ from robosac.session import Session
 from service.errors import TokenReplaced
 from service.keeping.record import SessionRecord
 from service.sessions.gathering import Gathering
-from service.sessions.identity import Token
 from service.sessions.motion import Motion
 from service.sessions.unread import Unread
 
 RENEWALS = 16
 """Tokens that a vehicle may take in a while, see `service.sessions.teams`."""
-AGAIN_S = 60.0
-"""So long a vehicle can ask again for a token whose answer it did not get."""
 REFUSALS_LOGGED = 16
 """Refused messages of one vehicle between two frames that get a record each; the others are counted."""
 EQUIVOCATIONS_LOGGED = 4
@@ -39,20 +36,6 @@ class Standing:
     """A vehicle that stands by, until its stream is over."""
 
     over: asyncio.Event = field(default_factory=asyncio.Event)
-
-
-@dataclass(frozen=True)
-class Renewal:
-    """A token that a vehicle has been given, and has not been seen to use."""
-
-    before: str
-    """Id of the token that it asked with."""
-    token: Token
-    at: float = field(default_factory=time.monotonic)
-
-    def counts(self, record: SessionRecord, vehicle: str) -> bool:
-        """Whether it is the vehicle's token now: it is not where the store failed, and did not keep it."""
-        return record.token_ids.get(vehicle) == self.token.token_id
 
 
 @dataclass
@@ -99,15 +82,11 @@ class LiveSession:
     refusals: Refusals = field(default_factory=Refusals)
     late: list[int] = field(default_factory=list)
     """Frames whose records say that they were in time, and whose answers were late: the next record tells."""
-    unsure: int | None = None
-    """A frame whose decision says that it was in time, and that the store failed to keep, or to say that it did."""
     equivocations: Counter[str] = field(default_factory=Counter)
     renewals: defaultdict[str, deque[float]] = field(
         default_factory=lambda: defaultdict(partial(deque, maxlen=RENEWALS))
     )
     """When each vehicle took its latest tokens here (`time.monotonic`)."""
-    renewed: dict[str, Renewal] = field(default_factory=dict)
-    """By vehicle: its latest, until it uses it."""
     team_changes: int = 0
     unread: defaultdict[str, Unread] = field(default_factory=lambda: defaultdict(Unread))
     """Bodies that are not whole yet, by vehicle."""
@@ -134,15 +113,12 @@ class LiveSession:
             self.gathering.change_team(record.teammates)
             here = {record.ego_id, *record.teammates}
             self.motion.forget_all_but(here)
-            for of_vehicles in (self.renewals, self.renewed, self.unread):
+            for of_vehicles in (self.renewals, self.unread):
                 for gone in of_vehicles.keys() - here:
                     del of_vehicles[gone]
             self.team, self.public_keys, self.token_ids = record.teammates, record.public_keys, record.token_ids
         if record.last_frame is not None and record.last_frame > self.gathering.closed:
             self.gathering.close(record.last_frame)
-        if record.last_frame is not None and record.last_frame == self.unsure:
-            self.late.append(record.last_frame)
-            self.unsure = None
         self.session.state = record.state
         if record.last_frame != self.answered:
             self.session.previous = self.ego_proof = None
@@ -157,11 +133,6 @@ class LiveSession:
         quiet = self.last_used < time.monotonic() - QUIET_S
         return quiet and self.gathering.waits and not self.lock.locked()
 
-    def renewing(self, record: SessionRecord) -> dict[str, str]:
-        """By vehicle: the token that it may still ask with for its new one, of those that did not use that yet."""
-        recent = time.monotonic() - AGAIN_S
-        return {name: of.before for name, of in self.renewed.items() if of.at >= recent and of.counts(record, name)}
-
     def send_away(self) -> None:
         """The session is elsewhere now, or soon: let those who stand by find it there."""
         self.held = False
@@ -171,8 +142,7 @@ class LiveSession:
     def count_on(self, before: LiveSession) -> None:
         """Count what there was before since the last decision."""
         self.refusals, self.late, self.equivocations = before.refusals, before.late, before.equivocations
-        self.renewals, self.renewed, self.team_changes = before.renewals, before.renewed, before.team_changes
-        self.unsure = before.unsure
+        self.renewals, self.team_changes = before.renewals, before.team_changes
         self.unrecorded = before.unrecorded
 
     def count_anew(self) -> Refusals:

@@ -6,7 +6,7 @@ import asyncio
 import contextlib
 import time
 from collections.abc import AsyncIterator, Awaitable, Callable, Iterator, Sequence
-from dataclasses import dataclass, replace
+from dataclasses import dataclass
 
 import structlog
 
@@ -87,11 +87,8 @@ class Sessions:
         """Take nothing new: the process is to end, and another goes on with its sessions."""
         self.moving.drain(self._live.values())
 
-    async def authenticate(self, session_id: str, token: str | None, *, renewing: bool = False) -> Caller:
+    async def authenticate(self, session_id: str, token: str | None) -> Caller:
         """The vehicle that a token belongs to.
-
-        Where it asks for another one (``renewing``), the token before its own counts as well, until it uses its own:
-        the answer with that may have been lost.
 
         Raises
         ------
@@ -112,8 +109,7 @@ class Sessions:
         if record is None or record.ended_at is not None:
             self._forget(session_id)
             raise SessionOver("there is no such session; it may have ended or expired")
-        asks_again = self._asks_again(record, live, token) if renewing and live is not None else None
-        vehicle = asks_again or await self._holder(record, token)
+        vehicle = await self._holder(record, token)
         is_ego = vehicle == record.ego_id
         try:
             live = self._live_session(record)
@@ -126,8 +122,6 @@ class Sessions:
             live = self._live_session(record)
         live.follow(record)
         live.last_used = time.monotonic()
-        if asks_again is None and vehicle in live.renewing(record):  # it has its own
-            del live.renewed[vehicle]
         return Caller(record, live, vehicle)
 
     async def authenticate_ego(self, session_id: str, token: str | None) -> Caller:
@@ -345,14 +339,6 @@ class Sessions:
         if before is not None:
             live.count_on(before)
         return live
-
-    def _asks_again(self, record: SessionRecord, live: LiveSession, token: str | None) -> str | None:
-        """The vehicle that comes with the token before its own, if it may; see `LiveSession.renewing`."""
-        before = live.renewing(record)
-        with contextlib.suppress(TokenRefused):
-            vehicle = self.tokens.holder(replace(record, token_ids={**record.token_ids, **before}), token)
-            return vehicle if vehicle in before else None
-        return None
 
     async def _holder(self, record: SessionRecord, token: str | None) -> str:
         """The vehicle of the session that a token belongs to; a refusal goes on record, but only so many of them."""

@@ -16,8 +16,8 @@ from service.errors import Kind, Refused
 from service.keeping.record import SessionRecord
 from service.keeping.store import Store
 from service.schemas import ChangedTeam, RenewedToken
-from service.sessions.identity import Token, Tokens
-from service.sessions.live import RENEWALS, Caller, Renewal
+from service.sessions.identity import Tokens
+from service.sessions.live import RENEWALS, Caller
 from service.sessions.sessions import Sessions
 from service.settings import Settings
 
@@ -72,31 +72,21 @@ class Teams:
             return self.sessions.keys.receipt(kept)
 
     async def renew(self, caller: Caller) -> RenewedToken:
-        """A fresh token of the caller; the one it came with is worth nothing more, but to ask for the same again."""
-        vehicle, live = caller.vehicle_id, caller.live
-        async with live.lock:  # else a team that changes meanwhile would bring the old token back
+        """A fresh token of the caller; the one it came with is worth nothing any more."""
+        vehicle = caller.vehicle_id
+        async with caller.live.lock:  # else a team that changes meanwhile would bring the old token back
             record = await self.sessions.current(caller)
-            again = live.renewed.get(vehicle)
-            if again is not None and again.counts(record, vehicle):  # whoever came with that has been seen to use it
-                return self._renewed(again.token, record)
             caller.check_token(record)
-            taken, within_s = live.renewals[vehicle], min(RENEWALS_WITHIN_S, self.settings.token_ttl_s)
+            taken, within_s = caller.live.renewals[vehicle], min(RENEWALS_WITHIN_S, self.settings.token_ttl_s)
             if len(taken) == RENEWALS and time.monotonic() - taken[0] < within_s:
                 raise Refused(Kind.TOO_MANY_RENEWALS, f"a vehicle may have {RENEWALS} tokens in {within_s:g} s")
             taken.append(time.monotonic())
-            token, before = (
-                self.tokens.issue(record.session_id, vehicle, is_ego=caller.is_ego),
-                record.token_ids[vehicle],
-            )
-            live.renewed[vehicle] = Renewal(before, token)  # the store may fail, and keep it all the same
+            token = self.tokens.issue(record.session_id, vehicle, is_ego=caller.is_ego)
             event = TokenRenewed(vehicle_id=vehicle, expires_at=token.expires_at)
-            kept = await self.store.renew_token(record.session_id, before, token.token_id, event)
-            live.token_ids = {**live.token_ids, vehicle: token.token_id}  # what it has sent still counts
-            return self._renewed(token, kept)
-
-    def _renewed(self, token: Token, record: SessionRecord) -> RenewedToken:
-        receipt = self.sessions.keys.receipt(record)
-        return RenewedToken(token=token.text, expires_at=token.expires_at, receipt=receipt)
+            kept = await self.store.renew_token(record.session_id, record.token_ids[vehicle], token.token_id, event)
+            caller.live.token_ids = {**caller.live.token_ids, vehicle: token.token_id}  # what it has sent still counts
+            receipt = self.sessions.keys.receipt(kept)
+            return RenewedToken(token=token.text, expires_at=token.expires_at, receipt=receipt)
 
     async def _change_team(
         self,

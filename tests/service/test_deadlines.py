@@ -9,7 +9,6 @@ import pytest
 from clients.errors import GatewayUnavailable
 from robosac import wire
 from service import routes
-from service.errors import StoreUnavailable
 from service.keeping.patience import GRACE_S
 from tests.service.conftest import EGO, TEAM, problem, serve
 
@@ -134,34 +133,6 @@ async def test_a_decision_past_the_point_of_return_is_found_out_about_before_the
     assert (await on_disk.post(session, "frames", good_frame(2))).json()["source"] == "consensus"
     records = [r for r in await on_disk.ego(session).audit() if r["event"] == "frame_answered"]
     assert [(record["frame"], record.get("late", [])) for record in records] == [(0, []), (1, []), (2, [1])]
-
-
-@pytest.mark.parametrize(("kept", "end"), [(True, "frame"), (True, "close"), (False, "frame")])
-async def test_a_decision_of_which_the_store_does_not_say_whether_it_is_kept_was_late(
-    on_disk, good_frame, monkeypatch, kept, end
-):
-    session, store = await on_disk.open(latency_budget_ms=2000, gather_ms=0), on_disk.gateway.store
-    with monkeypatch.context() as failing:
-        keep = store.decide
-
-        async def fail(*arguments):
-            if kept:
-                await keep(*arguments)
-            raise StoreUnavailable
-
-        failing.setattr(store, "decide", fail)
-        problem(await on_disk.post(session, "frames", good_frame(0)), 503, "store-unavailable")
-    again = await on_disk.post(session, "frames", good_frame(0))
-    if kept:
-        problem(again, 409, "stale-frame")
-    assert again.status_code == 409 or again.json()["deadline_met"]
-    if end == "frame":
-        assert (await on_disk.post(session, "frames", good_frame(1))).status_code == 200
-    ego = on_disk.ego(session)
-    await ego.close()
-    told = [r.get("late", []) for r in await ego.audit() if r["event"] in ("frame_answered", "session_ended")]
-    late = [0] if kept else []
-    assert told == ([[], late, []] if end == "frame" else [[], late])
 
 
 @pytest.mark.parametrize("stalled", ["store", "engine"])

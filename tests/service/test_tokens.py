@@ -9,8 +9,7 @@ import jwt
 import pytest
 
 from clients.errors import AccessDenied, InvalidRequest, SessionNotFound
-from service.errors import StoreUnavailable
-from service.sessions import identity, live, teams
+from service.sessions import identity, teams
 from service.sessions.identity import AUDIENCE, CLAIMS, ISSUER
 from tests.service.conftest import EGO, problem, serve
 from tests.service.credentials import OTHER_SECRET, SECRET, bearer, claims_of, forged, segment
@@ -128,68 +127,11 @@ async def test_a_fresh_token_replaces_the_one_before(messages):
         assert refused == ["rsu", "rsu", EGO]
 
 
-async def test_two_renewals_with_one_token_give_one_token(served):
+async def test_of_two_renewals_with_one_token_only_one_is_granted(served):
     session = await served.open()
     unit = [served.teammate(session, "rsu"), served.teammate(session, "rsu")]
-    one, other = await asyncio.gather(*(client.renew() for client in unit))
-    assert one.token == other.token
-    renewals = [r for r in await served.ego(session).audit() if r["event"] == "token_renewed"]
-    assert len(renewals) == 1
-
-
-async def renewed(served, token):
-    path = f"/v1/sessions/{claims_of(token)['sid']}/token"
-    return await served.http.post(path, headers=bearer(token))
-
-
-async def test_a_token_whose_answer_was_lost_comes_again_until_it_is_used(served, messages):
-    session = await served.open()
-    before = session.teammate_tokens["rsu"]
-    lost, again = [(await renewed(served, before)).json() for _ in range(2)]
-    assert again["token"] == lost["token"] != before
-    problem(await served.post(session, "messages", b"", before), 401, "unauthenticated")  # it is good for nothing else
-    assert (await renewed(served, before)).json()["token"] == lost["token"]
-    session.teammate_tokens["rsu"] = lost["token"]
-    await served.teammate(session, "rsu").send(0, messages["rsu"])
-    problem(await renewed(served, before), 401, "unauthenticated")
-    assert (await renewed(served, lost["token"])).json()["token"] != lost["token"]
-
-
-async def test_a_token_whose_answer_was_lost_does_not_come_for_ever(served, monkeypatch):
-    session = await served.open()
-    assert (await renewed(served, session.ego_token)).status_code == 201
-    monkeypatch.setattr(live, "AGAIN_S", 0.0)
-    problem(await renewed(served, session.ego_token), 401, "unauthenticated")
-
-
-async def test_who_left_and_came_back_gets_no_token_by_the_one_before(served):
-    session = await served.open()
-    before = session.teammate_tokens["rsu"]
-    assert (await renewed(served, before)).status_code == 201
-    await served.ego(session).dismiss("rsu")
-    problem(await renewed(served, before), 401, "unauthenticated")
-    await served.ego(session).enrol(["rsu"])
-    problem(await renewed(served, before), 401, "unauthenticated")
-
-
-@pytest.mark.parametrize("kept", [True, False])
-async def test_a_token_of_which_the_store_does_not_say_whether_it_is_kept_comes_again(served, kept, monkeypatch):
-    session = await served.open()
-    with monkeypatch.context() as failing:
-        keep = served.gateway.store.renew_token
-
-        async def fail(*arguments):
-            if kept:
-                await keep(*arguments)
-            raise StoreUnavailable
-
-        failing.setattr(served.gateway.store, "renew_token", fail)
-        problem(await renewed(served, session.ego_token), 503, "store-unavailable")
-    token = (await renewed(served, session.ego_token)).json()["token"]
-    assert (await renewed(served, session.ego_token)).json()["token"] == token
-    session = dataclasses.replace(session, ego_token=token)
-    events = [record["event"] for record in await served.ego(session).audit()]
-    assert events.count("token_renewed") == 1
+    answers = await asyncio.gather(*(client.renew() for client in unit), return_exceptions=True)
+    assert sum(isinstance(answer, AccessDenied) for answer in answers) == 1
 
 
 async def test_a_vehicle_that_leaves_while_it_waits_for_a_token_gets_none(served):
