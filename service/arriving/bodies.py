@@ -89,35 +89,41 @@ def _timed(took_s: list[float], body: bytes, model: type[Model], context: Any) -
 
 
 def _parsed(body: bytes, model: type[Model], context: Any) -> Model:
+    if body.count(b"[") + body.count(b"{") > MOST_VALUES:  # of which each is a value
+        raise _too_many("body")
     try:
         plain = json.loads(body, object_pairs_hook=named_once)
     except (ValueError, RecursionError) as error:
         raise Refused(Kind.MALFORMED_JSON, f"not JSON: {error}") from None
-    _check_number(plain)
+    _check_number(plain, model)
     try:
         return model.model_validate_json(body, context=context)
     except ValidationError as error:
         raise RequestValidationError(error.errors(include_url=False, include_input=False)) from None
 
 
-def _check_number(plain: Any) -> None:
-    left, number = [("", plain)], 0
+def _check_number(plain: Any, model: type[BaseModel]) -> None:
+    left, number = [("body", plain)], 0
     while left:
         field, value = left.pop()
         if isinstance(value, dict):
             if len(value) > MOST_MEMBERS:
                 detail = f"an object may have {MOST_MEMBERS} members, got {len(value)}"
-                raise Refused(Kind.INVALID_REQUEST, detail, field or "body")
-            parts = [(f"{field}.{name}" if field else name, part) for name, part in value.items()]
+                raise Refused(Kind.INVALID_REQUEST, detail, field)
+            known = model.model_fields if value is plain else ()
+            parts = [(name if name in known else field, part) for name, part in value.items()]
         elif isinstance(value, list):
-            parts = [] if len(value) > MOST_VALUES else [(field, part) for part in value]
+            parts = [(field, part) for part in value[:MOST_VALUES]]
         else:
             continue
         number += len(value)
         if number > MOST_VALUES:
-            detail = f"at most {MOST_VALUES} values are allowed"
-            raise Refused(Kind.INVALID_REQUEST, detail, field or "body")
+            raise _too_many(field)
         left += parts
+
+
+def _too_many(field: str) -> Refused:
+    return Refused(Kind.INVALID_REQUEST, f"at most {MOST_VALUES} values are allowed", field)
 
 
 def _in_full(node: Any, definitions: dict[str, Any]) -> Any:

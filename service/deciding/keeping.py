@@ -15,7 +15,7 @@ from robosac.audit.packing import packed_state
 from robosac.defenses import State
 from robosac.fusion import FusionResult
 from service.deciding.asked import Asked, Present
-from service.errors import GivenUp, StoreTooSlow
+from service.errors import GivenUp, StoreTooSlow, StoreUnavailable
 from service.keeping.patience import GRACE_S, Patience, ask_for_the_exception
 from service.keeping.record import SessionRecord
 from service.keeping.store import Store
@@ -100,10 +100,12 @@ class _Write:
             self.kept = await keeping.store.decide(record, event, next_seed, body, patience, keep_frames)
         except GivenUp:  # whoever gave up has undone it
             return
-        except BaseException:
+        except BaseException as error:
             with contextlib.suppress(GivenUp):
                 self.patience.check()
                 self.undo()
+            if isinstance(error, StoreUnavailable) and answer.deadline_met:
+                asked.caller.live.unsure = asked.frame, next_seed
             raise
         self._remember()
         if self.is_too_late and answer.deadline_met:
@@ -138,7 +140,7 @@ class _Write:
         """What the next frame is judged by."""
         asked, live = self.asked, self.asked.caller.live
         live.equivocations.clear()
-        live.team_changes = 0
+        live.team_changes, live.unsure = 0, None
         live.session.remember(self.result)
         live.answered, live.ego_proof = asked.frame, asked.ego.proof
         live.gathering.close(asked.frame)

@@ -24,6 +24,8 @@ CLOCKS_APART_S = 300.0
 """So long proofs are remembered that do not count any more: by the clock of another gateway they may."""
 LINE_BYTES = 2**16
 """Of a line of a log, with a whole state in it."""
+MOST_ROOM = 8 * 2**20
+"""More is not written to see whether there is room for it."""
 
 
 def secret(connection: Connection, name: str, make: Callable[[], str]) -> str:
@@ -44,9 +46,10 @@ def change(connection: Connection, room: int = LINE_BYTES) -> None:
     if file is not None and shutil.disk_usage(Path(file).absolute().parent).free < 2 * room:
         raise OSError(errno.ENOSPC, os.strerror(errno.ENOSPC))
     undone = connection.begin_nested()
-    line = literal(token_hex(room // 2))  # at random, as it may be compressed
-    of_any = select(sessions.c.session_id, literal(0), line, literal(day())).limit(1)
-    connection.execute(insert(audit_lines).from_select(["session_id", "seq", "line", "day"], of_any))
+    for number in range(0, min(room, MOST_ROOM), LINE_BYTES):
+        line = literal(token_hex(LINE_BYTES // 2))  # at random, as it may be compressed
+        of_any = select(sessions.c.session_id, literal(-number), line, literal(day())).limit(1)
+        connection.execute(insert(audit_lines).from_select(["session_id", "seq", "line", "day"], of_any))
     undone.rollback()
     keep = text(
         "INSERT INTO secrets (name, value) VALUES ('changed', :value) ON CONFLICT (name) DO UPDATE SET value = :value"

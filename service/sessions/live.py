@@ -82,6 +82,10 @@ class LiveSession:
     refusals: Refusals = field(default_factory=Refusals)
     late: list[int] = field(default_factory=list)
     """Frames whose records say that they were in time, and whose answers were late: the next record tells."""
+    unsure: tuple[int, str] | None = None
+    """A frame whose record says that it was in time, and the seed drawn with it, where the store failed, and may have
+    kept it all the same.
+    """
     equivocations: Counter[str] = field(default_factory=Counter)
     renewals: defaultdict[str, deque[float]] = field(
         default_factory=lambda: defaultdict(partial(deque, maxlen=RENEWALS))
@@ -119,9 +123,16 @@ class LiveSession:
             self.team, self.public_keys, self.token_ids = record.teammates, record.public_keys, record.token_ids
         if record.last_frame is not None and record.last_frame > self.gathering.closed:
             self.gathering.close(record.last_frame)
+        self.settle(record)
         self.session.state = record.state
         if record.last_frame != self.answered:
             self.session.previous = self.ego_proof = None
+
+    def settle(self, record: SessionRecord) -> None:
+        """Find out whether a decision was kept of which the store did not say so: nobody got the answer in time."""
+        if self.unsure is not None and self.unsure == (record.last_frame, record.seed):
+            self.late.append(self.unsure[0])
+            self.unsure = None
 
     def _is_who_it_was(self, vehicle: str, record: SessionRecord) -> bool:
         same_key = self.public_keys.get(vehicle) == record.public_keys.get(vehicle)
@@ -142,7 +153,7 @@ class LiveSession:
     def count_on(self, before: LiveSession) -> None:
         """Count what there was before since the last decision."""
         self.refusals, self.late, self.equivocations = before.refusals, before.late, before.equivocations
-        self.renewals, self.team_changes = before.renewals, before.team_changes
+        self.renewals, self.team_changes, self.unsure = before.renewals, before.team_changes, before.unsure
         self.unrecorded = before.unrecorded
 
     def count_anew(self) -> Refusals:

@@ -314,6 +314,8 @@ class Sessions:
         *checks: Callable[[SessionRecord], None],
     ) -> None:
         live = self._live.get(session_id)
+        if live is not None and live.unsure is not None and (record := await self.store.get(session_id)) is not None:
+            live.settle(record)
         ended = SessionEnded(why=why, late=() if live is None else tuple(live.late))
         with contextlib.suppress(SessionOver):
             await self.store.end(session_id, ended, unused_since, *checks)

@@ -12,11 +12,11 @@ from robosac.audit.events import TeamChanged, TokenRenewed
 from robosac.budget import DomainError
 from robosac.defenses import Defense
 from robosac.session import changed_team
-from service.errors import Kind, Refused
+from service.errors import Kind, Refused, StoreUnavailable
 from service.keeping.record import SessionRecord
 from service.keeping.store import Store
 from service.schemas import ChangedTeam, RenewedToken
-from service.sessions.identity import Tokens
+from service.sessions.identity import Token, Tokens
 from service.sessions.live import RENEWALS, Caller
 from service.sessions.sessions import Sessions
 from service.settings import Settings
@@ -25,6 +25,8 @@ RENEWALS_WITHIN_S = 3600.0
 """In so long a vehicle may take `RENEWALS` tokens, or in a token's lifetime if that is shorter: each leaves a record,
 and its ego's log must not be filled.
 """
+FINDING_OUT_S = 2.0
+"""So long it is asked whether a token is kept of which the store did not say so."""
 MAX_CHANGES = 128
 """Changes of a team between two frames: each leaves a record with all that the defence remembers."""
 
@@ -83,10 +85,34 @@ class Teams:
             taken.append(time.monotonic())
             token = self.tokens.issue(record.session_id, vehicle, is_ego=caller.is_ego)
             event = TokenRenewed(vehicle_id=vehicle, expires_at=token.expires_at)
-            kept = await self.store.renew_token(record.session_id, record.token_ids[vehicle], token.token_id, event)
+            try:
+                kept = await self.store.renew_token(record.session_id, record.token_ids[vehicle], token.token_id, event)
+            except StoreUnavailable:
+                kept = await self._kept_all_the_same(record.session_id, vehicle, token)
             caller.live.token_ids = {**caller.live.token_ids, vehicle: token.token_id}  # what it has sent still counts
             receipt = self.sessions.keys.receipt(kept)
             return RenewedToken(token=token.text, expires_at=token.expires_at, receipt=receipt)
+
+    async def _kept_all_the_same(self, session_id: str, vehicle: str, token: Token) -> SessionRecord:
+        """The session with a new token of which the store did not say that it is kept. The vehicle has no other then.
+
+        Raises
+        ------
+        StoreUnavailable
+            If it is not kept, or the store does not tell.
+        """
+        until = time.monotonic() + FINDING_OUT_S
+        while True:
+            try:
+                record = await self.store.get(session_id)
+            except StoreUnavailable:
+                if time.monotonic() >= until:
+                    raise
+                await asyncio.sleep(FINDING_OUT_S / 10)
+            else:
+                if record is None or record.token_ids.get(vehicle) != token.token_id:
+                    raise StoreUnavailable
+                return record
 
     async def _change_team(
         self,

@@ -9,6 +9,7 @@ import pytest
 from clients.errors import GatewayUnavailable
 from robosac import wire
 from service import routes
+from service.errors import StoreUnavailable
 from service.keeping.patience import GRACE_S
 from tests.service.conftest import EGO, TEAM, problem, serve
 
@@ -133,6 +134,64 @@ async def test_a_decision_past_the_point_of_return_is_found_out_about_before_the
     assert (await on_disk.post(session, "frames", good_frame(2))).json()["source"] == "consensus"
     records = [r for r in await on_disk.ego(session).audit() if r["event"] == "frame_answered"]
     assert [(record["frame"], record.get("late", [])) for record in records] == [(0, []), (1, []), (2, [1])]
+
+
+def failing_after(keep, *, kept):
+    """A store that keeps what it is given, or does not, and fails then."""
+
+    async def fail(*arguments):
+        if kept:
+            await keep(*arguments)
+        raise StoreUnavailable
+
+    return fail
+
+
+async def late_of_all(ego):
+    told = (r for r in await ego.audit() if r["event"] in ("frame_answered", "session_ended"))
+    return [record.get("late", []) for record in told]
+
+
+@pytest.mark.parametrize(("kept", "end"), [(True, "frame"), (True, "close"), (False, "frame")])
+async def test_a_decision_of_which_the_store_does_not_say_whether_it_is_kept_was_late(
+    on_disk, good_frame, monkeypatch, kept, end
+):
+    session, store = await on_disk.open(latency_budget_ms=2000, gather_ms=0), on_disk.gateway.store
+    with monkeypatch.context() as failing:
+        failing.setattr(store, "decide", failing_after(store.decide, kept=kept))
+        problem(await on_disk.post(session, "frames", good_frame(0)), 503, "store-unavailable")
+    again = await on_disk.post(session, "frames", good_frame(0))
+    if kept:
+        problem(again, 409, "stale-frame")
+    assert again.status_code == 409 or again.json()["deadline_met"]
+    if end == "frame":
+        assert (await on_disk.post(session, "frames", good_frame(1))).status_code == 200
+    ego, late = on_disk.ego(session), [0] if kept else []
+    await ego.close()
+    assert await late_of_all(ego) == ([[], late, []] if end == "frame" else [[], late])
+
+
+async def test_of_an_idle_session_it_is_found_out_as_well(path, good_frame, monkeypatch):
+    async with serve(database_url=f"sqlite:///{path}", session_idle_s=1) as served:
+        session, store = await served.open(latency_budget_ms=2000, gather_ms=0), served.gateway.store
+        monkeypatch.setattr(store, "decide", failing_after(store.decide, kept=True))
+        problem(await served.post(session, "frames", good_frame(0)), 503, "store-unavailable")
+        while (await store.get(session.session_id)).ended_at is None:
+            await asyncio.sleep(0.3)
+            await served.gateway.sessions.sweep()
+        assert await late_of_all(served.ego(session)) == [[], [0]]
+
+
+async def test_what_another_process_answered_in_time_was_not_late(path, good_frame, monkeypatch):
+    url = f"sqlite:///{path}"
+    async with serve(database_url=url) as one, serve(database_url=url) as other:
+        session, store = await one.open(latency_budget_ms=2000, gather_ms=0), one.gateway.store
+        with monkeypatch.context() as failing:
+            failing.setattr(store, "decide", failing_after(store.decide, kept=False))
+            problem(await one.post(session, "frames", good_frame(0)), 503, "store-unavailable")
+        assert (await other.post(session, "frames", good_frame(0))).json()["deadline_met"]
+        assert (await one.post(session, "frames", good_frame(1))).status_code == 200
+        assert await late_of_all(one.ego(session)) == [[], []]
 
 
 @pytest.mark.parametrize("stalled", ["store", "engine"])

@@ -9,6 +9,7 @@ import jwt
 import pytest
 
 from clients.errors import AccessDenied, InvalidRequest, SessionNotFound
+from service.errors import StoreUnavailable
 from service.sessions import identity, teams
 from service.sessions.identity import AUDIENCE, CLAIMS, ISSUER
 from tests.service.conftest import EGO, problem, serve
@@ -132,6 +133,39 @@ async def test_of_two_renewals_with_one_token_only_one_is_granted(served):
     unit = [served.teammate(session, "rsu"), served.teammate(session, "rsu")]
     answers = await asyncio.gather(*(client.renew() for client in unit), return_exceptions=True)
     assert sum(isinstance(answer, AccessDenied) for answer in answers) == 1
+
+
+@pytest.mark.parametrize("kept", ["yes", "no", "nobody knows"])
+async def test_a_token_of_which_the_store_does_not_say_that_it_is_kept_is_looked_for(served, kept, monkeypatch):
+    session, store = await served.open(), served.gateway.store
+    path = f"/v1/sessions/{session.session_id}/token"
+    monkeypatch.setattr(teams, "FINDING_OUT_S", 0.3)
+    with monkeypatch.context() as failing:
+        keep, get, left = store.renew_token, store.get, [2 if kept == "yes" else 0]
+
+        async def fail(*arguments):
+            if kept != "no":
+                await keep(*arguments)
+            failing.setattr(store, "get", away)
+            raise StoreUnavailable
+
+        async def away(session_id):
+            left[0] -= 1
+            if left[0] >= 0 or kept == "nobody knows":
+                raise StoreUnavailable
+            return await get(session_id)
+
+        failing.setattr(store, "renew_token", fail)
+        answer = await served.http.post(path, headers=bearer(session.ego_token))
+    if kept == "yes":
+        session = dataclasses.replace(session, ego_token=answer.json()["token"])
+    else:
+        problem(answer, 503, "store-unavailable")
+    if kept != "nobody knows":
+        again = await served.http.post(path, headers=bearer(session.ego_token))
+        session = dataclasses.replace(session, ego_token=again.json()["token"])
+        events = [record["event"] for record in await served.ego(session).audit()]
+        assert events.count("token_renewed") == 1 + (kept == "yes")
 
 
 async def test_a_vehicle_that_leaves_while_it_waits_for_a_token_gets_none(served):
