@@ -13,7 +13,7 @@ A message is refused only on evidence that cannot be turned against somebody hon
 
 What another teammate had sent first, in a frame of which it is remembered that this one sent something else in it, is
 refused as well, and names nobody: it may be its own, sent late, and overheard by the other. Whoever was silent then
-stays in. So is what a vehicle sent itself not long ago: it may have nothing new.
+stays in. Nor does it name anybody who sends again what it sent not long ago: it may have nothing new.
 
 Two messages that are merely alike are told, and stay in. Nobody can know from the maps who copied. And the maps of an
 honest vehicle that drives on an empty road, between walls or in a platoon are as alike as .99.
