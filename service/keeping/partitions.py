@@ -48,28 +48,24 @@ def make_ahead(connection: Connection) -> None:
     """
     if not are_there(connection):
         return
-    wanted = [name_of(day() + ahead) for ahead in range(AHEAD + 1)]
-    if set(connection.execute(_PARTS).scalars()) >= set(wanted):
+    today = day()
+    wanted = {name_of(number): number for number in range(today, today + AHEAD + 1)}
+    if set(connection.execute(_PARTS).scalars()) >= wanted.keys():
         return
     migrations.lock(connection)
     known = set(connection.execute(_PARTS).scalars())
     try:
         with connection.begin_nested():
             _wait_briefly(connection)
-            for name in wanted:
+            for name, number in wanted.items():
                 if name not in known:
-                    _make(connection, name)
+                    values = f"FOR VALUES FROM ({number}) TO ({number + 1})"
+                    connection.execute(text(f"CREATE TABLE {name} (LIKE audit_lines INCLUDING DEFAULTS)"))
+                    connection.execute(text(f"ALTER TABLE audit_lines ATTACH PARTITION {name} {values}"))
     except DBAPIError as error:
-        if wanted[0] not in known or error.connection_invalidated:
+        if name_of(today) not in known or error.connection_invalidated:
             raise
         logger.warning("no part of the audit log was made for the next days: %s", describe(error.orig or error))
-
-
-def _make(connection: Connection, name: str) -> None:
-    number = int(_day_of(name))
-    values = f"FOR VALUES FROM ({number}) TO ({number + 1})"
-    connection.execute(text(f"CREATE TABLE {name} (LIKE audit_lines INCLUDING DEFAULTS)"))
-    connection.execute(text(f"ALTER TABLE audit_lines ATTACH PARTITION {name} {values}"))
 
 
 def old(connection: Connection, before: float) -> list[str]:
