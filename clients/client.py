@@ -277,8 +277,10 @@ def _is_to_be_sent_again(response: httpx.Response, method: str, path: str) -> bo
 
 
 def _counts_once(method: str, path: str) -> bool:
-    """Whether it does no harm to send a request again of which nobody knows what came of it: a message counts once."""
-    return method == "GET" or path.endswith(("/messages", "/frames"))
+    """Whether it does no harm to send a request again of which nobody knows what came of it: a message counts once, and
+    a vehicle gets one fresh token however often it asks with one key.
+    """
+    return method == "GET" or path.endswith(("/messages", "/frames", "/token"))
 
 
 def _refusal(response: httpx.Response) -> RequestRefused:

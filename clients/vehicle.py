@@ -5,6 +5,7 @@ from __future__ import annotations
 import asyncio
 import contextlib
 import json
+import secrets
 from collections.abc import AsyncIterator, Generator, Mapping, Sequence
 from dataclasses import dataclass
 from typing import Any, TypeVar
@@ -25,6 +26,7 @@ from robosac.signatures import sign
 
 MSGPACK = "application/vnd.msgpack"
 SESSION_HEADER = "X-Session-Id"
+RENEWAL_KEY_HEADER = "Idempotency-Key"
 RECEIPT_HEADER, HEAD_HEADER = "Audit-Receipt", "Audit-Head"
 AUDIT_PAGE = 1000
 """Audit records that are asked for at a time."""
@@ -105,8 +107,9 @@ class VehicleClient:
 
     async def renew(self) -> RenewedToken:
         """Take a fresh token and speak with it from now on; the one before is worth nothing any more."""
-        before = self._promised
-        response = await self._request("POST", f"{self._path}/token", **self._proven)
+        before, asked = self._promised, self._proven
+        asked["headers"][RENEWAL_KEY_HEADER] = secrets.token_urlsafe(16)  # so that it can be asked again
+        response = await self._request("POST", f"{self._path}/token", **asked)
         renewed = told(response, RenewedToken)
         self.token = renewed.token
         await self._keep(renewed.receipt, before)

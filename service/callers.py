@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from typing import Annotated
+from typing import Annotated, NamedTuple
 
 from fastapi import Depends, Header, Request
 from fastapi.security import HTTPAuthorizationCredentials, HTTPBearer
@@ -11,13 +11,26 @@ from fastapi.security.http import HTTPBase
 from robosac.possession import HEADER, Call
 from service.arriving.paths import path_of
 from service.gateway import Gateway
+from service.sessions.identity import RENEWAL_KEY
 from service.sessions.live import Caller
 
 _token_scheme = HTTPBase(scheme="bearer", auto_error=False, scheme_name="Token", description="A vehicle's token.")
 _api_key = HTTPBearer(auto_error=False, scheme_name="ApiKey", description="An API key, where the gateway has any.")
 _SCHEMES = ("bearer", HEADER.lower())
 """RFC 9449 shows a token in a scheme of its own beside a proof."""
+_RENEWAL_KEY = Header(
+    alias="Idempotency-Key",
+    pattern=RENEWAL_KEY,
+    description="Chosen at random for this renewal: whoever asks again with it and the same token gets the same again.",
+)
 _PROOF = Header(alias=HEADER, description="Proof that the vehicle's key is there, where it registered one (RFC 9449).")
+
+
+class Renewing(NamedTuple):
+    """Who asks for another token, and with which key of its own choice."""
+
+    caller: Caller
+    key: str | None
 
 
 async def _gateway(request: Request) -> Gateway:  # a plain function would be called on another thread
@@ -45,6 +58,12 @@ async def _vehicle(sid: str, gateway: GatewayDep, token: Token) -> Caller:
     return await gateway.sessions.authenticate(sid, token)
 
 
+async def _renewing(
+    sid: str, gateway: GatewayDep, token: Token, renewal_key: Annotated[str | None, _RENEWAL_KEY] = None
+) -> Renewing:
+    return Renewing(await gateway.sessions.authenticate(sid, token, renewal_key), renewal_key)
+
+
 async def _ego(sid: str, gateway: GatewayDep, token: Token) -> Caller:
     return await gateway.sessions.authenticate_ego(sid, token)
 
@@ -60,10 +79,15 @@ async def _check_possession(request: Request, gateway: GatewayDep, caller: Calle
     return caller
 
 
-async def _proven_vehicle(
-    request: Request, gateway: GatewayDep, caller: Vehicle, token: Token, _: Annotated[str | None, _PROOF] = None
-) -> Caller:
-    return await _check_possession(request, gateway, caller, token)
+async def _proven_renewing(
+    request: Request,
+    gateway: GatewayDep,
+    renewing: Annotated[Renewing, Depends(_renewing)],
+    token: Token,
+    _: Annotated[str | None, _PROOF] = None,
+) -> Renewing:
+    await _check_possession(request, gateway, renewing.caller, token)
+    return renewing
 
 
 async def _proven_ego(
@@ -72,6 +96,7 @@ async def _proven_ego(
     return await _check_possession(request, gateway, caller, token)
 
 
-ProvenVehicle = Annotated[Caller, Depends(_proven_vehicle)]
-"""For what a stolen token must not be enough for."""
+ProvenRenewing = Annotated[Renewing, Depends(_proven_renewing)]
+"""For another token, for which a stolen one must not be enough."""
 ProvenEgo = Annotated[Caller, Depends(_proven_ego)]
+"""For what else a stolen token must not be enough for."""

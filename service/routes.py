@@ -20,7 +20,7 @@ from service import description
 from service.arriving.arrival import arrival_of
 from service.arriving.bodies import JSON_BYTES, MSGPACK, MSGPACK_TYPES, STREAMED, check_type, read_json
 from service.arriving.limits import expected_bytes, read_bounded
-from service.callers import Ego, GatewayDep, KeyId, ProvenEgo, ProvenVehicle, Token, Vehicle
+from service.callers import Ego, GatewayDep, KeyId, ProvenEgo, ProvenRenewing, Token, Vehicle
 from service.deciding.asked import Answered
 from service.errors import Kind, Refused
 from service.gateway import Gateway
@@ -160,10 +160,12 @@ async def delete_session(caller: ProvenEgo, gateway: GatewayDep, response: Respo
     tags=["sessions"],
     responses=description.RENEWED,
 )
-async def renew_token(caller: ProvenVehicle, gateway: GatewayDep, response: Response) -> RenewedToken:
-    """A fresh token for the vehicle that asks; the one it asks with is worth nothing any more."""
+async def renew_token(renewing: ProvenRenewing, gateway: GatewayDep, response: Response) -> RenewedToken:
+    """A fresh token for the vehicle that asks; the one it asks with is worth nothing any more. With
+    `Idempotency-Key` the vehicle can ask again if the answer was lost.
+    """
     response.headers.update(_NO_STORE)
-    return await gateway.teams.renew(caller)
+    return await gateway.teams.renew(renewing.caller, renewing.key)
 
 
 @v1.post(

@@ -37,6 +37,8 @@ LEEWAY_S = 10.0
 ISSUER = AUDIENCE = "robosac-gateway"
 ALGORITHM = "HS256"
 CLAIMS = ("iss", "aud", "sub", "sid", "role", "jti", "iat", "exp")
+RENEWAL_KEY = r"^[!-~]{16,256}$"
+"""What a vehicle may choose so that it can ask again for the same fresh token."""
 _BEARER_TOKEN = re.compile(r"[A-Za-z0-9._~+/-]+=*")  # RFC 6750, section 2.1
 
 
@@ -167,9 +169,32 @@ class Tokens:
 
     def issue(self, session_id: str, vehicle_id: str, *, is_ego: bool) -> Token:
         """A token of a vehicle for a session."""
-        now = int(self.clock())
-        expires = now + int(self._ttl_s)
-        token_id = secrets.token_hex(16)
+        return self._token(session_id, vehicle_id, is_ego, secrets.token_hex(16), int(self.clock()) + int(self._ttl_s))
+
+    def renewed(self, record: SessionRecord, vehicle_id: str, before: str, key: str | None) -> Token:
+        """A token of a vehicle in place of the one with the id ``before``. With a ``key``, `again` finds it again."""
+        if key is None:
+            return self.issue(record.session_id, vehicle_id, is_ego=vehicle_id == record.ego_id)
+        expires = int(self.clock()) + int(self._ttl_s)
+        token_id = _renewed_id(self._secrets[0], record.session_id, vehicle_id, before, key, expires)
+        return self._token(record.session_id, vehicle_id, vehicle_id == record.ego_id, token_id, expires)
+
+    def again(self, record: SessionRecord, vehicle_id: str, before: str, key: str | None) -> Token | None:
+        """The vehicle's latest token, if it was made in place of the one with the id ``before`` and with this ``key``.
+
+        Nothing of it is remembered: its id tells, to whoever has the secret. So it holds after a restart, and in
+        another process. Whoever stole the token before does not have the key.
+        """
+        latest = record.token_ids.get(vehicle_id, "")
+        expires = latest.partition("-")[0]
+        if key is None or not expires.isdecimal():
+            return None
+        of = record.session_id, vehicle_id, before, key, int(expires)
+        if not any(hmac.compare_digest(latest, _renewed_id(secret, *of)) for secret in self._secrets):
+            return None
+        return self._token(record.session_id, vehicle_id, vehicle_id == record.ego_id, latest, int(expires))
+
+    def _token(self, session_id: str, vehicle_id: str, is_ego: bool, token_id: str, expires: int) -> Token:
         claims = {
             "iss": ISSUER,
             "aud": AUDIENCE,
@@ -177,7 +202,7 @@ class Tokens:
             "sid": session_id,
             "role": _role(is_ego),
             "jti": token_id,
-            "iat": now,
+            "iat": int(self.clock()),
             "exp": expires,
         }
         expires_at = datetime.fromtimestamp(expires, UTC).isoformat().replace("+00:00", "Z")
@@ -189,8 +214,10 @@ class Tokens:
             lambda: {vehicle: self.issue(session_id, vehicle, is_ego=vehicle == ego_id) for vehicle in vehicles}
         )
 
-    def holder(self, record: SessionRecord, text: str | None) -> str:
-        """The vehicle that may speak in a session with this token.
+    def holder(self, record: SessionRecord, text: str | None, key: str | None = None) -> tuple[str, str]:
+        """The vehicle that may speak in a session with this token, and the token's id.
+
+        With the ``key`` with which it was renewed, the token before the vehicle's latest is one, too.
 
         Raises
         ------
@@ -201,14 +228,15 @@ class Tokens:
         if claims is None or claims["sid"] != record.session_id:
             raise TokenRefused("a bearer token of a vehicle of this session is needed")
         vehicle: str = claims["sub"]
-        is_latest = record.token_ids.get(vehicle) == claims["jti"]
-        if not is_latest or claims["role"] != _role(vehicle == record.ego_id):
+        token_id: str = claims["jti"]
+        counts = record.token_ids.get(vehicle) == token_id or self.again(record, vehicle, token_id, key) is not None
+        if not counts or claims["role"] != _role(vehicle == record.ego_id):
             raise TokenRefused(RENEWED, vehicle)
         if claims["iat"] > self.clock() + LEEWAY_S:
             raise TokenRefused("the token is from the future: the gateways' clocks are too far apart", vehicle)
         if claims["exp"] <= self.clock() - LEEWAY_S:
             raise TokenRefused("the token has expired", vehicle, Kind.TOKEN_EXPIRED)
-        return vehicle
+        return vehicle, token_id
 
     def signed(self, session_id: str, text: str) -> bool:
         """Whether this gateway made a token for a session. It may count no more: the session's record tells."""
@@ -259,6 +287,11 @@ def claimed(text: str) -> Claimed | None:
         return None
     named = [claim for claim in (claims.get(name) for name in ("sid", "sub", "jti")) if isinstance(claim, str)]
     return Claimed(*named) if len(named) == len(Claimed._fields) else None
+
+
+def _renewed_id(secret: str, session_id: str, vehicle_id: str, before: str, key: str, expires: int) -> str:
+    named = json.dumps(["robosac renewed token", session_id, vehicle_id, before, key, expires]).encode()
+    return f"{expires}-{hmac.new(secret.encode(), named, sha256).hexdigest()[:32]}"
 
 
 def _role(is_ego: bool) -> str:

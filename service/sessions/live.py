@@ -169,6 +169,8 @@ class Caller:
     record: SessionRecord
     live: LiveSession
     vehicle_id: str
+    token_id: str
+    """Of the token that it came with."""
 
     @property
     def is_ego(self) -> bool:
@@ -183,7 +185,7 @@ class Caller:
         TokenReplaced
             If the token was renewed, or its vehicle has left, even if that has joined again since.
         """
-        if now.token_ids.get(self.vehicle_id) != self.record.token_ids[self.vehicle_id]:
+        if now.token_ids.get(self.vehicle_id) != self.token_id:
             raise TokenReplaced
 
     @property

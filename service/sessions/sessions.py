@@ -87,8 +87,8 @@ class Sessions:
         """Take nothing new: the process is to end, and another goes on with its sessions."""
         self.moving.drain(self._live.values())
 
-    async def authenticate(self, session_id: str, token: str | None) -> Caller:
-        """The vehicle that a token belongs to.
+    async def authenticate(self, session_id: str, token: str | None, renewal_key: str | None = None) -> Caller:
+        """The vehicle that a token belongs to; with a ``renewal_key`` also one before its latest, see `Tokens.holder`.
 
         Raises
         ------
@@ -109,7 +109,7 @@ class Sessions:
         if record is None or record.ended_at is not None:
             self._forget(session_id)
             raise SessionOver("there is no such session; it may have ended or expired")
-        vehicle = await self._holder(record, token)
+        vehicle, token_id = await self._holder(record, token, renewal_key)
         is_ego = vehicle == record.ego_id
         try:
             live = self._live_session(record)
@@ -122,7 +122,7 @@ class Sessions:
             live = self._live_session(record)
         live.follow(record)
         live.last_used = time.monotonic()
-        return Caller(record, live, vehicle)
+        return Caller(record, live, vehicle, token_id)
 
     async def authenticate_ego(self, session_id: str, token: str | None) -> Caller:
         """As `authenticate`, but nobody but the ego is let in."""
@@ -147,8 +147,10 @@ class Sessions:
             raise SessionOver("there is no such session; its log may have been purged")
         if record.ended_at is None and self._is_served(record):
             await self.authenticate_ego(session_id, token)
-        elif (vehicle := await self._holder(record, token)) != record.ego_id:
-            raise _ego_only(vehicle)
+        else:
+            vehicle, _ = await self._holder(record, token)
+            if vehicle != record.ego_id:
+                raise _ego_only(vehicle)
         return await begun(pages(self.store, session_id, after, min(record.audit_seq, after + limit)))
 
     async def describe(self, caller: Caller) -> SessionState:
@@ -342,10 +344,12 @@ class Sessions:
             live.count_on(before)
         return live
 
-    async def _holder(self, record: SessionRecord, token: str | None) -> str:
-        """The vehicle of the session that a token belongs to; a refusal goes on record, but only so many of them."""
+    async def _holder(
+        self, record: SessionRecord, token: str | None, renewal_key: str | None = None
+    ) -> tuple[str, str]:
+        """As `Tokens.holder`; a refusal goes on record, but only so many of them."""
         try:
-            return self.tokens.holder(record, token)
+            return self.tokens.holder(record, token, renewal_key)
         except TokenRefused as refused:
             live = self._live_session(record) if record.ended_at is None and self._is_served(record) else None
             await self.journal.stranger(record.session_id, live, refused)

@@ -12,7 +12,7 @@ from robosac.audit.events import TeamChanged, TokenRenewed
 from robosac.budget import DomainError
 from robosac.defenses import Defense
 from robosac.session import changed_team
-from service.errors import Kind, Refused, StoreUnavailable
+from service.errors import Kind, Refused, StoreUnavailable, TokenReplaced
 from service.keeping.record import SessionRecord
 from service.keeping.store import Store
 from service.schemas import ChangedTeam, RenewedToken
@@ -73,25 +73,39 @@ class Teams:
             kept = await self._change_team(caller, record, team, token_ids, keys)
             return self.sessions.keys.receipt(kept)
 
-    async def renew(self, caller: Caller) -> RenewedToken:
-        """A fresh token of the caller; the one it came with is worth nothing any more."""
+    async def renew(self, caller: Caller, key: str | None = None) -> RenewedToken:
+        """A fresh token of the caller; the one it came with is worth nothing any more. With a ``key`` of the caller's
+        choice the same comes again, as often as it asks with that and with the token before.
+        """
         vehicle = caller.vehicle_id
         async with caller.live.lock:  # else a team that changes meanwhile would bring the old token back
             record = await self.sessions.current(caller)
+            again = self.tokens.again(record, vehicle, caller.token_id, key)
+            if again is not None:
+                return self._renewed(again, record)
             caller.check_token(record)
             taken, within_s = caller.live.renewals[vehicle], min(RENEWALS_WITHIN_S, self.settings.token_ttl_s)
             if len(taken) == RENEWALS and time.monotonic() - taken[0] < within_s:
                 raise Refused(Kind.TOO_MANY_RENEWALS, f"a vehicle may have {RENEWALS} tokens in {within_s:g} s")
             taken.append(time.monotonic())
-            token = self.tokens.issue(record.session_id, vehicle, is_ego=caller.is_ego)
+            token = self.tokens.renewed(record, vehicle, caller.token_id, key)
             event = TokenRenewed(vehicle_id=vehicle, expires_at=token.expires_at)
             try:
-                kept = await self.store.renew_token(record.session_id, record.token_ids[vehicle], token.token_id, event)
+                kept = await self.store.renew_token(record.session_id, caller.token_id, token.token_id, event)
             except StoreUnavailable:
                 kept = await self._kept_all_the_same(record.session_id, vehicle, token)
+            except TokenReplaced:  # by another process, that may have been asked for the same
+                now = await self.store.get(record.session_id)
+                again = None if now is None else self.tokens.again(now, vehicle, caller.token_id, key)
+                if now is None or again is None:
+                    raise
+                return self._renewed(again, now)
             caller.live.token_ids = {**caller.live.token_ids, vehicle: token.token_id}  # what it has sent still counts
-            receipt = self.sessions.keys.receipt(kept)
-            return RenewedToken(token=token.text, expires_at=token.expires_at, receipt=receipt)
+            return self._renewed(token, kept)
+
+    def _renewed(self, token: Token, record: SessionRecord) -> RenewedToken:
+        receipt = self.sessions.keys.receipt(record)
+        return RenewedToken(token=token.text, expires_at=token.expires_at, receipt=receipt)
 
     async def _kept_all_the_same(self, session_id: str, vehicle: str, token: Token) -> SessionRecord:
         """The session with a new token of which the store did not say that it is kept. The vehicle has no other then.

@@ -3,6 +3,7 @@ import asyncio
 import httpx
 import numpy as np
 import pytest
+from cryptography.hazmat.primitives.asymmetric.ed25519 import Ed25519PrivateKey
 
 from clients.client import STORE_UNAVAILABLE, FrameAnswer, GatewayClient
 from clients.errors import (
@@ -114,6 +115,24 @@ async def test_what_does_no_harm_is_sent_again(status, problem, path, again):
             with pytest.raises(GatewayUnavailable):
                 await client._request("POST", path)
     assert asked == [path] * (3 if again else 1)
+
+
+async def test_a_token_whose_answer_was_lost_is_asked_for_again_with_the_same_key_and_a_new_proof():
+    asked = []
+
+    def answer(request):
+        asked.append((request.headers["Idempotency-Key"], request.headers["DPoP"]))
+        if len(asked) % 2:
+            raise httpx.ReadError("lost")
+        return httpx.Response(201, json={"token": f"fresh {len(asked)}", "expires_at": "2026-11-28T00:00:00Z"})
+
+    async with gateway(answer) as client:
+        ego = client.vehicle("s", "car-1", "old", Ed25519PrivateKey.generate())
+        assert [(await ego.renew()).token, (await ego.renew()).token] == ["fresh 2", "fresh 4"]
+    keys, proofs = zip(*asked, strict=True)
+    assert (keys[0], keys[2]) == (keys[1], keys[3])
+    assert len(set(keys)) == 2
+    assert len(set(proofs)) == 4
 
 
 async def test_nothing_is_sent_again_for_ever(monkeypatch):

@@ -17,6 +17,7 @@ from robosac.detectors.embedded import SHIPPED_WEIGHTS, EmbeddedDetector
 from service.keeping.tables import sessions
 from service.sessions.idle import Idle
 from tests.service.conftest import EGO, HOOKED, TEAM, problem, serve
+from tests.service.credentials import bearer, claims_of
 
 
 @pytest.fixture
@@ -256,6 +257,17 @@ async def test_a_token_is_renewed_at_one_gateway_only(two):
         (renewed,) = [outcome for outcome in outcomes if not isinstance(outcome, AccessDenied)]
         session.teammate_tokens["rsu"] = renewed.token
     await two[1].teammate(session, "rsu").renew()
+
+
+async def test_two_gateways_that_are_asked_for_one_fresh_token_give_the_same(two):
+    session = await two[0].open()
+    path, headers = f"/v1/sessions/{session.session_id}/token", bearer(session.teammate_tokens["rsu"])
+    for turn in range(5):
+        asked = {**headers, "Idempotency-Key": f"chosen-at-random-{turn}"}
+        answers = await asyncio.gather(*(served.http.post(path, headers=asked) for served in two))
+        fresh = [answer.json()["token"] for answer in answers]
+        assert len({claims_of(token)["jti"] for token in fresh}) == 1
+        headers = bearer(fresh[0])
 
 
 async def test_who_is_dismissed_at_one_gateway_gets_no_fresh_token_at_the_other(two):

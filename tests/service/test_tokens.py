@@ -168,6 +168,40 @@ async def test_a_token_of_which_the_store_does_not_say_that_it_is_kept_is_looked
         assert events.count("token_renewed") == 1 + (kept == "yes")
 
 
+async def test_a_vehicle_asks_again_for_a_token_whose_answer_was_lost_with_the_key_that_it_chose(served):
+    session = await served.open()
+    path, key, old = f"/v1/sessions/{session.session_id}/token", "chosen-at-random-1", bearer(session.ego_token)
+    first = await renewed(served, path, old, key)
+    assert await renewed(served, path, old, key) == first
+    for headers in (old, {**old, "Idempotency-Key": "chosen-at-random-2"}):
+        problem(await served.http.post(path, headers=headers), 401, "unauthenticated")
+    mate = await renewed(served, path, bearer(session.teammate_tokens["rsu"]), key)
+    assert mate[1] != first[1]
+    problem(await served.http.get(path.removesuffix("/token"), headers=old), 401, "unauthenticated")
+    second = await renewed(served, path, bearer(first[0]), key)
+    assert second[1] != first[1]
+    problem(await served.http.post(path, headers={**old, "Idempotency-Key": key}), 401, "unauthenticated")
+    records = await served.client.vehicle(session.session_id, EGO, second[0]).audit()
+    assert [r["vehicle_id"] for r in records if r["event"] == "token_renewed"] == [EGO, "rsu", EGO]
+
+
+async def renewed(served, path, headers, key):
+    """The token that a vehicle gets with a key of its choice, its id and its end."""
+    answer = await served.http.post(path, headers={**headers, "Idempotency-Key": key})
+    assert answer.status_code == 201, answer.text
+    token = answer.json()["token"]
+    return token, claims_of(token)["jti"], answer.json()["expires_at"]
+
+
+@pytest.mark.parametrize("key", ["", "x" * 15, "x" * 257, "chosen at random, with spaces"])
+async def test_a_key_of_a_renewal_that_could_be_guessed_is_refused(served, key):
+    session = await served.open()
+    headers = {**bearer(session.ego_token), "Idempotency-Key": key}
+    refused = await served.http.post(f"/v1/sessions/{session.session_id}/token", headers=headers)
+    assert problem(refused, 422, "invalid-request")["field"] == "header.Idempotency-Key"
+    assert (await served.ego(session).state())["ego_id"] == EGO
+
+
 async def test_a_vehicle_that_leaves_while_it_waits_for_a_token_gets_none(served):
     session = await served.open()
     async with (await served.gateway.sessions.authenticate(session.session_id, session.ego_token)).live.lock:
@@ -273,12 +307,16 @@ async def test_tokens_outlive_a_restart_and_a_rotation_of_secrets(secrets, good_
     database = f"sqlite:///{tmp_path}/robosac.db"
     async with serve(database_url=database, token_secrets=secrets[0]) as served:
         session = await served.open()
-        renewed = await served.teammate(session, "rsu").renew()
+        mate = await served.teammate(session, "rsu").renew()
+        path, key = f"/v1/sessions/{session.session_id}/token", "chosen-at-random-1"
+        own = await renewed(served, path, bearer(session.teammate_tokens["car-2"]), key)
     async with serve(database_url=database, token_secrets=secrets[1]) as served:
+        again = await renewed(served, path, bearer(session.teammate_tokens["car-2"]), key)
+        assert again[1:] == own[1:]
         assert (await served.post(session, "frames", good_frame(0))).status_code == 200
         with pytest.raises(AccessDenied):
             await served.teammate(session, "rsu").renew()
-        unit = served.client.vehicle(session.session_id, "rsu", renewed.token)
+        unit = served.client.vehicle(session.session_id, "rsu", mate.token)
         fresh = (await unit.renew()).token
     if secrets[1].startswith(OTHER_SECRET):
         async with serve(database_url=database, token_secrets=OTHER_SECRET) as served:
