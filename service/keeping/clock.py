@@ -2,11 +2,36 @@
 
 from __future__ import annotations
 
+import sqlite3
 import time
+from typing import Any
 
-from sqlalchemy import Connection, text
+from sqlalchemy import Connection, Double, select
+from sqlalchemy.ext.compiler import compiles
+from sqlalchemy.sql.compiler import SQLCompiler
+from sqlalchemy.sql.functions import FunctionElement
 
-_NOW = text("SELECT CAST(extract(epoch FROM clock_timestamp()) AS double precision)")
+
+class Now(FunctionElement[float]):
+    """Unix time by the database's clock: what gateways write must not look older for the clock of one of them."""
+
+    inherit_cache = True
+    type = Double()
+
+
+@compiles(Now)
+def _of_server(_: Now, __: SQLCompiler, **___: Any) -> str:
+    return "CAST(extract(epoch FROM clock_timestamp()) AS double precision)"
+
+
+@compiles(Now, "sqlite")
+def _of_machine(_: Now, __: SQLCompiler, **___: Any) -> str:
+    return "unix_time()"
+
+
+def tell_time(connection: sqlite3.Connection) -> None:
+    """Let a connection of SQLite, which has no clock of its own, know this machine's."""
+    connection.create_function("unix_time", 0, time.time)
 
 
 def ahead_s(connection: Connection) -> float:
@@ -17,6 +42,6 @@ def ahead_s(connection: Connection) -> float:
     if connection.dialect.name != "postgresql":
         return 0.0
     before = time.time()
-    there: float = connection.execute(_NOW).scalar_one()
+    there: float = connection.execute(select(Now())).scalar_one()
     after = time.time()
     return before - there if before > there else min(0.0, after - there)

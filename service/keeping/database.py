@@ -30,6 +30,7 @@ from sqlalchemy.pool import NullPool, QueuePool
 from robosac.extras import need
 from robosac.faults import describe
 from service.errors import StoreUnavailable
+from service.keeping import clock
 from service.keeping.limits import UNBOUND, Limits
 from service.keeping.place import Place
 from service.keeping.together import Piece, Work, do_each, prepare_each
@@ -273,6 +274,7 @@ class _SqliteThreads:
 def _prepare(connection: Any, _: object) -> None:
     """Leave transactions to us, and see that what is committed survives a power cut."""
     connection.isolation_level = None
+    clock.tell_time(connection)
     cursor = connection.cursor()
     _keep_a_journal(cursor)
     for setting in ("synchronous = FULL", "foreign_keys = ON"):

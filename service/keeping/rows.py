@@ -4,19 +4,19 @@ from __future__ import annotations
 
 import json
 import logging
-import time
 from collections.abc import Mapping
 from dataclasses import fields
 from types import NoneType
 from typing import Any
 
-from sqlalchemy import BigInteger, Row, bindparam, false, func, literal, select, update
+from sqlalchemy import BigInteger, Row, bindparam, false, func, insert, literal, select, update
 from sqlalchemy.ext.compiler import compiles
 from sqlalchemy.sql.compiler import SQLCompiler
 from sqlalchemy.sql.functions import FunctionElement
 
 from robosac.faults import describe
 from service.errors import StoreUnavailable
+from service.keeping import clock
 from service.keeping.record import SessionRecord
 from service.keeping.tables import kept_messages, sessions
 
@@ -46,7 +46,8 @@ GET_BUT_KNOWN = select(*(sessions.c[name] for name in FIELDS if name not in {"st
 GET_TO_CHANGE = GET.with_for_update()  # SQLite, which knows no such clause, has locked everything by then
 GET_BUT_STATE = select(*(sessions.c[name] for name in FIELDS if name != "state")).where(THIS).with_for_update()
 GET_TOUCHED = select(sessions.c.touched_at).where(THIS).with_for_update()
-CHANGE = update(sessions).where(THIS)
+CHANGE = update(sessions).where(THIS).values(touched_at=clock.Now())
+ADD = insert(sessions).values(touched_at=clock.Now())
 TOUCH = (
     update(sessions)
     .where(THIS, OPEN, sessions.c.touched_at < bindparam("used_at"))
@@ -104,7 +105,7 @@ def read_row(row: Row[Any], known: SessionRecord | None = None) -> SessionRecord
 
 
 def columns(record: SessionRecord, *names: str, state: str | None = None) -> dict[str, Any]:
-    """Columns of these fields, as touched now; ``state`` is the text of the one that is called so, if it is at hand."""
+    """Columns of these fields; ``state`` is the text of the one that is called so, if it is at hand."""
     values = {name: getattr(record, name) for name in names if state is None or name != "state"}
     written = {name: json.dumps(value) if name in _JSON else value for name, value in values.items()}
-    return {**written, **({} if state is None else {"state": state}), "touched_at": time.time()}
+    return {**written, **({} if state is None else {"state": state})}

@@ -28,7 +28,7 @@ from service.keeping.database import connect
 from service.keeping.limits import Limits
 from service.keeping.patience import Patience
 from service.keeping.record import SessionRecord
-from service.keeping.rows import ADD_REST, FIELDS, GET, GET_BUT_KNOWN, NO_CHANGE, OPEN, TOUCH, columns, read_row
+from service.keeping.rows import ADD, ADD_REST, FIELDS, GET, GET_BUT_KNOWN, NO_CHANGE, OPEN, TOUCH, columns, read_row
 from service.keeping.sealing import Draft, Ready, Sealing, drafted, sealed
 from service.keeping.seen import Seen, has_lost
 from service.keeping.shares import Shares
@@ -99,7 +99,7 @@ class Store:
                 usage.check_room(connection, record.key_id, most_of_key)
             line = draft.made
             kept = replace(record, audit_seq=1, audit_head=digest(line), kept_bytes=len(line.encode()))
-            connection.execute(insert(sessions), columns(kept, *FIELDS))
+            connection.execute(ADD, columns(kept, *FIELDS))
             connection.execute(insert(audit_lines), line_row(kept.session_id, 1, line))
             return kept
 

@@ -34,7 +34,7 @@ class Idle:
 
     async def unused(self) -> list[str]:
         """Sessions that nobody has used for too long, once the store knows of what was used here."""
-        now = time.time()
+        now = time.time() - await self.store.ahead_s()
         quiet = [one for one in await self.store.unused_since(now - self.idle_s / 2) if one in self.live]
         used = sorted((one, now - age_s) for one in quiet if (age_s := self._unused_s(one)) < self.idle_s / 2)
         for first in range(0, len(used), NOTED_TOGETHER):  # few at a time, since decisions wait for the database, too

@@ -6,6 +6,7 @@ from types import SimpleNamespace
 
 import pytest
 
+from service.sessions.clock import Clock
 from tests.service.conftest import serve
 
 
@@ -29,6 +30,35 @@ async def test_a_gateway_whose_clock_is_wrong_ends_and_purges_nothing(skew_s, sa
         await asyncio.sleep(0.02)
         await sweep()
         assert await store.audit(over.session_id, 0) == []
+
+
+@pytest.mark.parametrize("skew_s", [-8 * 86400, 8 * 86400])
+async def test_what_a_gateway_with_a_wrong_clock_keeps_is_as_old_as_it_is(skew_s, postgres, monkeypatch):
+    right = time.time
+    monkeypatch.setattr(Clock, "stepped_s", lambda *_: 0.0)  # here two clocks, of which one is right all the time
+    settings = {"session_idle_s": 2, "audit_retention_s": 1}
+    async with serve(database_url=await postgres.new_database(), **settings) as served:
+        store, sessions = served.gateway.store, served.gateway.sessions
+        with monkeypatch.context() as patched:
+            patched.setattr(time, "time", lambda: right() + skew_s)
+            await store.make_ahead()  # as if it had started so
+            over, read, unused = [await served.open() for _ in range(3)]
+            await served.ego(over).close()
+        sessions._forget(unused.session_id)  # as if another gateway had answered it
+        await sessions.sweep()
+        assert len(await store.audit(over.session_id, 0)) == 2
+        assert (await store.get(unused.session_id)).ended_at is None
+        await asyncio.sleep(1.5)
+        with monkeypatch.context() as patched:
+            patched.setattr(time, "time", lambda: right() + skew_s)
+            await served.gateway.sessions.authenticate(read.session_id, read.ego_token)
+            await sessions.sweep()  # tells the store that it is used here
+        sessions._forget(read.session_id)
+        await asyncio.sleep(1.6)
+        await sessions.sweep()
+        assert await store.audit(over.session_id, 0) == []
+        assert (await store.get(read.session_id)).ended_at is None
+        assert (await store.get(unused.session_id)).ended_at is not None
 
 
 async def test_what_was_written_before_the_clock_was_set_right_is_no_older_for_it(url, monkeypatch, caplog):
