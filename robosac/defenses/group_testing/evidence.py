@@ -87,7 +87,7 @@ class Evidence:
         self._known = known
         self._compare_frames = compare_frames
         if not compare_frames:
-            known.memory.shown = {}
+            self._forgo()
         self._checked: dict[Hypothesis, Shown | None] = {}
         self._alone: Shown | None = None
         self._against: dict[str, defaultdict[str, float]] = {test: defaultdict(float) for test in TESTS}
@@ -101,8 +101,9 @@ class Evidence:
         and what has changed in it since the frame before. ``shown`` is the same, checked by testimony.
         """
         self._checked[outcome.teammates] = shown
-        if outcome.frame != self._known.memory.shown_in + 1:  # nothing to compare with, nor to be promised
-            self._known.memory.shown = {}
+        self._known.frames_since = since = outcome.frame - self._known.memory.shown_in
+        if since != 1:
+            self._forgo()
         self.ego_sees = outcome.reference is not None and len(outcome.reference) >= MIN_WITNESSES
         if not self.outcomes and self._compare_frames:
             self._begin(outcome)
@@ -119,6 +120,11 @@ class Evidence:
         self.outcomes.append(outcome)
         for finding in findings:
             self._apply(finding)
+
+    def _forgo(self) -> None:
+        """Let nothing be compared with the frame judged before, nor promised by it. Vehicles have not gone since."""
+        known, memory = self._known, self._known.memory
+        known.shown_before, memory.shown = memory.shown or known.shown_before, {}
 
     def compare_singles(self) -> None:
         """Let those be judged whose own fusion was decoded in this frame and the one before; the frame is over."""
@@ -169,7 +175,7 @@ class Evidence:
         return [self._finding(a, d, pair, 1 / math.sqrt(len(found)), {}, off) for a, d, pair, off in found]
 
     def _changes(self, outcome: Outcome) -> list[_Finding]:
-        if not self._compare_frames or outcome.boxes is None or outcome.pose is None:
+        if outcome.boxes is None or outcome.pose is None:
             return []
         subset = self._known.key(outcome.teammates)
         self.shown[subset] = now = self.followed(outcome.boxes, outcome.pose)

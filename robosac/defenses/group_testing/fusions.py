@@ -17,6 +17,7 @@ from robosac.defenses.group_testing.lateness import (
     WHILE_S,
     Place,
     late,
+    lately,
     motions,
     moved_since,
     senders,
@@ -141,15 +142,19 @@ class Fusions:
     def remember_senders(self) -> None:
         """Let the next frames know where senders were."""
         if self.hearing is not None:
-            self.known.memory.senders = sent(self.known.memory.senders, self.senders, self.number)
+            self.known.memory.senders = sent(self.known.memory.senders, self.senders, self.number, self._lately)
 
     def _moved(self, sender: str) -> FloatArray | None:
-        return moved_since(self.known.memory.senders.get(sender), self.senders.get(sender), self.number)
+        return moved_since(self.known.memory.senders.get(sender), self.senders.get(sender), self.number, self._lately)
+
+    @property
+    def _lately(self) -> int:
+        return lately(self.known.period_s)
 
     def _turned(self, sender: str) -> float:
         """How far a sender has turned in a frame, radians. An ego that had not been turning is not where it says."""
         last = self.known.memory.senders.get(sender)
-        turned = turned_since(last, self.senders.get(sender), self.number)
+        turned = turned_since(last, self.senders.get(sender), self.number, self._lately)
         least = TURNING * self.known.period_s / WHILE_S
         return turned if last is None or sender != EGO or last[4] * turned > least**2 else 0.0
 
@@ -233,9 +238,10 @@ class Fusions:
         memory, own, ego = self.known.memory, self._moved(sender), self._moved(EGO)
         if self._testimony is None or own is None or ego is None:
             return False
-        largest = max(memory.shown.values(), key=len, default=NOTHING)
-        before = memory.shown.get(self.known.key(shown.teammates), largest)
-        moved = motions(followed(shown.boxes[told], self.pose), before)
+        shown_before, since = memory.shown or self.known.shown_before, self.known.frames_since
+        largest = max(shown_before.values(), key=len, default=NOTHING)
+        before = shown_before.get(self.known.key(shown.teammates), largest)
+        moved = motions(followed(shown.boxes[told], self.pose), before, since, self.known.period_s)
         known, turn = ~np.isnan(moved[:, 0]), self.pose[:2, :2]
         centres, moved = centres[known], moved[known] @ turn
         if sender != EGO:  # the ego is a vehicle, too

@@ -164,13 +164,16 @@ def gone_since(before: FloatArray, now: FloatArray) -> FloatArray:
     return _nowhere(before[before[:, 3] >= WITNESS_SCORE], now)
 
 
-def same_vehicles(boxes: FloatArray, others: FloatArray) -> tuple[IntArray, IntArray]:
-    """Pairs (k,) of boxes (n, 4) and others (m, 4), by their places, of which one is where the other can get in a
-    frame.
+def same_vehicles(
+    boxes: FloatArray, others: FloatArray, along_m: float = ALONG_M, across_m: float = ACROSS_M
+) -> tuple[IntArray, IntArray]:
+    """Pairs (k,) of boxes (n, 4) and others (m, 4), by their places, of which one is where the other can get, by
+    default in a frame.
     """
     x, y = boxes[:, :1] - others[:, 0], boxes[:, 1:2] - others[:, 1]
     cos, sin = np.cos(boxes[:, 2:3]), np.sin(boxes[:, 2:3])
-    one, other = np.nonzero((np.abs(cos * x + sin * y) < ALONG_M) & (np.abs(cos * y - sin * x) < ACROSS_M))
+    along, across = np.abs(cos * x + sin * y), np.abs(cos * y - sin * x)
+    one, other = np.nonzero((along < along_m) & (across < across_m))
     turned = np.abs((boxes[one, 2] - others[other, 2] + np.pi / 2) % np.pi - np.pi / 2) < TURN_RAD
     return one[turned], other[turned]
 

@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Sequence
+from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, field
 
 import numpy as np
@@ -27,6 +27,10 @@ class Knowledge:
     """The team, in the order of every array over teammates; some may be missing in the frame."""
     shown: dict[int, FloatArray] = field(default_factory=dict, init=False)
     """By the sum of its identities: what each subset showed in this frame (n, 4), see `geometry.followed`."""
+    shown_before: Mapping[int, FloatArray] = field(default_factory=dict, init=False)
+    """As `Memory.shown`, where the frame judged before this one is too long ago to be compared with."""
+    frames_since: int = field(default=1, init=False)
+    """How many frames ago that one was."""
 
     def __post_init__(self) -> None:
         self.members = self.posterior.members

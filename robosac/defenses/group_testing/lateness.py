@@ -14,7 +14,7 @@ from collections.abc import Mapping
 import numpy as np
 
 from robosac.boxes import FloatArray
-from robosac.defenses.group_testing.geometry import same_vehicles
+from robosac.defenses.group_testing.geometry import ACROSS_M, ALONG_M, same_vehicles
 from robosac.testimony import Testimony
 
 WHILE_S = 0.2
@@ -36,8 +36,12 @@ excuse itself.
 """
 TURNING = 0.02
 """A sender that turns by less in `WHILE_S`, radians, goes straight on, as far as poses tell."""
-SENT_FRAMES = 5
-"""How fast a sender is may be told by where it was so many frames ago: not each sends in every frame."""
+SENT_S, SENT_FRAMES = 5.0, 5
+"""How fast a sender is may be told by where it was so long ago, or so many frames: not each sends in every frame."""
+FOLLOWED_S = 1.0
+"""So long a vehicle can be followed, be it over one frame or over some that are missing in between."""
+FASTEST_M_S = 35.0
+"""How fast it may be where it is followed for longer than `WHILE_S`."""
 Place = tuple[float, float, float]
 """Where in the world a sender is: x, y, metres, and yaw."""
 Sent = tuple[float, float, int, float | None, float]
@@ -100,36 +104,46 @@ def senders(testimony: Testimony, pose: FloatArray) -> dict[str, Place]:
     return {name: (x, y, yaw) for name, (x, y), yaw in zip(testimony.agents, placed, yaws, strict=True)}
 
 
-def sent(before: Mapping[str, Sent], now: Mapping[str, Place], number: int) -> dict[str, Sent]:
-    """Where senders were that sent a message in a frame of this number, or lately."""
-    lately = {name: last for name, last in before.items() if 0 < number - last[2] < SENT_FRAMES}
-    turned = {name: round(turned_since(before.get(name), place, number), 4) for name, place in now.items()}
-    return {**lately, **{name: (x, y, number, yaw, turned[name]) for name, (x, y, yaw) in now.items()}}
+def lately(period_s: float) -> int:
+    """In how many frames `SENT_S` are over."""
+    return max(SENT_FRAMES, round(SENT_S / period_s))
 
 
-def moved_since(last: Sent | None, now: Place | None, number: int) -> FloatArray | None:
-    """How far (2,) a sender has moved in a frame, on average since it last sent a message; None if it did not lately,
-    or does not in this frame, which has that number.
+def sent(before: Mapping[str, Sent], now: Mapping[str, Place], number: int, most: int) -> dict[str, Sent]:
+    """Where senders were that sent a message in a frame of this number, or in one of the ``most`` before the next."""
+    recent = {name: last for name, last in before.items() if 0 < number - last[2] < most}
+    turned = {name: round(turned_since(before.get(name), place, number, most), 4) for name, place in now.items()}
+    return {**recent, **{name: (x, y, number, yaw, turned[name]) for name, (x, y, yaw) in now.items()}}
+
+
+def moved_since(last: Sent | None, now: Place | None, number: int, most: int) -> FloatArray | None:
+    """How far (2,) a sender has moved in a frame, on average since it last sent a message; None if it did not in the
+    ``most`` frames before this one, which has that number, or does not in this one.
     """
-    if last is None or now is None or not 0 < number - last[2] <= SENT_FRAMES:
+    if last is None or now is None or not 0 < number - last[2] <= most:
         return None
     moved: FloatArray = np.subtract(now[:2], last[:2]) / (number - last[2])
     return moved
 
 
-def turned_since(last: Sent | None, now: Place | None, number: int) -> float:
+def turned_since(last: Sent | None, now: Place | None, number: int, most: int) -> float:
     """As `moved_since`, how far it has turned, radians; 0 where nothing is known of that."""
-    if last is None or now is None or last[3] is None or not 0 < number - last[2] <= SENT_FRAMES:
+    if last is None or now is None or last[3] is None or not 0 < number - last[2] <= most:
         return 0.0
     return float((now[2] - last[3] + np.pi) % (2 * np.pi) - np.pi) / (number - last[2])
 
 
-def motions(now: FloatArray, before: FloatArray) -> FloatArray:
-    """How far (n, 2) each of some boxes (n, 4) has moved since the frame before, in which there were others (m, 4), as
-    `geometry.followed` gives them; not a number for what was not there.
+def motions(now: FloatArray, before: FloatArray, frames: int = 1, period_s: float = WHILE_S) -> FloatArray:
+    """How far (n, 2) each of some boxes (n, 4) has moved in a frame since others were there (m, 4), ``frames`` ago, as
+    `geometry.followed` gives them; not a number for what was not there, or too long ago.
     """
-    one, other = same_vehicles(now, before)
-    moved = now[one, :2] - before[other, :2]
+    since_s, reach = frames * period_s, (ALONG_M, ACROSS_M)
+    if since_s > WHILE_S:
+        reach = FASTEST_M_S * since_s, ACROSS_M * since_s / WHILE_S
+    if not 0.0 < since_s <= FOLLOWED_S + 1e-9:
+        before = before[:0]
+    one, other = same_vehicles(now, before, *reach)
+    moved = (now[one, :2] - before[other, :2]) / frames
     nearest_last = np.argsort(-np.hypot(*moved.T), kind="stable")
     found = np.full((len(now), 2), np.nan)
     for pair in nearest_last.tolist():

@@ -1,6 +1,7 @@
 """Whose message is late."""
 
 import json
+from dataclasses import replace
 
 import numpy as np
 import pytest
@@ -8,12 +9,13 @@ import pytest
 from robosac.answers import Verdict
 from robosac.boxes import pose_matrix
 from robosac.defenses import EGO, Outcome
+from robosac.defenses.group_testing.defense import COMPARABLE_PERIOD_MS
 from robosac.defenses.group_testing.findings import Findings
 from robosac.defenses.group_testing.geometry import followed
 from robosac.defenses.group_testing.knowledge import Knowledge
 from robosac.defenses.group_testing.lateness import (
-    SENT_FRAMES,
     late,
+    lately,
     motions,
     moved_since,
     senders,
@@ -26,6 +28,8 @@ from robosac.defenses.group_testing.posterior import Posterior
 from tests.robosac.defenses.group_testing.conversing import TEAM, run_frame
 from tests.robosac.defenses.group_testing.one_place import DEFENSE, LIAR, MODEL
 from tests.robosac.testifying import saying
+
+MOST = lately(0.2)
 
 YES, NO = 5.5, -7.0
 SPEED = np.array([3.0, 0.0])
@@ -106,6 +110,11 @@ def test_vehicles_are_followed_along_themselves():
     assert motions(now, before) == pytest.approx(np.array([[3.0, 0.1], [2.0, 0.0], [0.0, 2.0]]))
     elsewhere = np.array([[5.5, 0.9, 0.0, 0.9], [-4.6, 0.0, 0.0, 0.9], [8.0, 0.0, 0.5, 0.9]])
     assert np.isnan(motions(elsewhere, before)).all()  # beside the lane, too far, or another heading
+    far = before + [[12.0, 0.0, 0.0, 0.0]]
+    assert motions(far[:1], before[:1], 2, 0.2) == pytest.approx(np.array([[6.0, 0.0]]))
+    assert motions(far[:1], before[:1], 1, 0.4) == pytest.approx(np.array([[12.0, 0.0]]))
+    assert np.isnan(motions(far[:1], before[:1], 6, 0.2)).all()  # too long ago
+    assert np.isnan(motions(before + [[0.0, 1.7, 0.0, 0.0]], before, 2, 0.2)[0]).all()
     assert np.isnan(motions(now, before[:0])).all()
     assert motions(now[:0], before).shape == (0, 2)
 
@@ -114,28 +123,28 @@ def cars(centres):
     return np.column_stack([centres, np.tile([4.5, 1.9, 0.0, 0.9], (len(centres), 1))])
 
 
-def drive(frames, delay, shown=False, every=1):
+def drive(frames, delay, shown=False, every=1, numbers=None, defense=DEFENSE, speed=SPEED):
     """Decisions in traffic, where one teammate's message is so many frames old, or as old as it is in each frame, and
-    shown or not where it is fused. It sends one in every so many frames.
+    shown or not where it is fused. It sends one in every so many frames. The ego asks in those with these ``numbers``.
     """
     delays = delay if callable(delay) else lambda frame: min(delay, frame)
-    state, rng, found = DEFENSE.initial_state(TEAM), np.random.default_rng(0), []
-    for frame in range(frames):
-        true = PLACES + frame * SPEED
-        old = true - delays(frame) * SPEED
+    state, rng, found = defense.initial_state(TEAM), np.random.default_rng(0), []
+    for frame in numbers or range(frames):
+        true = PLACES + frame * speed
+        old = true - delays(frame) * speed
         honest = [(*place, NO) for place in old if delay] + [(*place, YES) for place in true]
         team = tuple(name for name in TEAM if name != LIAR or frame % every == 0)
         said = {**dict.fromkeys((EGO, *TEAM), honest), LIAR: shown_at(old, true)}
         heard = saying({name: said[name] for name in (EGO, *team)})
 
-        def judge(subset, _, number, true=true, old=old, heard=heard):
-            more = old if shown and number and LIAR in subset else old[:0]
+        def judge(subset, _, __, frame=frame, true=true, old=old, heard=heard):
+            more = old if shown and frame and LIAR in subset else old[:0]
             told = {"testimony": heard, "alone": cars(true)}
             return Outcome(
-                subset, 0.93, Verdict.CONSENSUS, cars(np.vstack([true, more])), cars(true), np.eye(4), number, **told
+                subset, 0.93, Verdict.CONSENSUS, cars(np.vstack([true, more])), cars(true), np.eye(4), frame, **told
             )
 
-        decision, _ = run_frame(DEFENSE, state, team, [], rng, judge=judge)
+        decision, _ = run_frame(defense, state, team, [], rng, judge=judge)
         state = json.loads(json.dumps(decision.state))
         found.append(decision)
     return found
@@ -170,10 +179,39 @@ def test_who_is_late_is_not_named_up_to_a_bound(delay, names):
     assert {name for decision in found for name in decision.named} == names
 
 
-def test_where_senders_were_is_known_for_some_frames():
+@pytest.mark.parametrize(("delay", "names"), [(2, set()), (5, {LIAR})])
+def test_who_is_late_and_sends_rarely_is_not_named_and_who_replays_is(delay, names):
+    found = drive(37, delay, shown=True, every=6, speed=SPEED / 3)
+    assert {name for decision in found for name in decision.named} == names
+
+
+@pytest.mark.parametrize("delay", [1, 2, 5])
+@pytest.mark.parametrize(
+    ("numbers", "period_ms"),
+    [
+        (range(0, 14, 2), 200.0),
+        (range(0, 18, 3), 200.0),
+        ([0, 1, 3, 4, 5, 8, 9, 11, 13], 200.0),
+        (range(0, 18, 4), 100.0),
+        (range(8), 300.0),
+        (range(8), 400.0),
+        (range(0, 20, 4), 200.0),
+    ],
+)
+def test_where_frames_are_missing_or_far_apart_nobody_who_is_late_is_named(numbers, period_ms, delay):
+    settings = DEFENSE.settings.model_copy(
+        update={"frame_period_ms": period_ms, "compare_frames": period_ms <= COMPARABLE_PERIOD_MS}
+    )
+    found = drive(0, delay, shown=True, numbers=numbers, defense=replace(DEFENSE, settings=settings))
+    is_late = delay * period_ms <= 800
+    assert {name for decision in found for name in decision.named} == (set() if is_late else {LIAR})
+
+
+def test_where_senders_were_is_known_for_some_seconds():
+    assert [lately(period_s) for period_s in (0.05, 0.2, 0.5, 1.0, 5.0)] == [100, 25, 10, 5, 5]
     state = drive(2, 0)[-1].state
     assert state["memory"]["senders"] == {name: [0.0, 0.0, 1, 0.0, 0.0] for name in (EGO, *TEAM)}
-    for frames, last in ((SENT_FRAMES, 0), (SENT_FRAMES + 1, None)):
+    for frames, last in ((MOST, 0), (MOST + 1, None)):
         kept = drive(frames, 0, every=100)[-1].state["memory"]["senders"]
         assert kept.get(LIAR) == (None if last is None else [0.0, 0.0, last, 0.0, 0.0])
         assert kept[EGO] == [0.0, 0.0, frames - 1, 0.0, 0.0]
@@ -181,16 +219,16 @@ def test_where_senders_were_is_known_for_some_frames():
 
 def test_how_fast_a_sender_is_shows_from_where_it_was_lately():
     def moved(last, number):
-        found = moved_since(last and (*last, None, 0.0), (16.0, -2.0, 0.0), number)
+        found = moved_since(last and (*last, None, 0.0), (16.0, -2.0, 0.0), number, MOST)
         return None if found is None else found.tolist()
 
     assert moved((10.0, 4.0, 8), 9) == [6.0, -6.0]
     assert moved((10.0, 4.0, 8), 11) == [2.0, -2.0]
-    assert moved((10.0, 4.0, 8), 8 + SENT_FRAMES) is not None
-    assert moved((10.0, 4.0, 8), 9 + SENT_FRAMES) is None
+    assert moved((10.0, 4.0, 8), 8 + MOST) is not None
+    assert moved((10.0, 4.0, 8), 9 + MOST) is None
     assert moved((10.0, 4.0, 8), 8) is None  # numbers that begin again
     assert moved(None, 9) is None
-    assert moved_since((10.0, 4.0, 8, None, 0.0), None, 9) is None
+    assert moved_since((10.0, 4.0, 8, None, 0.0), None, 9, MOST) is None
 
 
 @pytest.mark.parametrize(("sender", "before", "counts"), [("a", 0.0, True), (EGO, 0.0, False), (EGO, 0.1, True)])
@@ -200,17 +238,17 @@ def test_an_ego_that_begins_to_turn_so_fast_is_not_where_it_says(sender, before,
     found = Findings(Knowledge(MODEL, Posterior(len(MODEL.kinds), 0.5, 0.25, TEAM), memory), Lies(), TEAM, ())
     found.number, found.senders = 1, {sender: (0.0, 0.0, sign * 0.2)}
     assert found._turned(sender) == pytest.approx(sign * 0.2 if counts else 0.0)
-    assert sent(memory.senders, found.senders, 1)[sender][4] == pytest.approx(sign * 0.2)
+    assert sent(memory.senders, found.senders, 1, MOST)[sender][4] == pytest.approx(sign * 0.2)
 
 
 def test_how_fast_a_sender_turns_shows_so_too():
     def turned(yaw, number, now=(0.0, 0.0, -3.0)):
-        return turned_since((0.0, 0.0, 8, yaw, 0.0), now, number)
+        return turned_since((0.0, 0.0, 8, yaw, 0.0), now, number, MOST)
 
     assert turned(3.0, 9) == pytest.approx(2 * np.pi - 6)
     assert turned(-2.6, 10) == pytest.approx(-0.2)
-    assert [turned(None, 9), turned(3.0, 8), turned(3.0, 9 + SENT_FRAMES), turned(3.0, 9, None)] == [0.0] * 4
-    assert turned_since(None, (0.0, 0.0, -3.0), 9) == 0.0
+    assert [turned(None, 9), turned(3.0, 8), turned(3.0, 9 + MOST), turned(3.0, 9, None)] == [0.0] * 4
+    assert turned_since(None, (0.0, 0.0, -3.0), 9, MOST) == 0.0
 
 
 @pytest.mark.parametrize("yaw_rate", [0.4, -0.4])
