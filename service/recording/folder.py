@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import re
 import time
+from collections import defaultdict
 from collections.abc import Iterator
 from dataclasses import dataclass, field
 from importlib.metadata import version
@@ -19,7 +20,11 @@ IDLE_S = 10.0
 """After so long without a frame a file is closed. The session's next frame begins another."""
 LOOKS = 16
 """How often the folder is measured while as much is written as it may hold."""
-_NAME = re.compile(r"\d{8}T\d{6}Z-(?P<session>[0-9a-f]{32})-(?P<part>\d{4,})\.mcap")
+KEY_LETTERS = 8
+"""So much of the id of an API key is in the names of its recordings."""
+REMEMBERED = 4096
+"""Sessions of which it is known how many files they have."""
+_NAME = re.compile(r"\d{8}T\d{6}Z-(?P<session>[0-9a-f]{32})-(?P<part>\d{4,})(-(?P<key>[0-9a-f]+))?\.mcap")
 
 
 @dataclass
@@ -40,7 +45,8 @@ class Folder:
     most_file : int
         Bytes of a file after which the session's next one begins.
     most : int
-        Bytes of all recordings in the folder, of other processes' too. The oldest are removed.
+        Bytes of all recordings in the folder, of other processes' too. The oldest are removed of the API key that has
+        most.
     bodies : bool
         Whether messages are recorded, or their digests.
     most_open : int
@@ -58,6 +64,8 @@ class Folder:
     _ros2: Ros2 = field(default_factory=Ros2)
     _written: int | None = None
     """Bytes since the folder was measured, if it was."""
+    _parts: dict[str, tuple[int, int]] = field(default_factory=dict)
+    """By session: the number of its latest file, and of frames answered by then."""
 
     def make(self) -> None:
         """Make the folder, and make sure that it can be written to.
@@ -80,15 +88,14 @@ class Folder:
         """
         self._asked(session_id).touch()
 
-    def is_asked(self, session_id: str) -> bool:
+    def is_asked(self, record: SessionRecord) -> bool:
         """Whether a session is to be recorded, or is recorded already.
 
         Raises
         ------
         OSError
         """
-        found = (match["session"] for match, _ in self._found())
-        return self._asked(session_id).exists() or session_id in found
+        return self._asked(record.session_id).exists() or self._latest_part(record) > 0
 
     def over(self, session_id: str) -> None:
         """A session has ended: its recording is whole.
@@ -99,6 +106,7 @@ class Folder:
         """
         self._asked(session_id).unlink(missing_ok=True)
         self.end(session_id)
+        self._parts.pop(session_id, None)
 
     def add(self, record: SessionRecord, moment: Moment, dropped: int) -> None:
         """Add a frame to its session's recording.
@@ -122,6 +130,8 @@ class Folder:
         except BaseException:
             self._files.pop(session_id).file.abandon()
             raise
+        part, _ = self._parts[session_id]
+        self._parts[session_id] = part, record.frames_answered + 1
         size = opened.file.size
         if size >= min(self.most_file, self.most // 2):
             self.end(session_id)
@@ -155,35 +165,54 @@ class Folder:
             self.end(session_id)
 
     def make_room(self) -> None:
-        """Remove the oldest recordings while all together are too large; those being written come last."""
+        """Remove recordings while all together are too large: of the API key that has most the oldest, those that are
+        being written last. So nobody's recordings go because another records much.
+        """
         self._written = 0
         open_ones = {opened.file.path: name for name, opened in self._files.items()}
-        sizes: list[tuple[bool, float, int, Path]] = []
-        for _, path in self._found():
+        of_keys: defaultdict[str, list[tuple[bool, float, int, Path]]] = defaultdict(list)
+        for match, path in self._found():
             try:
                 told = path.stat()
             except FileNotFoundError:  # another process was faster
                 continue
-            sizes.append((path in open_ones, told.st_mtime, told.st_size, path))
-        total = sum(size for _, _, size, _ in sizes)
-        for is_open, _, size, path in sorted(sizes):
-            if total <= self.most:
-                return
+            of_keys[match["key"] or ""].append((path in open_ones, told.st_mtime, told.st_size, path))
+        totals = {key: sum(size for _, _, size, _ in files) for key, files in of_keys.items()}
+        for files in of_keys.values():
+            files.sort(reverse=True)
+        while sum(totals.values()) > self.most:
+            most = max(totals, key=lambda key: totals[key])
+            is_open, _, size, path = of_keys[most].pop()
             if is_open:
                 self._files.pop(open_ones[path]).file.abandon()
             path.unlink(missing_ok=True)
-            total -= size
+            totals[most] -= size
 
     def _begin(self, record: SessionRecord, moment: Moment) -> _Open:
         if self._written is None:
             self.make_room()
-        part = 1 + max((int(m["part"]) for m, _ in self._found() if m["session"] == record.session_id), default=0)
+        part = self._latest_part(record) + 1
         began = time.strftime("%Y%m%dT%H%M%SZ", time.gmtime(moment.time_ns / 1e9))
-        path = self.root / f"{began}-{record.session_id}-{part:04d}.mcap"
+        of_key = f"-{record.key_id[:KEY_LETTERS]}" if record.key_id else ""
+        path = self.root / f"{began}-{record.session_id}-{part:04d}{of_key}.mcap"
         kept = {name: value for name, value in vars(record).items() if name in Opening.model_fields}
         more = {"version": version("robosac"), "least_score": moment.least_score, "bodies": self.bodies, "part": part}
         opening = Opening(**kept, **more)
-        return _Open(RecordingFile(path, opening, moment.time_ns, self._ros2), time.monotonic())
+        opened = _Open(RecordingFile(path, opening, moment.time_ns, self._ros2), time.monotonic())
+        self._parts.pop(record.session_id, None)
+        self._parts[record.session_id] = part, record.frames_answered
+        while len(self._parts) > REMEMBERED:
+            del self._parts[next(iter(self._parts))]
+        return opened
+
+    def _latest_part(self, record: SessionRecord) -> int:
+        """The number of a session's latest file, 0 if it has none. The folder, which may hold very many, is read only
+        where another process may have written files of the session.
+        """
+        part, frames = self._parts.get(record.session_id, (0, 0))
+        if record.frames_answered == frames:
+            return part
+        return max((int(m["part"]) for m, _ in self._found() if m["session"] == record.session_id), default=0)
 
     def _use(self, session_id: str, opened: _Open, now: float) -> None:
         """A session's file is written to now; others that are open rest where they are too many."""

@@ -185,7 +185,7 @@ class Recorder:
     def _add(self, folder: Folder, noted: _Noted) -> None:
         """Write a frame, unless nobody asked for it: of each session it is looked once."""
         if not self._all and noted.live.recorded is None:
-            noted.live.recorded = folder.is_asked(noted.record.session_id)
+            noted.live.recorded = folder.is_asked(noted.record)
         if self._all or noted.live.recorded:
             folder.add(noted.record, noted.moment, noted.dropped)
             self._metrics.recorded()

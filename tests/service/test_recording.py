@@ -226,12 +226,50 @@ async def test_a_disk_that_fails_costs_the_recording_only(fleet, detector, tmp_p
     assert [each.differing for each in replay(recorded, detector)] == [(), ()]
 
 
-def a_session(number):
+def a_session(number, **more):
     return SessionRecord(
         session_id=f"{number:032x}", ego_id=EGO, teammates=("car-2",), detector="intersection-mean",
         defense={"kind": "none"}, latency_budget_ms=200.0, gather_ms=100.0, frame_period_ms=200.0, token_ids={},
-        created_at="2026-11-22T12:00:00.000Z", seed="00",
+        created_at="2026-11-22T12:00:00.000Z", seed="00", **more,
     )  # fmt: skip
+
+
+def test_whoever_records_much_loses_recordings_of_its_own(recorded_moments, tmp_path):
+    folder = Folder(tmp_path, most_file=2**28, most=2**21, bodies=True)
+    folder.make()
+    honest, keyless = [a_session(number, key_id=key) for number, key in ((0, "0123456789abcdef"), (1, ""))]
+    for session in (honest, keyless):
+        folder.add(session, recorded_moments[0], 0)
+        folder.end(session.session_id)
+    for number in range(2, 40):
+        folder.add(a_session(number, key_id="fedcba9876543210"), recorded_moments[0], 0)
+        folder.end(a_session(number).session_id)
+    folder.make_room()
+    left = sorted(path.name.split("-", 1)[1] for path in tmp_path.iterdir())
+    assert left[:2] == [f"{0:032x}-0001-01234567.mcap", f"{1:032x}-0001.mcap"]
+    assert left[-1] == f"{39:032x}-0001-fedcba98.mcap"
+    assert 2 < len(left) < 40
+    assert {session.opening.session_id for session in sessions(tmp_path)} >= {honest.session_id, keyless.session_id}
+
+
+def test_a_folder_that_holds_very_many_files_is_not_read_for_each_session(recorded_moments, tmp_path, monkeypatch):
+    folder = Folder(tmp_path, most_file=2**28, most=2**33, bodies=False)
+    folder.make()
+    folder.make_room()
+    with monkeypatch.context() as patched:
+        patched.setattr(Folder, "_found", lambda _: pytest.fail("the folder was read"))
+        for number in range(3):
+            assert not folder.is_asked(a_session(number))
+            for answered in range(3):
+                folder.add(a_session(number, frames_answered=answered), recorded_moments[answered], 0)
+                folder.end(a_session(number).session_id)
+    other = Folder(tmp_path, most_file=2**28, most=2**33, bodies=False)  # of another process
+    other.add(a_session(0, frames_answered=3), recorded_moments[3], 0)
+    folder.add(a_session(0, frames_answered=4), recorded_moments[4], 0)
+    for each in (folder, other):
+        each.close()
+    parts = sorted(int(path.name.split("-")[2][:4]) for path in tmp_path.glob(f"*-{a_session(0).session_id}-*"))
+    assert parts == [1, 2, 3, 4, 5]
 
 
 def test_files_are_rotated_and_the_oldest_are_removed(recorded_moments, tmp_path):
@@ -277,8 +315,8 @@ def test_of_many_sessions_that_take_turns_each_has_one_file_and_few_are_open(rec
     found = sessions(tmp_path)
     assert [[frame.number for frame in session.frames] for session in found] == [[0, 1, 2, 3]] * 66
     assert not any(file.damage for session in found for file in session.files)
-    assert folder.is_asked(f"{65:032x}")
-    assert not folder.is_asked(f"{66:032x}")
+    assert folder.is_asked(a_session(65))
+    assert not folder.is_asked(a_session(66))
 
 
 def test_a_file_that_is_removed_while_it_waits_for_its_next_frame_is_not_missed(recorded_moments, tmp_path):
