@@ -44,6 +44,7 @@ DRAINING, STORE_UNAVAILABLE = "urn:robosac:problem:draining", "urn:robosac:probl
 EVENTS = "text/event-stream"
 SILENCE_S = 40.0
 """A stream on which nothing came for so long is broken."""
+TRUST = "SSL_CERT_FILE may name a file with the certificate of an authority of your own"
 API_KEY_VARIABLE = "ROBOSAC_API_KEY"
 """Where the command lines look for an API key: better than an option, which every process of the machine can read."""
 
@@ -109,7 +110,8 @@ class GatewayClient:
     receipts : str or Path, optional
         File that the receipts of answers are added to.
     tls : ssl.SSLContext, optional
-        Whose certificates are good; by default those of the well-known authorities (`certifi`).
+        Whose certificates are good; by default those in the file that ``SSL_CERT_FILE`` names, or else those of the
+        well-known authorities (`certifi`).
     transport : httpx.AsyncBaseTransport, optional
         For tests: `httpx.ASGITransport` talks to an app without a socket.
 
@@ -141,7 +143,7 @@ class GatewayClient:
             limits=LIMITS,
             transport=transport,
             trust_env=False,
-            verify=True if tls is None else tls,
+            verify=httpx.create_ssl_context() if tls is None else tls,
         )
         self.receipts = ReceiptBook(self.public_keys, gateway_keys, None if receipts is None else Path(receipts))
 
@@ -250,7 +252,8 @@ class GatewayClient:
             yield
         except (httpx.HTTPError, httpx.InvalidURL) as error:
             where = f"{method} {self._where(path)}"
-            raise GatewayUnreachable(f"{where}: {type(error).__name__} {error}; is the gateway running?") from error
+            hint = TRUST if "CERTIFICATE_VERIFY_FAILED" in str(error) else "is the gateway running?"
+            raise GatewayUnreachable(f"{where}: {type(error).__name__} {error}; {hint}") from error
 
     def _where(self, path: str) -> str:
         return f"{_shown(self._http.base_url).rstrip('/')}{path}"

@@ -26,7 +26,7 @@ class CountingTransport(httpx.AsyncHTTPTransport):
     """Counts the bytes of requests and answers, as HTTP/1.1 has them; what TCP and TLS add is not in it."""
 
     def __init__(self) -> None:
-        super().__init__(limits=LIMITS, trust_env=False)
+        super().__init__(limits=LIMITS, trust_env=False, verify=httpx.create_ssl_context())
         self.sent_bytes = self.received_bytes = 0
 
     async def handle_async_request(self, request: httpx.Request) -> httpx.Response:
@@ -110,7 +110,7 @@ class Meter:
 
     async def _samples(self, name: str) -> list[list[float]]:
         """Of each gateway, the values of a metric."""
-        async with httpx.AsyncClient(trust_env=False) as http:
+        async with httpx.AsyncClient(trust_env=False, verify=httpx.create_ssl_context()) as http:
             return [await _samples(http, url, name) for url in self.gateways]
 
     def _disk_bytes(self) -> float:

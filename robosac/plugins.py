@@ -100,6 +100,12 @@ class Kind(Generic[T]):
         self.check(made, self.contract, text)
         return made
 
+    @property
+    def _choice(self) -> str:
+        """What may be given, for messages."""
+        names = [each for each in sorted(self.shipped) if f"{each}:" not in self.forms]  # the others are in these
+        return f"one of {', '.join(names)}, {self.forms}"
+
     def check(self, candidate: object, contract: type[Any], who: str) -> None:
         """Refuse what does not fulfil a contract, with what it lacks; ``who`` made it."""
         faults = [lacks(candidate, contract), misfits(candidate, contract)]
@@ -112,13 +118,14 @@ class Kind(Generic[T]):
     def _foreign(self, name: str, arguments: list[str], text: str) -> T:
         offered = next((f"{point.module}:{point.attr}" for point in entry_points(group=self.package, name=name)), None)
         if offered is None and not _REFERENCE.fullmatch(text):
-            names = [each for each in sorted(self.shipped) if f"{each}:" not in self.forms]  # the others are in these
-            raise self.error(f"no {self.noun} {text!r}: give one of {', '.join(names)}, {self.forms}")
+            raise self.error(f"no {self.noun} {text!r}: give {self._choice}")
         self.origins.add((offered or text).partition(":")[0])
         try:
             made: T = pkgutil.resolve_name(text)() if offered is None else pkgutil.resolve_name(offered)(*arguments)
         except (Exception, SystemExit) as error:  # the user's code may raise anything, or be a script that ends
             said = " ".join(str(error).split())
+            if isinstance(error, ModuleNotFoundError) and error.name == re.split("[.:]", text)[0]:
+                said += f" (if it is a module of yours, PYTHONPATH has to name its folder; else give {self._choice})"
             raise self.error(f"{text}: {type(error).__name__}: {said}") from error
         return made
 

@@ -202,7 +202,7 @@ async def _running(gateway: Gateway, settings: Settings, tokens: Tokens, tracing
         gateway.metrics.sessions.set(await blamed_on("ROBOSAC_DATABASE_URL", store.count()))
         if settings.detector not in engine.detectors:
             known = list(engine.detectors)
-            raise ValueError(f"ROBOSAC_DETECTOR: unknown detector {settings.detector!r}; known: {known}")
+            raise ValueError(f"ROBOSAC_DETECTOR: unknown detector {settings.detector!r}; known: {', '.join(known)}")
         keep_what_is_loaded()
         gateway.watch.start()
         sweeper = asyncio.create_task(gateway.sessions.expire_idle())

@@ -145,7 +145,7 @@ class Settings(BaseSettings):
         2**28, ge=2**20, le=2**40, description="Largest recording; then a session's next one begins."
     )
     record_bytes: int = Field(
-        2**33, ge=2**21, le=2**50, description="All recordings in the folder; beyond, the oldest go of the key that has most."
+        2**33, ge=2**21, le=2**50, description="All recordings in the folder; beyond, those of the key with most go."
     )
     session_idle_s: float = Field(3600.0, ge=0.01, le=10 * _YEAR_S, description="A session unused for longer is ended.")
     audit_retention_s: float = Field(

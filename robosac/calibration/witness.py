@@ -78,7 +78,7 @@ def training_scenes(source: SceneSource, count: int) -> Sequence[Scene]:
     keep = getattr(source, "training_scenes", None)
     scenes = source.scenes("validation") if keep is None else keep()
     if len(scenes) < count:
-        raise SceneError(f"{source.name} has {len(scenes)} scenes to train on; {count} are wanted")
+        raise SceneError(f"{source.name} has too few scenes to train on: {len(scenes)}, and {count} are wanted")
     return list(scenes[:count]) if keep is not None else list(scenes[len(scenes) - count :])
 
 

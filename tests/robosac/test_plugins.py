@@ -104,7 +104,11 @@ def test_an_argument_follows_the_name_where_the_kind_takes_one():
         ("house.others:Wall", r"others:Wall made no shape but .* which lacks area"),
         ("house.others:fail", r"^house.others:fail: KeyError: 'two\\nlines'$"),
         ("house.others:nothing", "no attribute 'nothing'"),
-        ("elsewhere:shape", "ModuleNotFoundError: No module named 'elsewhere'"),
+        (
+            "elsewhere:shape",
+            r"No module named 'elsewhere' \(if it is .* PYTHONPATH .*; else give one of sized, square, ",
+        ),
+        ("house.nowhere:shape", "No module named 'house.nowhere'$"),
         ("house.others:leave", "^house.others:leave: SystemExit: 3$"),
     ],
 )

@@ -15,7 +15,9 @@ from cryptography.hazmat.primitives.asymmetric import ec
 from cryptography.hazmat.primitives.serialization import Encoding, NoEncryption, PrivateFormat
 from cryptography.x509.oid import NameOID
 
+from clients.client import GatewayClient
 from clients.continuity import Traffic, affinity, prepare
+from clients.errors import GatewayUnreachable
 from clients.load_test import DEFENSE
 from clients.proxied import configured, program, proxied
 
@@ -66,10 +68,16 @@ def test_only_the_shipped_configuration_is_changed():
         configured("frontend gateway\n    bind :80\n", [1, 2], 3, None)
 
 
-async def test_sessions_go_on_while_one_process_is_restarted_and_the_other_is_killed(tmp_path, certificate):
+async def test_sessions_go_on_while_one_process_is_restarted_and_the_other_killed(tmp_path, certificate, monkeypatch):
     async with proxied(CONFIG, tmp_path, f"sqlite:///{tmp_path}/robosac.db", KEY, 2, certificate) as gateways:
         with pytest.raises(httpx.ConnectError, match="certificate"):  # nobody vouches for it but the test
             await asyncio.to_thread(httpx.get, f"{gateways.url}/readyz", trust_env=False)
+        async with GatewayClient(gateways.url) as client:
+            with pytest.raises(GatewayUnreachable, match="SSL_CERT_FILE"):
+                await client.detectors()
+        monkeypatch.setenv("SSL_CERT_FILE", str(certificate))
+        async with GatewayClient(gateways.url) as client:
+            assert await client.detectors()
         async with gateways.client() as client:
             for path in ("/metrics", "/%6detrics", "/metric%73?a=b"):  # which are all one to a gateway
                 refused = await client._http.get(path)

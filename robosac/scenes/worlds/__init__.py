@@ -54,7 +54,7 @@ class World:
 
     def __init__(self, name: str = "") -> None:
         if name not in WORLDS:
-            raise SceneError(f"no world {name!r}: give world:NAME with one of {', '.join(WORLDS)}")
+            raise SceneError(f"no world {name!r}: there are {', '.join(WORLDS)}")
         self.name = f"{self.kind}:{name}"
         self._recipe = WORLDS[name]
 

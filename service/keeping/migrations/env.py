@@ -5,7 +5,7 @@ from __future__ import annotations
 import asyncio
 
 from alembic import context
-from sqlalchemy import Connection
+from sqlalchemy import Connection, make_url
 
 from robosac.extras import MissingExtra
 from service.keeping.database import connect
@@ -26,13 +26,17 @@ def _run_locked(connection: Connection) -> None:
 
 async def _by_hand() -> None:
     try:
-        database = connect(settings_of_environment().database_url)
+        url = settings_of_environment().database_url
+        if "database_url" not in settings_of_environment().model_fields_set:
+            raise SystemExit("Error: ROBOSAC_DATABASE_URL has to name the database: it would be a new file here")
+        database = connect(url)
     except (MissingExtra, SettingsError) as wrong:
         raise SystemExit(f"Error: {wrong}") from wrong
     try:
         await database.prepare(_run_locked)
     finally:
         await database.close()
+    print(f"{make_url(url).render_as_string()}: done")
 
 
 if context.is_offline_mode():

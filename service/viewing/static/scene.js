@@ -7,7 +7,7 @@ export const LAYERS = {
   single_witness: { label: 'answered: single witness', colour: '#e69f00', dash: [9, 3], width: 2.4 },
   disputed: { label: 'answered: disputed', colour: '#cc79a7', dash: [9, 3, 2, 3], width: 2.4 },
   repaired: { label: 'answered: repaired', colour: '#56b4e9', dash: [4, 2], width: 3.2 },
-  answered: { label: 'answered: standing not known', colour: '#0072b2', dash: [], width: 2.4 },
+  answered: { label: 'answered: standing not known', colour: '#0072b2', dash: [6, 2, 2, 2], width: 2.4 },
   contradicted: { label: 'left out: contradicted', colour: '#d55e00', dash: [5, 4], width: 2, crossed: true },
   averted: { label: 'only in a rejected fusion', colour: null, dash: [1, 3], width: 1.6, crossed: true },
   vehicles: { label: 'vehicles that send', colour: null, dash: [], width: 2 },

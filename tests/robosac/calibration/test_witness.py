@@ -145,7 +145,7 @@ class Kept:
 def test_scenes_are_those_kept_for_training_or_the_last_ones_of_validation():
     assert training_scenes(Kept(), 2) == [2, 3]
     assert training_scenes(Kept([7, 8, 9]), 2) == [7, 8]
-    with pytest.raises(SceneError, match="kept has 4 scenes to train on; 5 are wanted"):
+    with pytest.raises(SceneError, match="kept has too few scenes to train on: 4, and 5 are wanted"):
         training_scenes(Kept(), 5)
 
 

@@ -41,3 +41,11 @@ def test_steps_by_hand_end_in_one_line(monkeypatch):
     with pytest.raises(SystemExit) as raised:
         command.upgrade(Config(Path(migrations.__file__).parent / "alembic.ini"), "head")
     assert raised.value.code == f"Error: {MESSAGE}"
+
+
+def test_steps_by_hand_ask_which_database(monkeypatch, tmp_path):
+    monkeypatch.delenv("ROBOSAC_DATABASE_URL", raising=False)
+    monkeypatch.chdir(tmp_path)
+    with pytest.raises(SystemExit, match="ROBOSAC_DATABASE_URL has to name the database"):
+        command.upgrade(Config(Path(migrations.__file__).parent / "alembic.ini"), "head")
+    assert not list(tmp_path.iterdir())

@@ -113,7 +113,7 @@ def test_several_comparisons_are_each_as_by_itself(detector):
 @pytest.mark.parametrize(
     ("arguments", "complaint"),
     [
-        (["--world", "nonesuch"], f"no world 'nonesuch': give world:NAME with one of {', '.join(WORLDS)}"),
+        (["--world", "nonesuch"], f"no world 'nonesuch': there are {', '.join(WORLDS)}"),
         (["--world", "highway", "--data", "world:car-park"], "--data does, too"),
         (["--world", "no.such:module"], "no.such:module: ModuleNotFoundError"),
         (["--world", "v2x-sim:a/b", "--world", "v2x-sim:a-b"], "two of them would have the same folder"),
