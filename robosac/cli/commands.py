@@ -6,6 +6,7 @@ Other packages add commands by the entry point group ``robosac.commands``, so th
 from __future__ import annotations
 
 import ast
+import inspect
 from collections.abc import Sequence
 from importlib.metadata import entry_points
 from importlib.util import find_spec
@@ -69,7 +70,14 @@ def load(name: str, place: str) -> Any:
         found.command(name)(function)
     command = typer.main.get_command(found)
     command.name = name
+    for each in (command, *getattr(command, "commands", {}).values()):
+        each.help = _in_paragraphs(each.help)
     return command
+
+
+def _in_paragraphs(text: str | None) -> str | None:
+    """A help text of which each paragraph is one line: typer breaks it where the docstring's lines end, too."""
+    return text and "\n\n".join(" ".join(part.split()) for part in inspect.cleandoc(text).split("\n\n"))
 
 
 class Commands(TyperGroup):

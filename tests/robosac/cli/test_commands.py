@@ -37,7 +37,10 @@ def words(text):
 def test_the_help_says_of_a_command_what_it_says_of_itself(name, place, brought):
     summary = commands.summary(place)
     assert summary
-    assert summary == " ".join(commands.load(name, place).help.partition("\n\n")[0].split())
+    command = commands.load(name, place)
+    assert command.help.partition("\n\n")[0] == summary
+    for each in (command, *getattr(command, "commands", {}).values()):
+        assert "\n" not in each.help.replace("\n\n", "")  # else lines would break in the middle
     assert summary in words(runner.invoke(app, ["--help"], terminal_width=400).output)
     own = runner.invoke(app, [name, "--help"], terminal_width=400)
     assert own.exit_code == 0, own.output
