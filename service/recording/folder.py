@@ -33,6 +33,7 @@ class _Open:
 
     file: RecordingFile
     used: float
+    part: int
 
 
 @dataclass
@@ -130,8 +131,7 @@ class Folder:
         except BaseException:
             self._files.pop(session_id).file.abandon()
             raise
-        part, _ = self._parts[session_id]
-        self._parts[session_id] = part, record.frames_answered + 1
+        self._remember(session_id, opened.part, record.frames_answered + 1)
         size = opened.file.size
         if size >= min(self.most_file, self.most // 2):
             self.end(session_id)
@@ -198,12 +198,13 @@ class Folder:
         kept = {name: value for name, value in vars(record).items() if name in Opening.model_fields}
         more = {"version": version("robosac"), "least_score": moment.least_score, "bodies": self.bodies, "part": part}
         opening = Opening(**kept, **more)
-        opened = _Open(RecordingFile(path, opening, moment.time_ns, self._ros2), time.monotonic())
-        self._parts.pop(record.session_id, None)
-        self._parts[record.session_id] = part, record.frames_answered
+        return _Open(RecordingFile(path, opening, moment.time_ns, self._ros2), time.monotonic(), part)
+
+    def _remember(self, session_id: str, part: int, frames: int) -> None:
+        self._parts.pop(session_id, None)
+        self._parts[session_id] = part, frames
         while len(self._parts) > REMEMBERED:
             del self._parts[next(iter(self._parts))]
-        return opened
 
     def _latest_part(self, record: SessionRecord) -> int:
         """The number of a session's latest file, 0 if it has none. The folder, which may hold very many, is read only

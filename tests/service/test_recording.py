@@ -378,6 +378,34 @@ def test_where_all_files_are_open_the_one_unused_for_longest_goes(recorded_momen
     assert 0 not in left
 
 
+def test_of_a_key_what_is_being_written_goes_last(recorded_moments, tmp_path):
+    folder = Folder(tmp_path, most_file=2**28, most=2**33, bodies=True)
+    folder.make()
+    for number in range(3):
+        folder.add(a_session(number), recorded_moments[0], 0)
+    folder.end(a_session(2).session_id)
+    (size, *_) = [path.stat().st_size for path in tmp_path.iterdir()]
+    folder.most = 5 * size // 2
+    folder.make_room()
+    assert {int(path.name.split("-")[1], 16) for path in tmp_path.iterdir()} == {0, 1}
+    folder.close()
+
+
+def test_more_sessions_are_recorded_than_are_remembered(recorded_moments, tmp_path, monkeypatch):
+    monkeypatch.setattr("service.recording.folder.REMEMBERED", 4)
+    folder = Folder(tmp_path, most_file=2**28, most=2**33, bodies=False)
+    folder.make()
+    for frame in range(3):
+        for number in range(6):
+            folder.add(a_session(number, frames_answered=frame), recorded_moments[frame], 0)
+            assert len(folder._parts) <= 4
+    for number in range(6):
+        folder.over(a_session(number).session_id)
+    assert not folder._parts
+    found = sessions(tmp_path)
+    assert [[frame.number for frame in session.frames] for session in found] == [[0, 1, 2]] * 6
+
+
 def test_what_a_file_and_a_folder_may_have_is_bounded():
     for name in ("record_file_bytes", "record_bytes"):
         with pytest.raises(ValueError, match=name):

@@ -31,7 +31,7 @@ DEFAULT_POSE_ERROR_M = 0.2
 CALIBRATED_PERIOD_MS = 200.0
 COMPARABLE_PERIOD_MS = 250.0
 """Longest period of frames of which one is like the next, as calibrated at `CALIBRATED_PERIOD_MS`."""
-LONGEST_PERIOD_MS = 60_000.0
+LEAST_PERIOD_MS, LONGEST_PERIOD_MS = 1.0, 60_000.0
 HIJACKED_OF = 10
 """In larger teams as many teammates are hijacked from frame to frame as in a team of so many."""
 
@@ -222,7 +222,7 @@ class GroupTesting:
             posterior.step(Hazards(hijack, recovery, change))
             memory.strangeness.step()
         posterior.regroup(unresolved(posterior.marginals()))
-        period_s = (settings.frame_period_ms or CALIBRATED_PERIOD_MS) / 1e3
+        period_s = max(LEAST_PERIOD_MS, settings.frame_period_ms or CALIBRATED_PERIOD_MS) / 1e3
         known = Knowledge(self.model, posterior, memory, period_s)
         evidence = self.evidence(known, compare_frames=settings.compare_frames is not False)
         judged = JudgedFrame(known, evidence, tuple(team), frozenset(trusted_in(state)))

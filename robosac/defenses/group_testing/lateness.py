@@ -36,8 +36,10 @@ excuse itself.
 """
 TURNING = 0.02
 """A sender that turns by less in `WHILE_S`, radians, goes straight on, as far as poses tell."""
-SENT_S, SENT_FRAMES = 5.0, 5
-"""How fast a sender is may be told by where it was so long ago, or so many frames: not each sends in every frame."""
+SENT_S, SENT_FRAMES, MOST_FRAMES = 5.0, 5, 250
+"""How fast a sender is may be told by where it was so long ago: not each sends in every frame. It may be so many frames
+ago at least, and at most.
+"""
 FOLLOWED_S = 1.0
 """So long a vehicle can be followed, be it over one frame or over some that are missing in between."""
 FASTEST_M_S = 35.0
@@ -105,8 +107,8 @@ def senders(testimony: Testimony, pose: FloatArray) -> dict[str, Place]:
 
 
 def lately(period_s: float) -> int:
-    """In how many frames `SENT_S` are over."""
-    return max(SENT_FRAMES, round(SENT_S / period_s))
+    """In how many frames `SENT_S` are over, within the bounds."""
+    return min(MOST_FRAMES, max(SENT_FRAMES, round(SENT_S / period_s)))
 
 
 def sent(before: Mapping[str, Sent], now: Mapping[str, Place], number: int, most: int) -> dict[str, Sent]:

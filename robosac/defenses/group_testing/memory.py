@@ -167,6 +167,7 @@ class Memory:
         self.straying.forget(teammate)
         self.placing.forget(teammate)
         self.steadiness.levels.pop(teammate, None)
+        self.senders.pop(teammate, None)
         self.left[teammate] = (suspicion, self.frame)
         while len(self.left) > MAX_LEFT:  # not by their order, which a state that was stored has lost
             del self.left[min(self.left, key=lambda name: (self.left[name][1], name))]

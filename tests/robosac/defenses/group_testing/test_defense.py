@@ -233,7 +233,9 @@ def test_frames_that_do_not_follow_on_one_another_are_not_compared(defense, fram
     assert set(decision.accepted) == set(TEAM)
 
 
-@pytest.mark.parametrize(("settings", "expected"), [({}, 0.2), ({"frame_period_ms": 50.0}, 0.05)])
+@pytest.mark.parametrize(
+    ("settings", "expected"), [({}, 0.2), ({"frame_period_ms": 50.0}, 0.05), ({"frame_period_ms": 1e-6}, 0.001)]
+)
 def test_what_is_known_of_a_frame_tells_how_long_it_lasts(settings, expected, rng):
     periods = []
 

@@ -114,6 +114,8 @@ def test_vehicles_are_followed_along_themselves():
     assert motions(far[:1], before[:1], 2, 0.2) == pytest.approx(np.array([[6.0, 0.0]]))
     assert motions(far[:1], before[:1], 1, 0.4) == pytest.approx(np.array([[12.0, 0.0]]))
     assert np.isnan(motions(far[:1], before[:1], 6, 0.2)).all()  # too long ago
+    aside = before[:1] + [[12.0, 1.5, 0.0, 0.0]]
+    assert motions(aside, before[:1], 2, 0.2) == pytest.approx(np.array([[6.0, 0.75]]))
     assert np.isnan(motions(before + [[0.0, 1.7, 0.0, 0.0]], before, 2, 0.2)[0]).all()
     assert np.isnan(motions(now, before[:0])).all()
     assert motions(now[:0], before).shape == (0, 2)
@@ -208,13 +210,19 @@ def test_where_frames_are_missing_or_far_apart_nobody_who_is_late_is_named(numbe
 
 
 def test_where_senders_were_is_known_for_some_seconds():
-    assert [lately(period_s) for period_s in (0.05, 0.2, 0.5, 1.0, 5.0)] == [100, 25, 10, 5, 5]
+    assert [lately(period_s) for period_s in (0.001, 0.05, 0.2, 0.5, 1.0, 5.0)] == [250, 100, 25, 10, 5, 5]
     state = drive(2, 0)[-1].state
     assert state["memory"]["senders"] == {name: [0.0, 0.0, 1, 0.0, 0.0] for name in (EGO, *TEAM)}
     for frames, last in ((MOST, 0), (MOST + 1, None)):
         kept = drive(frames, 0, every=100)[-1].state["memory"]["senders"]
         assert kept.get(LIAR) == (None if last is None else [0.0, 0.0, last, 0.0, 0.0])
         assert kept[EGO] == [0.0, 0.0, frames - 1, 0.0, 0.0]
+
+
+def test_who_leaves_is_nowhere_when_another_of_that_name_joins():
+    memory = Memory(senders={"a": (1.0, 2.0, 6, 0.5, 0.1), "b": (1.0, 2.0, 6, 0.5, 0.1)})
+    memory.leave("a", 0.1)
+    assert set(memory.senders) == {"b"}
 
 
 def test_how_fast_a_sender_is_shows_from_where_it_was_lately():
