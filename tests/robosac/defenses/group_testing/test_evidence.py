@@ -1,5 +1,8 @@
 """What several findings of one frame count together."""
 
+from dataclasses import replace
+
+import numpy as np
 import pytest
 
 from robosac.defenses.group_testing.evidence import SAID_AGAIN, Evidence
@@ -48,3 +51,16 @@ def test_what_speaks_for_them_counts_in_full():
     both = ("car-2", "rsu")
     honest = counted(("car-2",), ("rsu",), both, attackers=())
     assert honest[both] == pytest.approx(counted(both, attackers=())[both])
+
+
+@pytest.mark.parametrize(("compared", "shown_in", "before"), [(True, 2, True), (True, 1, False), (False, 2, False)])
+def test_a_frame_is_compared_with_the_one_just_before_alone_and_vehicles_stay_known(compared, shown_in, before):
+    whole = tuple(TEAM)
+    known = Knowledge(MODEL, Posterior(len(MODEL.kinds), 0.5, 0.25, TEAM), Memory(frame=1, shown_in=shown_in))
+    boxes = np.array([[number * 8.0, 0.0, 0.0, 0.9] for number in range(4)])
+    known.memory.shown = shown = {known.key(whole): boxes}
+    evidence = Evidence(known, compare_frames=compared)
+    assert bool(known.memory.shown) == compared  # a comparison may be promised until the frame's number is known
+    evidence.learn(replace(outcome(whole, ()), frame=3))
+    assert known.frames_since == 3 - shown_in
+    assert (known.memory.shown, known.shown_before) == ((shown, {}) if before else ({}, shown))
