@@ -7,6 +7,7 @@ from types import SimpleNamespace
 import pytest
 
 from service.sessions.clock import Clock
+from service.sessions.sessions import Sessions
 from tests.service.conftest import serve
 
 
@@ -36,6 +37,7 @@ async def test_a_gateway_whose_clock_is_wrong_ends_and_purges_nothing(skew_s, sa
 async def test_what_a_gateway_with_a_wrong_clock_keeps_is_as_old_as_it_is(skew_s, postgres, monkeypatch):
     right = time.time
     monkeypatch.setattr(Clock, "stepped_s", lambda *_: 0.0)  # here two clocks, of which one is right all the time
+    monkeypatch.setattr(Sessions, "expire_idle", lambda _: asyncio.Event().wait())  # which no sweep sees change
     settings = {"session_idle_s": 2, "audit_retention_s": 1}
     async with serve(database_url=await postgres.new_database(), **settings) as served:
         store, sessions = served.gateway.store, served.gateway.sessions
