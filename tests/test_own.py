@@ -59,7 +59,7 @@ def test_all_four_are_compared(own):
 
 async def test_all_four_are_calibrated_served_and_driven(own, monkeypatch):
     options = ["--detector", "my_detector:build", "--data", "my_data:Road", "--pose-error", 0]
-    attacks = ["--attack", "pgd", "--attack", "my_attack:Suppress", "--scenes", 16, "--check-scenes", 0]
+    attacks = ["--attack", "pgd", "--attack", "my_attack:Suppress", "--scenes", 8, "--check-scenes", 0]
     path = own / "my_detector.calibration.json"
     done = robosac("calibrate", *options, *attacks, "--out", path)
     assert done.exit_code == 0, done.stdout
@@ -86,7 +86,7 @@ def test_data_can_be_disturbed_and_compared_with_itself(own):
     example = re.findall(r"```python\n(.*?)```", (DOCS / "own-data.md").read_text(), re.DOTALL)[1]
     (own / "my_worlds.py").write_text(example)
     worlds = ["--world", "my_data:Road", "--world", "my_worlds:WetRoad"]
-    short = ["--setting", "honest:0", "--only", "no defence", "--scenes", 2, "--frames", 6, "--jobs", 2]
+    short = ["--setting", "honest:0", "--only", "no defence", "--scenes", 2, "--frames", 6]
     done = robosac("compare", *worlds, *short, "--out", "out")
     assert done.exit_code == 0, done.stderr
     with (own / "out" / "worlds.csv").open() as file:

@@ -11,7 +11,7 @@ from abc import ABC, abstractmethod
 from collections.abc import Callable, Collection, Mapping, Sequence
 from dataclasses import dataclass, fields
 from numbers import Integral, Real
-from typing import ClassVar
+from typing import ClassVar, Protocol
 
 import numpy as np
 import torch
@@ -30,6 +30,28 @@ Aim = Callable[[Tensors, Tensors], torch.Tensor]
 Term = Callable[[Tensors], torch.Tensor]
 """What is added to that, of the attackers' present messages."""
 _VARIABLES = "variables"
+
+
+class Optimiser(Protocol):
+    """What moves variables along their ``grad``, as those of `torch.optim` do."""
+
+    def step(self) -> object:
+        """Move them once."""
+
+
+@dataclass(frozen=True)
+class Descent:
+    """Plain descent. `torch.optim.SGD` does the same, but loads all of torch's compiler, which takes seconds."""
+
+    variables: Sequence[torch.Tensor]
+    step_size: float
+
+    @torch.no_grad()
+    def step(self) -> None:
+        """Subtract ``step_size * grad`` from each variable."""
+        for variable in self.variables:
+            assert variable.grad is not None
+            variable.sub_(variable.grad, alpha=self.step_size)
 
 
 @dataclass(frozen=True)
@@ -259,9 +281,9 @@ class IterativeAttack(Attack):
         """The perturbation that a variable stands for; by default itself."""
         return variable
 
-    def optimiser(self, variables: list[torch.Tensor]) -> torch.optim.Optimizer:
+    def optimiser(self, variables: list[torch.Tensor]) -> Optimiser:
         """What moves the variables; by default plain descent."""
-        return torch.optim.SGD(variables, lr=self.step_size)
+        return Descent(variables, self.step_size)
 
     def normalise(self, gradient: torch.Tensor) -> torch.Tensor:
         """The direction of a step; by default the sign, the steepest descent under an L-infinity bound."""

@@ -8,7 +8,7 @@ import pytest
 
 import robosac
 
-HEAVY = ("torch", "scipy", "matplotlib")
+HEAVY = ("torch", "torch._dynamo", "scipy", "matplotlib")
 
 
 def loaded_by(code: str) -> set[str]:
@@ -37,6 +37,18 @@ def test_light_things_are_light_to_import(code):
 def test_fusion_has_loaded_all_that_a_frame_needs():
     # match() imports scipy in its rare branch; inside a frame that would cost a second
     assert "scipy" in loaded_by("import robosac.fusion")
+
+
+def test_an_attack_does_without_the_compiler_of_torch():
+    code = """
+import torch
+from robosac.attacks import PGD
+variable = torch.ones(3)
+variable.grad = torch.tensor([1.0, 0.0, -2.0])
+PGD(step_size=0.5).optimiser([variable]).step()
+assert variable.tolist() == [0.5, 1.0, 2.0]
+"""
+    assert loaded_by(code) == {"torch"}
 
 
 @pytest.mark.parametrize("package", ["robosac", "robosac.detectors"])

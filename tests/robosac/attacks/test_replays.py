@@ -11,18 +11,11 @@ from robosac.consensus import at_least
 from robosac.defenses import EGO
 from robosac.defenses.group_testing.claims import Claims
 from robosac.defenses.group_testing.geometry import measure
-from robosac.evaluation.encounters import Encounters
-from robosac.scenes import IntersectionScene
 from tests.robosac.attacks.linear import Linear, situation
 
-SCENE, SENDER = IntersectionScene(2), "car-3"
+SENDER = "car-3"
 ROUNDING = 0.01
 """Of messages, which are half floats."""
-
-
-def frames(detector, spec, count=3, attackers=(SENDER,)):
-    """Those in which somebody attacks."""
-    return [met for met in Encounters(detector, SCENE).sequence(count, spec, list(attackers)) if met.attackers]
 
 
 def features(message):
@@ -35,16 +28,16 @@ def logits(detector, met, messages):
 
 
 @pytest.mark.parametrize(("spec", "bound"), [("copy@soft", 0.5), ("copy@soft@double", 1.0), ("copy@denying", 0.5)])
-def test_a_soft_replay_keeps_within_the_bound_around_the_replayed_map(spec, bound, detector):
-    for met in frames(detector, spec, 2):
+def test_a_soft_replay_keeps_within_the_bound_around_the_replayed_map(spec, bound, played):
+    for met in played(spec, 2):
         changed = np.abs(features(met.teammates[SENDER]) - features(met.benign["car-4"]))
         assert 0.8 * bound < changed.max() < bound + ROUNDING
 
 
-def figures(detector, spec):
+def figures(detector, frames):
     """Means over frames of g + v beside the ego alone, and of how strange the attacker's word is where boxes show."""
     pairs, strange, witness = [], [], witness_of(detector.info)
-    for met in frames(detector, spec):
+    for met in frames:
         prepared = met.prepare(met.ego, met.teammates)
         pair = measure(at_least(prepared.detect(()), detector.info.consensus_score), prepared.detect([SENDER]))
         pairs.append(pair.loss + pair.novelty)
@@ -57,14 +50,14 @@ def figures(detector, spec):
     return np.mean(pairs), np.mean(strange)
 
 
-def test_a_soft_replay_shows_less_in_what_is_measured(detector):
-    plain, soft, denying = (figures(detector, spec) for spec in ("copy", "copy@soft", "copy@denying"))
+def test_a_soft_replay_shows_less_in_what_is_measured(detector, played):
+    plain, soft, denying = (figures(detector, played(spec, 2)) for spec in ("copy", "copy@soft", "copy@denying"))
     assert soft[0] < plain[0] - 1
     assert denying[1] < 0.5 * min(plain[1], soft[1])
 
 
-def test_the_harm_of_a_soft_replay_stays(detector):
-    for plain, soft in zip(frames(detector, "copy"), frames(detector, "copy@soft"), strict=True):
+def test_the_harm_of_a_soft_replay_stays(detector, played):
+    for plain, soft in zip(played("copy", 2), played("copy@soft", 2), strict=True):
         honest, wanted, found = (
             torch.sigmoid(logits(detector, met, messages))
             for met, messages in ((plain, plain.benign), (plain, plain.teammates), (soft, soft.teammates))
@@ -89,17 +82,17 @@ def pull(sent):
     return 1e3 * sum(tensor.sum() for tensor in sent.values())
 
 
-def test_who_has_nothing_to_replay_is_honest_though_soft(detector):
-    first = Encounters(detector, SCENE).sequence(1, "frozen@soft", [SENDER])[0]
+def test_who_has_nothing_to_replay_is_honest_though_soft(played):
+    (first,) = played("frozen@soft", 1)
     assert not first.attackers
     assert Frozen().optimise(Linear(), ["a"], np.random.default_rng(0), Situation()) == {}
 
 
-def test_without_a_pretence_a_replay_is_the_map_itself(detector):
+def test_without_a_pretence_a_replay_is_the_map_itself(played):
     for spec in ("copy", "copy@asleep@false-pose"):
         assert (campaign := load_campaign(spec)).needs == ()
         assert campaign.attack == Copy()
-    (met,) = frames(detector, "copy", 1)
+    met, _ = played("copy", 2)
     np.testing.assert_array_equal(met.teammates[SENDER].tensors["features"], met.benign["car-4"].tensors["features"])
 
 
@@ -121,12 +114,12 @@ def test_what_only_a_replay_shows_is_spoken_of_honestly():
     assert len(kept[1]) > len(kept[0])
 
 
-def test_replaying_attackers_can_have_an_alibi(detector):
+def test_replaying_attackers_can_have_an_alibi(detector, played):
     pair = ("car-3", "rsu")
     assert BEHAVIOURS["covering"]["alibi"] is covering
     off = {}
     for spec in ("copy", "copy@covering"):
-        (met,) = frames(detector, spec, 1, pair)
+        (met,) = played(spec, 1, pair)
         alone = [logits(detector, met, {name: sent[name] for name in pair[:1]}) for sent in (met.benign, met.teammates)]
         off[spec] = float((alone[0].sigmoid() - alone[1].sigmoid()).abs().mean())
     assert off["copy@covering"] < off["copy"]

@@ -12,12 +12,8 @@ from robosac.calibrated import witness_of
 from robosac.defenses import EGO
 from robosac.defenses.group_testing.claims import DENIES, SUPPORTS, Claims
 from robosac.detectors.base import DetectorInfo
-from robosac.evaluation.encounters import Encounters
-from robosac.scenes import IntersectionScene
 from robosac.testimony import MOST
 from tests.robosac.attacks.linear import VEHICLES, Linear, hearing, situation
-
-SCENE = IntersectionScene(2)
 
 
 @pytest.fixture(scope="module")
@@ -120,10 +116,10 @@ def test_who_vouches_for_a_moved_vehicle_sees_it_where_it_is_said_to_be():
     assert paid[1] - paid[0] == pytest.approx(1.2, abs=0.05)
 
 
-def own_words(detector, spec, attackers, frames=2):
+def own_words(detector, frames, attackers):
     """Of each lie in each frame: L of the attackers' own messages there, and whether the undefended fusion tells it."""
     witness = witness_of(detector.info)
-    for met in Encounters(detector, SCENE).sequence(frames, spec, attackers):
+    for met in frames:
         said = witness.testify(EGO, {EGO: met.ego, **met.teammates}).of(attackers)
         fused = met.prepare(met.ego, met.teammates).detect(met.team)
         fused = fused[fused[:, 5] >= 0.3]
@@ -138,15 +134,15 @@ def own_words(detector, spec, attackers, frames=2):
 @pytest.mark.parametrize(
     ("spec", "attackers", "sign"),
     [
-        ("ghost@denying", ["car-3"], -1),
-        ("remove@denying", ["car-3", "rsu"], 1),
-        ("displace@denying", ["car-3"], 1),
-        ("ghost@vouching", ["car-3", "rsu"], 1),
-        ("remove@vouching", ["car-3"], -1),
+        ("ghost@denying", ("car-3",), -1),
+        ("remove@denying", ("car-3", "rsu"), 1),
+        ("displace@denying", ("car-3",), 1),
+        ("ghost@vouching", ("car-3", "rsu"), 1),
+        ("remove@vouching", ("car-3",), -1),
     ],
 )
-def test_their_own_word_is_as_wanted_and_the_lie_still_shows(spec, attackers, sign, detector):
-    found = list(own_words(detector, spec, attackers))
+def test_their_own_word_is_as_wanted_and_the_lie_still_shows(spec, attackers, sign, detector, played):
+    found = list(own_words(detector, played(spec, 1, attackers), attackers))
     for everybody, _ in found:
         said = everybody[everybody != 0.0]  # the place may lie beyond the map of one of them
         assert len(said)
@@ -154,11 +150,11 @@ def test_their_own_word_is_as_wanted_and_the_lie_still_shows(spec, attackers, si
     assert np.mean([shows for _, shows in found]) > 0.5
 
 
-def test_an_attack_on_whole_fusions_says_honestly_what_is_there(detector):
+def test_an_attack_on_whole_fusions_says_honestly_what_is_there(detector, played):
     witness, strange = witness_of(detector.info), {}
     for spec in ("shift@soft", "shift@denying"):
         strange[spec] = []
-        for met in Encounters(detector, SCENE).sequence(2, spec, ["car-3"]):
+        for met in played(spec, 1):
             own, honest = (
                 Claims.of(met.truth[:, :5], witness.testify(EGO, {EGO: met.ego, "car-3": sent["car-3"]})).likelihood[1]
                 for sent in (met.teammates, met.benign)

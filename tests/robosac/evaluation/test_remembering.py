@@ -14,6 +14,8 @@ from robosac.scenes.intersection import Synthetic
 from tests.robosac.evaluation.test_recordings import same
 
 SCENE = IntersectionScene(4)
+FEW = IntersectionScene(4, car_agents=3)
+"""With three teammates, since all subsets of them are recorded."""
 
 
 def told(frame):
@@ -25,27 +27,27 @@ def features(frame, name):
 
 
 def test_a_frame_does_not_depend_on_which_others_are_recorded(detector, tmp_path):
-    whole = Recordings(detector, SCENE).sequence(3, "ghost", ["car-3"])
+    whole = Recordings(detector, FEW).sequence(3, "ghost", ["car-3"])
     assert all(frame.lies for frame in whole)
-    Recordings(detector, SCENE, folder=tmp_path).sequence(2, "ghost", ["car-3"])
-    extended = Recordings(detector, SCENE, folder=tmp_path).sequence(3, "ghost", ["car-3"])
+    Recordings(detector, FEW, folder=tmp_path).sequence(2, "ghost", ["car-3"])
+    extended = Recordings(detector, FEW, folder=tmp_path).sequence(3, "ghost", ["car-3"])
     for one, other in zip(whole, extended, strict=True):
         assert same(one, other)
         assert told(one) == told(other)
 
 
 def test_a_schedule_chooses_among_the_frames_of_the_whole_course(detector):
-    recordings = Recordings(detector, SCENE)
+    recordings = Recordings(detector, FEW)
     awake = recordings.sequence(12, "frozen", ["car-3"])
     asleep = recordings.sequence(12, "frozen@asleep", ["car-3"])
     assert [frame.attackers for frame in asleep] == [frozenset()] * 10 + [{"car-3"}] * 2
     assert asleep[11] is awake[11]
-    first = Recordings(detector, SCENE).sequence(12, "frozen@asleep", ["car-3"])
+    first = Recordings(detector, FEW).sequence(12, "frozen@asleep", ["car-3"])
     assert all(map(same, first, asleep))
 
 
 def test_lies_survive_a_file(detector, tmp_path):
-    frames = Recordings(detector, SCENE).sequence(1, "displace", ["car-3"])
+    frames = Recordings(detector, FEW).sequence(1, "displace", ["car-3"])
     save(tmp_path / "x.npz", {0: frames[0]}, whole=True)
     (again,) = load(tmp_path / "x.npz", detector, lambda _: []).values()
     (lie,), (before,) = again.lies, frames[0].lies

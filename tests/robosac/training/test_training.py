@@ -16,7 +16,7 @@ from robosac.training.loop import TrainingConfig, _step, train_network
 from robosac.training.loss import detection_loss, stack, targets
 from robosac.training.validation import OperatingPoint
 
-TINY = TrainingConfig(scenes=2, frames_per_scene=2, steps=40, frames_per_step=2, egos_per_frame=2)
+TINY = TrainingConfig(scenes=2, frames_per_scene=2, steps=24, frames_per_step=2, egos_per_frame=2)
 
 
 def silent(stage, done, total, remark):
@@ -45,7 +45,7 @@ def test_training_learns_and_resumes_where_it_stopped(trained, tmp_path):
     assert np.mean(losses[-5:]) < 0.9 * np.mean(losses[:5])
 
     def interrupt(stage, done, total, remark):
-        if stage == "train" and done == 29:
+        if stage == "train" and done == 13:
             raise Stop
 
     with pytest.raises(Stop):
@@ -54,7 +54,7 @@ def test_training_learns_and_resumes_where_it_stopped(trained, tmp_path):
     resumed = train_network(
         TINY, tmp_path / "parts.pt", lambda stage, done, *_: steps.append(done) if stage == "train" else None
     )
-    assert steps == list(range(25, 41))
+    assert steps == list(range(9, 25))
     for name, tensor in whole.state_dict().items():
         torch.testing.assert_close(resumed.state_dict()[name], tensor)
 
