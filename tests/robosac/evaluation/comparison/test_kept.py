@@ -171,7 +171,7 @@ def test_a_full_disk_ends_it_in_a_line(tmp_path, monkeypatch):
 def test_what_other_code_recorded_is_not_used(own, tmp_path):
     helper, attack = own
     folder = tmp_path / "recordings"
-    arguments = ["--setting", attack, "--recordings", folder, "--force", "--out", tmp_path / "out"]
+    arguments = ["--setting", attack, "--recordings", folder, "--force", "--scenes", 1, "--out", tmp_path / "out"]
     files = []
     for strength in (0.5, 0.5, 0.1):
         helper.write_text(f"STRENGTH = {strength}\n")

@@ -31,7 +31,7 @@ def test_the_number_of_jobs_changes_nothing(plan):
 
 def test_a_defence_that_fails_in_another_process_stops_the_comparison(plan):
     with pytest.raises(FaultyDefense, match="worse, frame 0: RuntimeError: broken"):
-        compare_defenses(replace(plan, defenses={"worse": Broken()}), 2)
+        compare_defenses(replace(plan, defenses={"worse": Broken()}, live=True, recordings=None), 2)
 
 
 def test_live_and_recorded_answers_are_the_same(plan):
