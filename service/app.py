@@ -24,7 +24,7 @@ from service.arriving.doors import Door, capacity_check, check_head, check_local
 from service.arriving.frames import Frames  # noqa: E402
 from service.arriving.giving_way import GivesWay, Line  # noqa: E402
 from service.arriving.hanging_up import HangingUp  # noqa: E402
-from service.arriving.limits import BodyLimit  # noqa: E402
+from service.arriving.limits import BodyLimit, Unfinished  # noqa: E402
 from service.arriving.pacing import Metered, Pacing  # noqa: E402
 from service.arriving.parties import Parties  # noqa: E402
 from service.deciding.admission import KEY_FRAMES, Admission  # noqa: E402
@@ -117,7 +117,9 @@ def create_app(
     parties, line = gateway.parties, Line(lambda: gateway.admission.busy)
     app.add_middleware(GivesWay, line=line, party_of=parties, is_vehicle=parties.is_vehicle)
     app.add_middleware(HangingUp)
-    app.add_middleware(BodyLimit, limit=settings.max_body_bytes, timeout_s=settings.body_timeout_s)
+    app.add_middleware(
+        BodyLimit, settings.max_body_bytes, timeout_s=settings.body_timeout_s, unfinished=gateway.unfinished
+    )
     app.add_middleware(Door, check=capacity_check(gateway.admission, gateway.sessions.in_use))
     if not keys or settings.allowed_hosts:
         app.add_middleware(Door, check=host_check(settings.hosts))
@@ -178,6 +180,7 @@ def _built(
         parties=parties,
         frames=Frames(sessions, deciding, metrics, admission, settings.max_frame_jump, pacing),
         bodies=Room(settings.max_inflight_bytes, of_key, "ROBOSAC_MAX_INFLIGHT_BYTES"),
+        unfinished=Unfinished(),
         api_keys=api_keys,
         watch=LoopWatch(),
         feed=feed,

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import os
+import signal
 import socket
 from typing import Annotated
 
@@ -37,7 +38,7 @@ def main(
         str | None, typer.Option(help="A Ray cluster that is there; by default one is started here.")
     ] = None,
 ) -> None:
-    """Run the gateway, with the settings of the environment (ROBOSAC_...), until SIGTERM or Ctrl-C."""
+    """Run the gateway, with the settings of the environment (ROBOSAC_...), until SIGTERM, SIGHUP or Ctrl-C."""
     if cluster:
         _serve_on_ray(host, port, (replicas, max(replicas, most_replicas), vehicles), address)
         return
@@ -62,6 +63,8 @@ def main(
     except SettingsError as fault:
         typer.echo(f"Error: {fault}", err=True)
         raise typer.Exit(2) from fault
+    if signal.getsignal(signal.SIGHUP) is signal.SIG_DFL:  # else, as under nohup, it is to be passed over
+        signal.signal(signal.SIGHUP, lambda *_: signal.raise_signal(signal.SIGTERM))
     try:
         # as uvicorn's own command does, the working directory may hold modules of the user's own detectors
         uvicorn.run(

@@ -121,6 +121,13 @@ class SessionLost(SessionOver):
         super().__init__("the database lost what was promised of this session: open another one")
 
 
+class Draining(Refused):
+    """The process is to end: nothing was done."""
+
+    def __init__(self) -> None:
+        super().__init__(Kind.DRAINING, "this gateway process is about to end; send it again, and another takes it")
+
+
 class FrameDecided(Refused):
     """A frame of this number or a higher one is decided already, perhaps by another process."""
 

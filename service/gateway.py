@@ -5,6 +5,7 @@ from __future__ import annotations
 from dataclasses import dataclass
 
 from service.arriving.frames import Frames
+from service.arriving.limits import Unfinished
 from service.arriving.parties import Parties
 from service.deciding.admission import Admission
 from service.engine import Engine
@@ -41,6 +42,7 @@ class Gateway:
     parties: Parties
     frames: Frames
     bodies: Room
+    unfinished: Unfinished
     api_keys: ApiKeys
     watch: LoopWatch
     feed: Feed
@@ -50,4 +52,5 @@ class Gateway:
     def stop(self) -> None:
         """Take nothing new, and send away whoever only listens."""
         self.sessions.drain()
+        self.unfinished.give_up()
         self.feed.end()

@@ -3,8 +3,9 @@
 from __future__ import annotations
 
 import asyncio
+import contextlib
 import math
-from collections.abc import Callable
+from collections.abc import AsyncIterator, Callable
 
 from fastapi import Request
 from starlette.datastructures import Headers
@@ -12,7 +13,7 @@ from starlette.requests import ClientDisconnect
 from starlette.types import ASGIApp, Message, Receive, Scope, Send
 
 from service import problems
-from service.errors import Kind, Refused
+from service.errors import Draining, Kind, Refused
 
 UNREAD_BYTES = 2**21
 """If more of a body is left when its request is answered, the connection is closed: to take the rest costs time."""
@@ -60,6 +61,42 @@ async def read_bounded(request: Request, limit: int, came: Callable[[], None] = 
     return bytes(body)
 
 
+class Unfinished:
+    """The bodies that a process waits for."""
+
+    def __init__(self) -> None:
+        self.given_up = False
+        self._waits: set[asyncio.Timeout] = set()
+
+    @contextlib.asynccontextmanager
+    async def wait_until(self, end: float | None) -> AsyncIterator[None]:
+        """Wait in a block for more of one until then, by the loop's clock, or without end.
+
+        Raises
+        ------
+        Refused
+            If it has not come by then (``slow-body``), or bodies are given up (``draining``).
+        """
+        try:
+            async with asyncio.timeout_at(-math.inf if self.given_up and end is not None else end) as wait:
+                self._waits.add(wait)
+                try:
+                    yield
+                finally:
+                    self._waits.discard(wait)
+        except TimeoutError as error:
+            if self.given_up:
+                raise Draining from error
+            raise Refused(Kind.SLOW_BODY, "the body did not come in time") from error
+
+    def give_up(self) -> None:
+        """The process is to end: wait for no body any more that is not there."""
+        self.given_up = True
+        for wait in self._waits:
+            if not wait.expired():
+                wait.reschedule(-math.inf)
+
+
 class BodyLimit:
     """Bounds every body, whatever route reads it: one that is too large is refused by its announced length, else when
     it outgrows the limit; one that is too slow, when its time is over. Hangs up where much of a body was not wanted.
@@ -73,10 +110,13 @@ class BodyLimit:
         Bytes.
     timeout_s : float
         From the first time that a route asks for it to its last byte.
+    unfinished : Unfinished
+        Those of the process.
     """
 
-    def __init__(self, app: ASGIApp, limit: int, timeout_s: float) -> None:
+    def __init__(self, app: ASGIApp, limit: int, timeout_s: float, unfinished: Unfinished) -> None:
         self._app = app
+        self._unfinished = unfinished
         self._limit = limit
         self._timeout_s = timeout_s
 
@@ -97,12 +137,12 @@ class BodyLimit:
                 return await receive()
             end = asyncio.get_running_loop().time() + self._timeout_s if end is None else end
             try:
-                async with asyncio.timeout_at(None if started else end):
+                async with self._unfinished.wait_until(None if started else end):
                     message = await receive()
-            except TimeoutError as error:
+            except Refused:
                 if started:
-                    return await bounded()
-                raise Refused(Kind.SLOW_BODY, "the body did not come in time") from error
+                    return await receive()
+                raise
             complete = not message.get("more_body", False)
             taken += len(message.get("body", b""))
             if taken > self._limit:

@@ -13,7 +13,7 @@ from robosac.audit.events import Proof
 from robosac.defenses import Rejection
 from robosac.detectors import Message
 from robosac.recording.truth import Truth
-from service.errors import Kind, Refused, Unusable
+from service.errors import Draining, Kind, Refused, Unusable
 from service.sessions.room import Share
 
 REMEMBERED_FRAMES = 8
@@ -188,7 +188,7 @@ class Gathering:
                     self._arrival.clear()
                     await self._arrival.wait()
         if self._sent_away and any(frame not in mine for mine in self._pending.values()):
-            raise Refused(Kind.DRAINING, "this gateway process is about to end; send it again, and another takes it")
+            raise Draining
         waiting = {name: mine.get(frame) for name, mine in self._pending.items()}
         return {name: received for name, received in waiting.items() if received is not None}
 

@@ -16,7 +16,7 @@ from collections.abc import AsyncIterator, Iterable, Iterator
 from dataclasses import dataclass, field
 from typing import Any
 
-from service.errors import Kind, Refused
+from service.errors import Draining, Refused
 from service.keeping.patience import within
 from service.keeping.record import SessionRecord
 from service.keeping.store import Store
@@ -58,7 +58,7 @@ class Moving:
             With the kind ``draining``: nothing was done, and another process does it.
         """
         if self.draining:
-            raise Refused(Kind.DRAINING, "this gateway process is about to end; send it again, and another takes it")
+            raise Draining
 
     def drain(self, sessions: Iterable[LiveSession]) -> None:
         """Take nothing new from now on. Frames that are being decided go on; those that wait are asked for again."""

@@ -18,7 +18,16 @@ from robosac.calibrated import screening_for
 from robosac.defenses import DefenseSettings, known, read_settings, suspicion_in
 from robosac.session import Session, defense_for
 from service.engine import Engine
-from service.errors import Kind, Refused, SessionInUse, SessionOver, StoreTooSlow, StoreUnavailable, TokenRefused
+from service.errors import (
+    Kind,
+    Refused,
+    SessionInUse,
+    SessionLost,
+    SessionOver,
+    StoreTooSlow,
+    StoreUnavailable,
+    TokenRefused,
+)
 from service.keeping.gateway_keys import GatewayKeys
 from service.keeping.patience import GRACE_S, within
 from service.keeping.record import SessionRecord, new_seed
@@ -217,7 +226,7 @@ class Sessions:
     async def _expire(self, session_id: str) -> None:
         """End a session, unless it has been used since it was found unused: many may have been ended in between."""
         if self._idle.is_unused_here(session_id):
-            with contextlib.suppress(SessionInUse):
+            with contextlib.suppress(SessionInUse, SessionLost):  # of which the store's log tells
                 await self._end(session_id, "expired", self._idle.long_ago())
 
     async def current(self, caller: Caller) -> SessionRecord:
@@ -319,9 +328,13 @@ class Sessions:
         if live is not None and live.unsure is not None and (record := await self.store.get(session_id)) is not None:
             live.settle(record)
         ended = SessionEnded(why=why, late=() if live is None else tuple(live.late))
-        with contextlib.suppress(SessionOver):
+        try:
             await self.store.end(session_id, ended, unused_since, *checks)
             logger.info("session ended", session_id=session_id, why=why)
+        except SessionLost:
+            raise
+        except SessionOver:  # already
+            pass
         self._forget(session_id)  # not before: if the store fails, the session goes on with the messages that wait
         self.on_end(session_id)
         self.metrics.sessions.set(await self.store.count())

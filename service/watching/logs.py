@@ -1,7 +1,7 @@
 """Structured logs: one event a line, with its fields; never tensors, tokens or keys.
 
 An exception is logged without local variables, and all of a line in bounded size: the innermost calls of the latest
-exceptions of a chain, each with its message in short (`robosac.faults`).
+exceptions of a chain, each with its message in short (`robosac.faults`). Nobody waits until a line is written.
 """
 
 from __future__ import annotations
@@ -18,6 +18,7 @@ import structlog
 
 from robosac.faults import describe, in_short
 from service.settings import Settings
+from service.watching.lines import Lines
 
 CHAIN = 3
 """Exceptions that are shown of a chain, from the latest."""
@@ -46,22 +47,38 @@ structlog.configure(
 )
 
 
-class _Stderr(logging.StreamHandler):  # type: ignore[type-arg]
-    """Writes to what is standard error at that moment."""
+LINES = Lines()
+"""Of this process, on their way to standard error."""
+PATIENCE_S = 1.0
+"""So long a gateway that ends waits for its last lines to be written."""
 
-    def __init__(self) -> None:
-        logging.Handler.__init__(self)
 
-    @property
-    def stream(self) -> object:
-        return sys.stderr
+class _Stderr(logging.Handler):
+    """Has lines written to what is standard error at that moment; ``last``, if the process may end after each."""
+
+    def __init__(self, *, last: bool) -> None:
+        super().__init__()
+        self._last = last
+
+    def emit(self, record: logging.LogRecord) -> None:
+        """Have the record's line written."""
+        try:
+            LINES.put(sys.stderr, f"{self.format(record)}\n", self._lost)
+        except Exception:
+            self.handleError(record)
+        if self._last:
+            LINES.flush(PATIENCE_S)
+
+    def _lost(self, number: int) -> str:
+        text = f"{number} lines of the log were lost: nobody read those before them"
+        return f"{self.format(logging.LogRecord(__name__, logging.WARNING, __file__, 0, text, None, None))}\n"
 
 
 def log_as_the_gateway(settings: Settings, secrets: Sequence[str] = ()) -> None:
     """Let a server that logs already do so as the gateway does: it has lines of its own before the start and after the
     end of `logging_to_stderr`.
     """
-    handler = _handler(settings, secrets)
+    handler = _handler(settings, secrets, last=True)
     for logger in map(logging.getLogger, _SERVER):
         if logger.handlers:
             logger.handlers = [handler]
@@ -88,13 +105,14 @@ def logging_to_stderr(settings: Settings, secrets: Sequence[str] = ()) -> Iterat
             logger.handlers = handlers
             logger.setLevel(level)
             logger.propagate = propagate
+        LINES.flush(PATIENCE_S)
 
 
-def _handler(settings: Settings, secrets: Sequence[str]) -> logging.Handler:
+def _handler(settings: Settings, secrets: Sequence[str], *, last: bool = False) -> logging.Handler:
     renderer: structlog.types.Processor = (
         structlog.processors.JSONRenderer() if settings.log_format == "json" else structlog.dev.ConsoleRenderer()
     )
-    handler = _Stderr()
+    handler = _Stderr(last=last)
     handler.setFormatter(
         structlog.stdlib.ProcessorFormatter(
             foreign_pre_chain=[*_SHARED, _message_in_short],

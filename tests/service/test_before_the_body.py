@@ -16,7 +16,7 @@ from robosac.signatures import show_public_key
 from service.app import create_app
 from service.arriving import bodies, pacing
 from service.arriving.doors import HEADER_BYTES, HEADERS, TARGET_BYTES
-from service.arriving.limits import UNREAD_BYTES, BodyLimit
+from service.arriving.limits import UNREAD_BYTES, BodyLimit, Unfinished
 from service.schemas import SessionRequest
 from service.settings import Settings
 from tests.service.conftest import problem, serve
@@ -319,5 +319,5 @@ async def test_a_body_beside_an_answer_that_goes_on_is_no_fault(piece, sent):
 
     answered: list[bytes] = []
     scope = {"type": "http", "method": "GET", "headers": [(b"transfer-encoding", b"chunked")]}
-    await BodyLimit(StreamingResponse(answer()), 100, 0.05)(scope, receive, send)
+    await BodyLimit(StreamingResponse(answer()), 100, 0.05, Unfinished())(scope, receive, send)
     assert b"".join(answered) == sent

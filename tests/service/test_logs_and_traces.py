@@ -21,6 +21,7 @@ from opentelemetry.sdk.trace.export.in_memory_span_exporter import InMemorySpanE
 
 from robosac import wire
 from service.settings import Settings
+from service.watching.logs import LINES
 from service.watching.tracing import provider_from_environment
 from tests.service.conftest import EGO, HOOKED, problem, serve
 from tests.service.test_identity import bearer
@@ -140,8 +141,10 @@ async def test_a_fault_leaves_no_secret_in_the_log_and_little_of_it(
     seeds = Seeds()
     async with serve(seeds, api_key=KEY, extra_detectors=HOOKED, **settings) as served:
         await served.client.ready()
+        LINES.flush(10)
         capsys.readouterr()
         session = await fault(served, seeds, messages, benign)
+        LINES.flush(10)
         text = capsys.readouterr().err
     assert "Error" in text
     assert len(text.encode()) < LOG_BYTES
@@ -167,6 +170,7 @@ async def test_a_fault_is_told_with_the_calls_that_led_to_it(hooked, capsys):
 
     hooked.detector.before_info = outer
     problem(await hooked.http.get("/v1/detectors"), 500, "internal-error")
+    LINES.flush(10)
     (event,) = [json.loads(line) for line in capsys.readouterr().err.splitlines() if "unhandled" in line]
     assert (event["level"], event["path"]) == ("error", "/v1/detectors")
     late, early = event["exception"].split("\nfrom ")

@@ -3,7 +3,7 @@ import json
 import sqlite3
 
 import pytest
-from sqlalchemy import delete
+from sqlalchemy import delete, text
 
 from clients.errors import AccessDenied, SessionNotFound
 from robosac.audit import verify
@@ -282,6 +282,25 @@ async def test_a_session_that_cannot_be_ended_keeps_no_other_from_it_nor_logs_fr
         await served.gateway.sessions.sweep()
         assert done == [idle[1].session_id]
         assert await store.get(over.session_id) is None
+
+
+async def test_a_session_whose_records_the_database_lost_is_not_said_to_be_closed(monkeypatch, messages, caplog):
+    columns = "revision = {0.revision}, audit_seq = {0.audit_seq}, audit_head = '{0.audit_head}'"
+    async with serve(session_idle_s=1.0) as served:
+        session, store = await served.open(defense={"kind": "none"}), served.gateway.store
+        before = await store.get(session.session_id)
+        await served.ego(session).ask(0, messages["car-1"])
+        undone = text(f"UPDATE sessions SET {columns.format(before)}")
+        await store._database.write(lambda connection: connection.execute(undone))
+        for _ in range(2):
+            with pytest.raises(SessionNotFound, match="the database lost what was promised"):
+                await served.ego(session).close()
+        monkeypatch.setattr(Idle, "unused", lambda _: asyncio.sleep(0, [session.session_id]))
+        monkeypatch.setattr(Idle, "is_unused_here", lambda *_: True)
+        await served.gateway.sessions.sweep()
+        assert "could not be" not in caplog.text
+        assert (await store.get(session.session_id)).ended_at is None
+        assert len(await store.audit(session.session_id, 0)) == 2  # none after what was promised
 
 
 @pytest.mark.parametrize(

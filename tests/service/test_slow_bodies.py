@@ -8,7 +8,9 @@ from cryptography.hazmat.primitives.asymmetric.ed25519 import Ed25519PrivateKey
 
 from robosac import wire
 from robosac.signatures import show_public_key
+from service.arriving.limits import Unfinished
 from service.deciding.admission import SESSION_FRAMES
+from service.errors import Kind, Refused
 from service.sessions.unread import BODIES
 from tests.service.conftest import EGO, problem
 
@@ -85,3 +87,33 @@ async def test_slow_bodies_of_one_vehicle_push_out_none_of_another(served):
         stalled(served, session, 3 * BODIES),
     ):
         assert not of_another.done()
+
+
+@pytest.mark.parametrize("what", ["messages", "frames"])
+async def test_a_process_that_is_to_end_waits_for_no_body(served, what):
+    session = await served.open(gather_ms=0)
+    async with stalled(served, session, 2, what) as senders:
+        served.gateway.stop()
+        for refused in await asyncio.wait_for(asyncio.gather(*senders), 30):
+            problem(refused, 503, "draining")
+
+
+async def test_bodies_that_are_given_up_in_whatever_state_end_once():
+    unfinished, ended = Unfinished(), []
+
+    async def wait(end):
+        try:
+            async with unfinished.wait_until(end):
+                await asyncio.sleep(3600)
+        except Refused as refused:
+            ended.append(refused.kind)
+
+    now = asyncio.get_running_loop().time()
+    waits = [asyncio.create_task(wait(end)) for end in (now, now + 3600)]
+    await asyncio.sleep(0)
+    await asyncio.sleep(0)
+    unfinished.give_up()
+    await asyncio.gather(*waits, wait(now + 3600))
+    assert ended == [Kind.DRAINING] * 3
+    async with unfinished.wait_until(now + 3600):
+        pass  # what is there already is taken

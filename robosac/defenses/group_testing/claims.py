@@ -148,13 +148,14 @@ class Claims:
         """Which boxes (n,) are so contradicted by all but the suspects that somebody is to blame for them.
 
         The sum of their L is at most -8, and at most -4 without the teammate who denies a box most: whoever lies may
-        deny what another one alone sees, and the ego may lean to it.
+        deny what another one alone sees, and the ego may lean to it. Two may lie together, however few others are
+        heard: to accuse the last honest one, too.
         """
         others = self.without(suspects)
         total = others.likelihood.sum(axis=0)
         most = others.likelihood[1:].min(axis=0, initial=0.0)
         enough = (total <= -BLAMED_SUM) & (total - most <= -BLAMED_BESIDE)
-        return others._contradicted(enough, len(others.witnesses) - 1) & ~self._supported_by_many
+        return others._contradicted(enough, NOT_TOGETHER) & ~self._supported_by_many
 
     def _contradicted(self, enough: BoolArray, others: int) -> BoolArray:
         """Which boxes (n,) are contradicted where it is ``enough`` (n,), by so many ``others`` besides the ego."""

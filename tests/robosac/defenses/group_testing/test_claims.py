@@ -73,7 +73,7 @@ def test_what_is_behind_a_vehicle_that_the_ego_sees_it_does_not_know(other, sees
 
 
 def test_a_suspects_own_word_is_left_out_whatever_it_is():
-    liar_denies = claim(0.0, NO, NO, 0.0)
+    liar_denies = claim(-1.5, NO, NO, 0.0)
     assert liar_denies.contradicted().tolist() == [True]
     assert liar_denies.contradicted_by_others(["a"]).tolist() == [False]  # only "b" is left to deny it
     assert liar_denies.contradicted_by_others(["c"]).tolist() == [True]
@@ -91,6 +91,9 @@ def test_a_suspects_own_word_is_left_out_whatever_it_is():
         ((-4.5, -6.0, YES), True),
         ((-3.2, -6.0, -1.0, YES), True),
         ((-2.0, -5.0, -5.0, YES), True),
+        ((0.0, -6.0, -6.0, YES), False),  # the other two may lie together
+        ((0.0, -6.0, -6.0, 0.0, YES), False),
+        ((0.0, -6.0, -6.0, -6.0, YES), True),
         ((-5.2, -3.5, YES), True),  # the ego does not lie
         ((-7.0, YES), True),  # the ego knows
         ((-6.5, YES), False),  # not quite
