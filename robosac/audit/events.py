@@ -50,6 +50,10 @@ Milliseconds = Annotated[float, Field(ge=0, le=86_400_000)]
 """Nothing that a gateway waits for or measures takes more than a day."""
 
 
+_SEED_DIGITS = 1024
+"""Of a seed, hexadecimal. A gateway's has 64; to draw from one of a megabyte takes long."""
+
+
 class Proof(Typed):
     """Who said what: the digest of a message (`robosac.wire.content_digest`), and its signature where it has one."""
 
@@ -153,7 +157,7 @@ class FrameAnswered(_Event, FrameAnswer):
     event: Literal["frame_answered"] = "frame_answered"
     frame: Count
     timings_ms: dict[str, Milliseconds]
-    seed: str
+    seed: str = Field(max_length=_SEED_DIGITS)
     ego_pose: Pose
     messages: dict[str, Proof]
     previous_frame: Count | None = None

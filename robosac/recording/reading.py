@@ -171,6 +171,8 @@ def _number(frame: RecordedFrame) -> int:
 def _of_folder(folder: Path) -> list[RecordedFile]:
     files = []
     for path in sorted(folder.glob(f"*{SUFFIX}")):
+        if not path.is_file():  # nobody may ever write to a pipe
+            continue
         with suppress(RecordingError):
             files.append(read(path))
     return [file for file in files if file.frames]

@@ -27,6 +27,10 @@ LINE_BYTES = 2**16
 MOST_ROOM = 8 * 2**20
 """More is not written to see whether there is room for it."""
 
+_CHANGED = text(
+    "INSERT INTO secrets (name, value) VALUES ('changed', :value) ON CONFLICT (name) DO UPDATE SET value = :value"
+)
+
 
 def secret(connection: Connection, name: str, make: Callable[[], str]) -> str:
     """The secret of a name: what ``make`` gave when it was first asked for."""
@@ -37,24 +41,24 @@ def secret(connection: Connection, name: str, make: Callable[[], str]) -> str:
 
 
 def change(connection: Connection, room: int = LINE_BYTES) -> None:
-    """Change something that means nothing, where there is room for so many bytes.
+    """Change something that means nothing, where there is room for so many bytes: they are kept, until `changed`.
 
-    SQLite writes down what is kept alone, so there the disk is asked: for twice as much, since what the journal holds
-    comes into the file as well.
+    A disk is asked first: for twice as much, since what SQLite's journal holds comes into the file as well.
     """
     file = file_of(connection.engine.url)
     if file is not None and shutil.disk_usage(Path(file).absolute().parent).free < 2 * room:
         raise OSError(errno.ENOSPC, os.strerror(errno.ENOSPC))
     undone = connection.begin_nested()
-    for number in range(0, min(room, MOST_ROOM), LINE_BYTES):
-        line = literal(token_hex(LINE_BYTES // 2))  # at random, as it may be compressed
-        of_any = select(sessions.c.session_id, literal(-number), line, literal(day())).limit(1)
-        connection.execute(insert(audit_lines).from_select(["session_id", "seq", "line", "day"], of_any))
+    line = literal(token_hex(LINE_BYTES // 2))  # at random, as it may be compressed
+    of_any = select(sessions.c.session_id, literal(0), line, literal(day())).limit(1)
+    connection.execute(insert(audit_lines).from_select(["session_id", "seq", "line", "day"], of_any))
     undone.rollback()
-    keep = text(
-        "INSERT INTO secrets (name, value) VALUES ('changed', :value) ON CONFLICT (name) DO UPDATE SET value = :value"
-    )
-    connection.execute(keep, {"value": token_hex(16)})
+    connection.execute(_CHANGED, {"value": token_hex(min(room, MOST_ROOM) // 2)})
+
+
+def changed(connection: Connection) -> None:
+    """Let go of what `change` kept."""
+    connection.execute(_CHANGED, {"value": token_hex(16)})
 
 
 def use_proof(

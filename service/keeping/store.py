@@ -343,6 +343,7 @@ class Store:
         if self._database.failed:
             await self.make_ahead()
             await self._database.write(partial(once.change, room=self._room))
+            await self._database.write(once.changed)
             self._database.failed, self._room = False, once.LINE_BYTES
         else:
             await self._execute(NO_CHANGE)

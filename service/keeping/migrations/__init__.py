@@ -6,6 +6,8 @@ from pathlib import Path
 
 from sqlalchemy import Connection, func, inspect, select, text
 
+from service.keeping.tables import metadata
+
 HEAD = "0007"
 """The latest step."""
 _ENCODINGS = ("UTF8", "SQL_ASCII")
@@ -22,12 +24,14 @@ def upgrade(connection: Connection) -> None:
     Raises
     ------
     ValueError
-        If the database is of a later version than this one, or of another program, or cannot keep every text.
+        If the database is of a later version than this one, or of another program, or cannot keep every text; or if
+        tables are gone.
     """
     _check_encoding(connection)
     lock(connection)
     revision = _revision(connection)
     if revision == HEAD:
+        _check_tables(connection)
         return
     from alembic import command  # noqa: PLC0415 - 0.2 s that most starts need not spend
     from alembic.config import Config  # noqa: PLC0415
@@ -56,6 +60,12 @@ def _check_encoding(connection: Connection) -> None:
     encoding = connection.execute(text("SHOW server_encoding")).scalar()
     if encoding not in _ENCODINGS:
         raise ValueError(f"the database's encoding is {encoding}, in which not every text can be kept; make it UTF8")
+
+
+def _check_tables(connection: Connection) -> None:
+    missing = sorted(set(metadata.tables).difference(inspect(connection).get_table_names()))
+    if missing:
+        raise ValueError(f"the database is damaged: it has no table {', '.join(missing)}; put a backup in its place")
 
 
 def _revision(connection: Connection) -> str | None:

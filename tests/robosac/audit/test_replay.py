@@ -256,6 +256,17 @@ def test_bad_arguments_are_explained(got, arguments, complaint, tmp_path, monkey
     assert complaint in said
 
 
+def test_of_a_file_without_end_no_more_is_read_than_a_frame_has(got, tmp_path, monkeypatch):
+    log, messages = tmp_path / "log", tmp_path / "frame"
+    log.write_bytes(b"\n".join(got.lines))
+    messages.write_bytes(got.bodies[2])
+    size = len(got.bodies[2])
+    for most, told in ((size, "the same decision"), (size - 1, f"no frame has more than {size - 1} bytes")):
+        monkeypatch.setattr("robosac.cli.audit.MOST_BYTES", most)
+        assert told in run("replay", log, "--messages", messages)[1]
+    assert run("replay", log, "--messages", "/dev/zero")[0] == 2
+
+
 def test_a_decision_is_made_again_with_as_many_threads_as_a_gateway_has(got, tmp_path):
     """More add up in another order, which shifts boxes by more than is tolerated."""
     (tmp_path / "log").write_bytes(b"\n".join(got.lines))

@@ -137,6 +137,10 @@ def test_a_seed_that_was_not_committed_to_is_told(events):
     assert faults(change(events, 2, next_seed_commitment="0" * 64)) == [(7, Fault.WRONG_SEED)]
 
 
+def test_a_seed_of_which_nobody_could_draw_in_time_is_no_seed(events):
+    assert (3, Fault.MALFORMED) in faults(change(events, 2, seed="ab" * 1000))
+
+
 def test_frames_must_increase(events):
     unseen = (5, Fault.NO_EVIDENCE)  # the first message of the equivocation in frame 1
     assert faults(change(events, 2, frame=0)) == [(3, Fault.FRAME_ORDER), (3, Fault.BAD_SIGNATURE), unseen]

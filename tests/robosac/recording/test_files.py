@@ -1,4 +1,6 @@
 import json
+import os
+import shutil
 
 import numpy as np
 import pytest
@@ -47,6 +49,15 @@ def test_memory_is_written_only_where_it_is_not_what_the_frame_before_left(whole
     assert third.decided.before.state == some[2].state
     assert third.decided.before.previous == some[2].previous.as_json()
     assert first.decided.before.previous is None
+
+
+def test_in_a_folder_what_is_no_file_is_passed_over(whole, tmp_path):
+    shutil.copy(whole, tmp_path)
+    os.mkfifo(tmp_path / "pipe.mcap")  # of which nobody holds the other end
+    (tmp_path / "folder.mcap").mkdir()
+    (tmp_path / "nowhere.mcap").symlink_to("nonesuch.mcap")
+    (session,) = sessions(tmp_path)
+    assert [file.path.name for file in session.files] == [whole.name]
 
 
 def test_any_reader_of_mcap_reads_it_with_its_schemas(whole):

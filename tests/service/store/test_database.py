@@ -80,6 +80,18 @@ async def test_a_database_of_a_later_version_is_refused(shared_url):
     await store.close()
 
 
+@pytest.mark.parametrize("table", ["audit_lines", "used_proofs"])
+async def test_a_database_that_lost_a_table_is_refused(shared_url, table):
+    async with opened(shared_url):
+        pass
+    async with a_database(shared_url) as database:
+        await database.write(lambda connection: connection.execute(text(f"DROP TABLE {table}")))
+    store = Store(shared_url)
+    with pytest.raises(ValueError, match=f"is damaged: it has no table {table};"):
+        await store.start()
+    await store.close()
+
+
 def test_the_steps_can_be_taken_and_undone_by_hand(tmp_path, monkeypatch):
     path = tmp_path / "by-hand.db"
     monkeypatch.setenv("ROBOSAC_DATABASE_URL", f"sqlite:///{path}")

@@ -119,10 +119,10 @@ async def test_a_server_that_only_reads_for_a_while(postgres, good_frame):
 
 
 @contextlib.contextmanager
-def no_file_may_grow(path):
-    """Beyond what the journal has: the system refuses the write."""
+def no_file_may_grow(path, more=0):
+    """Beyond what the journal has, and so many bytes: the system refuses the write."""
     before, most = resource.getrlimit(resource.RLIMIT_FSIZE)
-    resource.setrlimit(resource.RLIMIT_FSIZE, (path.with_name(f"{path.name}-wal").stat().st_size, most))
+    resource.setrlimit(resource.RLIMIT_FSIZE, (path.with_name(f"{path.name}-wal").stat().st_size + more, most))
     try:
         yield
     finally:
@@ -167,6 +167,19 @@ async def on_a_full_disk(path, full, good_frame):
 
 async def test_a_file_that_may_not_grow(tmp_path, good_frame):
     await on_a_full_disk(tmp_path / "robosac.db", no_file_may_grow, good_frame)
+
+
+async def test_a_file_with_room_for_little_is_told_as_long_as_frames_are_refused(tmp_path, good_frame):
+    path = tmp_path / "robosac.db"
+    async with serve(database_url=f"sqlite:///{path}") as served:
+        ego = await Ego.of(served, good_frame)
+        for more in range(16_000, 48_000, 2_000):  # of which a page may be left, or several
+            with no_file_may_grow(path, more):
+                while await ego.post():
+                    pass
+                problem(await served.http.get("/readyz"), 503, "store-unavailable")
+            assert (await served.http.get("/readyz")).status_code == 200
+        await ego.check()
 
 
 async def test_a_disk_that_is_full(tmp_path, good_frame):
