@@ -81,8 +81,16 @@ def _taken(joined: Shown, without: Shown, suspects: Sequence[str]) -> list[Lie]:
     drop = without.odds_at(lost[:, :2]) - joined.odds_at(lost[:, :2])
     which = which[(lost[:, 5] >= CRISP_SCORE) & (drop >= GONE_EFFECT)]
     own = without.own(suspects)[:, which].min(axis=0).tolist()
+    supporting = zip(without.claims.witnesses, without.claims.supporting, strict=True)
+    others = [(name, sees) for name, sees in supporting if name not in suspects]
     return [
-        Lie("gone", without.boxes[at, :2], said >= SUPPORTS, said=said <= DENIES)
+        Lie(
+            "gone",
+            without.boxes[at, :2],
+            veiled=said >= SUPPORTS,
+            said=said <= DENIES,
+            by=tuple(name for name, sees in others if sees[at]),
+        )
         for at, said in zip(which.tolist(), own, strict=True)
     ]
 

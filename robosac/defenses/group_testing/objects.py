@@ -66,7 +66,7 @@ class Lie:
     said: bool = False
     """Whether the message of whoever is behind it says so, too: that a vehicle that it removes is not there."""
     by: Hypothesis = ()
-    """Who says that a vehicle is moved or reshaped."""
+    """Who says that a vehicle is moved or reshaped, or sees the one that is gone."""
 
     @property
     def counts_as(self) -> str:

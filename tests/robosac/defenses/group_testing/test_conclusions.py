@@ -349,3 +349,17 @@ def test_two_may_lie_together_as_long_as_three_others_than_the_suspect_are_heard
     fused = tuple(name for name in TEAM if name == LIAR or name not in named)
     without = tuple(name for name in fused if name != LIAR)
     assert set(concluded(two, fused, without, named=named).lies.levels[LIAR]) == {kind}
+
+
+@pytest.mark.parametrize(
+    ("said", "kind"),
+    [
+        ({"car-2": YES, "car-3": YES}, "late"),
+        ({EGO: YES, "car-2": YES}, "gone"),
+        ({"car-2": YES, "car-3": YES, "rsu": YES}, "gone"),
+    ],
+)
+def test_two_may_say_together_that_the_last_honest_one_takes_a_vehicle_away(said, kind):
+    others = ("car-2", "car-3", "rsu", "car-5")
+    framed = World(said | {LIAR: NO}, with_liar(CAR[:0], CAR))
+    assert set(concluded(framed, (*others, LIAR), others).lies.levels[LIAR]) == {kind}
