@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import errno
 import os
 import signal
 import socket
@@ -45,11 +46,7 @@ def main(
     for name in OF_A_CLUSTER:
         if getattr(ctx.get_parameter_source(name), "name", "DEFAULT") != "DEFAULT":
             raise typer.BadParameter("only with --cluster", param_hint=f"--{name.replace('_', '-')}")
-    try:
-        socket.getaddrinfo(host or None, port, flags=socket.AI_PASSIVE)
-    except (OSError, UnicodeError) as error:
-        why = error.strerror if isinstance(error, OSError) else "no name of a host"
-        raise typer.BadParameter(f"{host}: {why}", param_hint="--host") from error
+    _check_address(host, port)
     workers = os.environ.get(WORKERS, "")
     if workers.isdecimal() and int(workers) > 1:
         typer.echo(
@@ -78,6 +75,22 @@ def main(
         )
     except SystemExit as end:
         raise SystemExit(2 if end.code == FAILED_START else end.code) from end
+
+
+def _check_address(host: str, port: int) -> None:
+    """Refuse an address on which nobody can listen, before anything is loaded."""
+    try:
+        family, kind, protocol, _, address = socket.getaddrinfo(
+            host or None, port, type=socket.SOCK_STREAM, flags=socket.AI_PASSIVE
+        )[0]
+        with socket.socket(family, kind, protocol) as probe:
+            probe.setsockopt(socket.SOL_SOCKET, socket.SO_REUSEADDR, 1)  # as the server does
+            probe.bind(address)
+    except (OSError, UnicodeError) as error:
+        why = error.strerror if isinstance(error, OSError) else "no name of a host"
+        if isinstance(error, OSError) and error.errno in (errno.EADDRINUSE, errno.EACCES):
+            raise typer.BadParameter(f"{port}: {why}", param_hint="--port") from error
+        raise typer.BadParameter(f"{host}: {why}", param_hint="--host") from error
 
 
 def _serve_on_ray(host: str, port: int, scale: tuple[int, int, int], address: str | None) -> None:

@@ -52,6 +52,16 @@ def test_a_host_that_there_is_not_is_named_before_anything_starts():
     assert "Invalid value for --host: 999.1.1.1: " in result.output
 
 
+def test_a_port_that_is_taken_is_named_before_anything_starts():
+    own = typer.Typer()
+    own.command()(main)
+    with socket.create_server(("127.0.0.1", 0)) as server:
+        port = server.getsockname()[1]
+        result = CliRunner().invoke(own, ["--port", str(port)], env={"COLUMNS": "300"})
+    assert result.exit_code == 2
+    assert f"Invalid value for --port: {port}: Address already in use" in result.output
+
+
 @pytest.mark.parametrize(
     "option", [("--replicas", "2"), ("--most-replicas", "3"), ("--vehicles", "9"), ("--address", "auto")]
 )
