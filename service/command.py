@@ -30,7 +30,7 @@ def main(
     host: Annotated[str, typer.Option(help="Address to listen on; other machines need an API key.")] = "127.0.0.1",
     port: Annotated[int, typer.Option(min=0, max=65535, help="Port; 0 takes a free one.")] = 8000,
     cluster: Annotated[
-        bool, typer.Option("--cluster", help="Serve with replicas, on Ray Serve; SIGHUP restarts them in turn.")
+        bool, typer.Option("--cluster", help="Serve with replicas, on Ray Serve; then SIGHUP restarts them in turn.")
     ] = False,
     replicas: Annotated[int, typer.Option(min=1, help="Of a cluster, at least.")] = 2,
     most_replicas: Annotated[int, typer.Option(min=1, help="At most; more are started as load asks for.")] = 2,

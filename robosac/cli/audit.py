@@ -29,7 +29,7 @@ from robosac.files import write_text
 app = typer.Typer(no_args_is_help=True, add_completion=False, help=__doc__)
 
 MOST_BYTES = 2**30
-"""Of a frame's messages."""
+"""Of a frame's messages that are read."""
 MOST_FINDINGS = 20
 """That are told one by one: of a file that is no log at all, every line is one."""
 Log = Annotated[Path, typer.Argument(help="The audit log (JSON Lines).", metavar="FILE")]
@@ -118,7 +118,7 @@ def replay_decision(
         with messages.open("rb") as file_of_messages:
             body = file_of_messages.read(MOST_BYTES + 1)
         if len(body) > MOST_BYTES:
-            raise typer.BadParameter(f"no frame has more than {MOST_BYTES} bytes", param_hint="--messages")
+            raise typer.BadParameter(f"a frame of more than {MOST_BYTES} bytes is not read", param_hint="--messages")
         number = wire.read_frame(body).frame if frame is None else frame
     with blaming("FILE", OSError, replay.ReplayError), file.open("rb") as lines:
         decision = replay.find(lines_in(lines), number)

@@ -140,9 +140,9 @@ class BodyLimit:
                 async with self._unfinished.wait_until(None if started else end):
                     message = await receive()
             except Refused:
-                if started:
-                    return await receive()
-                raise
+                if not started:
+                    raise
+                message = await receive()
             complete = not message.get("more_body", False)
             taken += len(message.get("body", b""))
             if taken > self._limit:

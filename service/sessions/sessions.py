@@ -332,6 +332,7 @@ class Sessions:
             await self.store.end(session_id, ended, unused_since, *checks)
             logger.info("session ended", session_id=session_id, why=why)
         except SessionLost:
+            self._forget(session_id)
             raise
         except SessionOver:  # already
             pass

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import contextlib
 import os
+import select
 import threading
 from collections import deque
 from collections.abc import Callable
@@ -65,7 +66,7 @@ class Lines:
 
 def _write(stream: TextIO, text: str) -> None:
     """Past the stream's own buffer: its lock would be held as long as nobody reads, and the process could not end."""
-    with contextlib.suppress(OSError, ValueError):  # there is nobody to tell
+    with contextlib.suppress(Exception):  # there is nobody to tell
         try:
             file = stream.fileno()
         except (OSError, ValueError):
@@ -74,4 +75,7 @@ def _write(stream: TextIO, text: str) -> None:
             return
         data = text.encode(errors="backslashreplace")
         while data:
-            data = data[os.write(file, data) :]
+            try:
+                data = data[os.write(file, data) :]
+            except BlockingIOError:  # whoever shares it may have made it so
+                select.select([], [file], [])

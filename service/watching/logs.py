@@ -61,7 +61,9 @@ class _Stderr(logging.Handler):
         self._last = last
 
     def emit(self, record: logging.LogRecord) -> None:
-        """Have the record's line written."""
+        """Have the record's line written, if there is a standard error."""
+        if sys.stderr is None:
+            return
         try:
             LINES.put(sys.stderr, f"{self.format(record)}\n", self._lost)
         except Exception:

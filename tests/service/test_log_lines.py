@@ -53,17 +53,25 @@ def test_nobody_waits_for_a_reader_and_what_is_lost_is_told(pipe, monkeypatch):
         put(number)
     written.flush(60)
     assert time.monotonic() - began < 30
-    assert read_all(reader, b"x\n") == ["x" * PIPE_BYTES]
-    assert read_all(reader, b"49\n") == [str(number) for number in range(50)]
+    assert read_all(reader, b"49\n") == ["x" * PIPE_BYTES, *map(str, range(50))]
     written.flush(30)
     put("there again")
     assert read_all(reader, b"again\n") == ["30 lost", "there again"]
 
 
-def test_a_stream_that_is_closed_or_in_memory_takes_what_it_can(capsys, tmp_path):
+def test_a_stream_that_does_not_wait_is_waited_for(pipe):
+    (reader, writer), written = pipe, Lines()
+    os.set_blocking(writer.fileno(), False)
+    many = [f"{number:0100}" for number in range(200)]
+    for text in many:
+        written.put(writer, f"{text}\n", str)
+    assert read_all(reader, f"{many[-1]}\n".encode()) == many
+
+
+def test_a_stream_that_takes_nothing_keeps_no_other_from_it(capsys, tmp_path):
     written, closed = Lines(), (tmp_path / "log").open("w")
     closed.close()
-    for stream in (closed, sys.stderr):
+    for stream in (closed, object(), sys.stderr):
         written.put(stream, "a line\n", str)
     written.flush(30)
     assert capsys.readouterr().err == "a line\n"

@@ -261,7 +261,7 @@ def test_of_a_file_without_end_no_more_is_read_than_a_frame_has(got, tmp_path, m
     log.write_bytes(b"\n".join(got.lines))
     messages.write_bytes(got.bodies[2])
     size = len(got.bodies[2])
-    for most, told in ((size, "the same decision"), (size - 1, f"no frame has more than {size - 1} bytes")):
+    for most, told in ((size, "the same decision"), (size - 1, f"a frame of more than {size - 1} bytes is not read")):
         monkeypatch.setattr("robosac.cli.audit.MOST_BYTES", most)
         assert told in run("replay", log, "--messages", messages)[1]
     assert run("replay", log, "--messages", "/dev/zero")[0] == 2
