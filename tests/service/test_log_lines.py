@@ -18,6 +18,8 @@ from service.watching.lines import Lines
 from tests.service.test_command import PROGRAM
 
 PIPE_BYTES = 4096
+HEARS_SIGHUP = "import signal; signal.signal(signal.SIGHUP, signal.SIG_DFL); "
+"""Also where the tests run under nohup."""
 
 
 @pytest.fixture
@@ -82,7 +84,7 @@ def test_a_gateway_whose_log_is_not_read_serves_and_ends(pipe, tmp_path):
     with closing(socket.create_server(("127.0.0.1", 0))) as server:
         port = server.getsockname()[1]
     environment = os.environ | {"ROBOSAC_DATABASE_URL": f"sqlite:///{tmp_path}/robosac.db"}
-    command = [sys.executable, "-c", PROGRAM, "--port", str(port)]
+    command = [sys.executable, "-c", HEARS_SIGHUP + PROGRAM, "--port", str(port)]
     process = subprocess.Popen(command, env=environment, stderr=writer)
     with httpx.Client(base_url=f"http://127.0.0.1:{port}", trust_env=False) as http:
         try:
