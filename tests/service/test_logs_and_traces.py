@@ -61,6 +61,17 @@ async def test_faults_are_logged_with_their_trace_and_for_the_eye_if_wanted(caps
     assert "not at this level" not in text
 
 
+async def test_what_was_lost_is_told_in_the_form_of_the_log(capsys, monkeypatch):
+    async with serve():
+        LINES.flush(10)
+        capsys.readouterr()
+        monkeypatch.setattr(LINES, "_lost", 3)
+        structlog.stdlib.get_logger("service.test").info("read again")
+    lost, again, *_ = [json.loads(line) for line in capsys.readouterr().err.splitlines()]
+    assert (lost["event"], lost["level"]) == ("3 lines of the log were lost: nobody read those before them", "warning")
+    assert again["event"] == "read again"
+
+
 KEY, OTHER_KEY, SECRET = "an-api-key-0123456789", "another-key-9876543210", "not-for-the-log-" * 3
 LOG_BYTES = 10_000
 
