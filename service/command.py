@@ -60,8 +60,9 @@ def main(
     except SettingsError as fault:
         typer.echo(f"Error: {fault}", err=True)
         raise typer.Exit(2) from fault
-    if signal.getsignal(signal.SIGHUP) is signal.SIG_DFL:  # else, as under nohup, it is to be passed over
-        signal.signal(signal.SIGHUP, lambda *_: signal.raise_signal(signal.SIGTERM))
+    hangup = getattr(signal, "SIGHUP", None)  # not every system has it
+    if hangup is not None and signal.getsignal(hangup) is signal.SIG_DFL:  # else, as under nohup, it is passed over
+        signal.signal(hangup, lambda *_: signal.raise_signal(signal.SIGTERM))
     try:
         # as uvicorn's own command does, the working directory may hold modules of the user's own detectors
         uvicorn.run(
