@@ -28,7 +28,7 @@ from robosac.files import write_text
 
 app = typer.Typer(no_args_is_help=True, add_completion=False, help=__doc__)
 
-MOST_BYTES = 2**30
+MOST_FRAME_BYTES = 2**30
 """Of a frame's messages that are read."""
 MOST_FINDINGS = 20
 """That are told one by one: of a file that is no log at all, every line is one."""
@@ -115,10 +115,12 @@ def replay_decision(
 
     torch.set_num_threads(1)  # as gateways do: another order of summation shifts boxes by more than is tolerated
     with blaming("--messages", OSError, wire.WireError):
-        with messages.open("rb") as file_of_messages:
-            body = file_of_messages.read(MOST_BYTES + 1)
-        if len(body) > MOST_BYTES:
-            raise typer.BadParameter(f"a frame of more than {MOST_BYTES} bytes is not read", param_hint="--messages")
+        with messages.open("rb") as whole:
+            body = whole.read(MOST_FRAME_BYTES + 1)
+        if len(body) > MOST_FRAME_BYTES:
+            raise typer.BadParameter(
+                f"a frame of more than {MOST_FRAME_BYTES} bytes is not read", param_hint="--messages"
+            )
         number = wire.read_frame(body).frame if frame is None else frame
     with blaming("FILE", OSError, replay.ReplayError), file.open("rb") as lines:
         decision = replay.find(lines_in(lines), number)

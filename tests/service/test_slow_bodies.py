@@ -12,7 +12,7 @@ from service.arriving.limits import Unfinished
 from service.deciding.admission import SESSION_FRAMES
 from service.errors import Kind, Refused
 from service.sessions.unread import BODIES
-from tests.service.conftest import EGO, problem
+from tests.service.conftest import EGO, problem, serve
 
 
 @contextlib.asynccontextmanager
@@ -90,12 +90,13 @@ async def test_slow_bodies_of_one_vehicle_push_out_none_of_another(served):
 
 
 @pytest.mark.parametrize("what", ["messages", "frames"])
-async def test_a_process_that_is_to_end_waits_for_no_body(served, what):
-    session = await served.open(gather_ms=0)
-    async with stalled(served, session, 2, what) as senders:
-        served.gateway.stop()
-        for refused in await asyncio.wait_for(asyncio.gather(*senders), 30):
-            problem(refused, 503, "draining")
+async def test_a_process_that_is_to_end_waits_for_no_body(what):
+    async with serve(body_timeout_s=120) as served:
+        session = await served.open(gather_ms=0)
+        async with stalled(served, session, 2, what) as senders:
+            served.gateway.stop()
+            for refused in await asyncio.wait_for(asyncio.gather(*senders), 30):
+                problem(refused, 503, "draining")
 
 
 async def test_bodies_that_are_given_up_in_whatever_state_end_once():
@@ -113,7 +114,7 @@ async def test_bodies_that_are_given_up_in_whatever_state_end_once():
     await asyncio.sleep(0)
     await asyncio.sleep(0)
     unfinished.give_up()
-    await asyncio.gather(*waits, wait(now + 3600))
+    await asyncio.wait_for(asyncio.gather(*waits, wait(now + 3600)), 30)
     assert ended == [Kind.DRAINING] * 3
     async with unfinished.wait_until(now + 3600):
         pass  # what is there already is taken

@@ -262,7 +262,7 @@ def test_of_a_file_without_end_no_more_is_read_than_a_frame_has(got, tmp_path, m
     messages.write_bytes(got.bodies[2])
     size = len(got.bodies[2])
     for most, told in ((size, "the same decision"), (size - 1, f"a frame of more than {size - 1} bytes is not read")):
-        monkeypatch.setattr("robosac.cli.audit.MOST_BYTES", most)
+        monkeypatch.setattr("robosac.cli.audit.MOST_FRAME_BYTES", most)
         assert told in run("replay", log, "--messages", messages)[1]
     assert run("replay", log, "--messages", "/dev/zero")[0] == 2
 
