@@ -70,12 +70,12 @@ def main(
     turns: Annotated[int, typer.Option(min=1)] = 30,
     threads: Annotated[int, typer.Option(min=1, help="Of torch, on the processor.")] = 1,
 ) -> None:
-    torch.set_num_threads(threads)
     try:
         as_device(device)
         loaded, ego, messages = shown(detector)
     except ValueError as error:
         raise typer.BadParameter(str(error)) from error
+    torch.set_num_threads(threads)
     placed = {worth: loaded.on_device(device, worth) for worth in (1, AT_ONCE)}
     for each in placed.values():
         warm_up(each)

@@ -95,6 +95,15 @@ class _Detectors:
     detectors: list[Mapping[str, Any]]
 
 
+def _trusted(base_url: str) -> ssl.SSLContext:
+    """Whose certificates are good. To read all authorities takes longer than some frames, so nobody is trusted where
+    there is no TLS.
+    """
+    if base_url.lower().startswith("http:"):
+        return ssl.SSLContext(ssl.PROTOCOL_TLS_CLIENT)
+    return httpx.create_ssl_context()
+
+
 class GatewayClient:
     """A connection to a gateway; an asynchronous context manager.
 
@@ -143,7 +152,7 @@ class GatewayClient:
             limits=LIMITS,
             transport=transport,
             trust_env=False,
-            verify=httpx.create_ssl_context() if tls is None else tls,
+            verify=_trusted(base_url) if tls is None else tls,
         )
         self.receipts = ReceiptBook(self.public_keys, gateway_keys, None if receipts is None else Path(receipts))
 

@@ -30,7 +30,7 @@ from service.arriving.parties import Parties  # noqa: E402
 from service.deciding.admission import KEY_FRAMES, Admission  # noqa: E402
 from service.deciding.answering import Deciding  # noqa: E402
 from service.deciding.keeping import Keeping  # noqa: E402
-from service.description import AT_THE_DOORS, TAGS, completed  # noqa: E402
+from service.description import TAGS, completed  # noqa: E402
 from service.engine import Engine  # noqa: E402
 from service.gateway import Gateway  # noqa: E402
 from service.keeping.gateway_keys import GatewayKeys  # noqa: E402
@@ -106,6 +106,7 @@ def create_app(
         summary="Fuses teammates' feature maps that the ego's own perception does not contradict.",
         version=version("robosac"),
         lifespan=lifespan,
+        routes=[*v1.routes, *operations.routes, *pages.routes],  # included, each request would look for its route twice
         redirect_slashes=False,
         openapi_tags=TAGS,
         openapi_url=None,  # FastAPI makes it on the loop; `api_pages` serves it
@@ -130,8 +131,6 @@ def create_app(
     app.add_middleware(Metered, pacing=gateway.frames.pacing)
     app.add_middleware(Arrival, watch=gateway.watch)
     app.add_middleware(Starting)
-    for router in (v1, operations, pages):
-        app.include_router(router, responses=AT_THE_DOORS)
     api_pages(app)
     return app
 

@@ -12,7 +12,7 @@ from service.problems import documented
 
 STORE_PATIENCE_S = 1.0
 """How long readiness waits for the database."""
-operations = APIRouter(tags=["operations"])
+operations = APIRouter(tags=["operations"], responses=description.AT_THE_DOORS)
 _TEXT = "text/plain; version=0.0.4; charset=utf-8"
 
 

@@ -47,7 +47,7 @@ API_HEADERS = {
 API_FILES = "/api-pages"
 OPENAPI = "/openapi.json"
 
-pages = APIRouter(tags=["live"])
+pages = APIRouter(tags=["live"], responses=description.AT_THE_DOORS)
 _bearer = HTTPBearer(
     auto_error=False, scheme_name="ViewerToken", description="A viewer's token, where the gateway asks for one."
 )

@@ -48,7 +48,7 @@ logger = structlog.stdlib.get_logger(__name__)
 ACCEPT_CHARACTERS = 512
 """Of the header `Accept` that are looked at: a head may be so long that all of it would hold up everybody."""
 
-v1 = APIRouter(prefix="/v1", responses=documented(422, 503))
+v1 = APIRouter(prefix="/v1", responses={**description.AT_THE_DOORS, **documented(422, 503)})
 
 
 class _Log(StreamingResponse):

@@ -131,7 +131,7 @@ async def test_the_largest_honest_requests_are_taken_and_larger_ones_not_read():
         defense = {"kind": "conformal", "calibration": calibration}
         response = await served.http.post("/v1/sessions", json={"ego_id": "a", "teammates": ["b"], "defense": defense})
         assert response.status_code == 201, response.text
-        session = await served.client.open_session("a", [])
+        session = await served.client.open_session("a", [], defense={"kind": "none"})  # soon adds a thousand
         path, ego = f"/v1/sessions/{session.session_id}/teammates", bearer(session.ego_token)
         response = await served.http.post(path, json=enrolment(1024), headers=ego)
         assert response.status_code == 201, response.text
