@@ -21,7 +21,7 @@ from rich.table import Table
 from rich.text import Text
 
 from clients.client import API_KEY_VARIABLE, GatewayClient
-from clients.errors import GatewayError
+from clients.errors import AccessDenied, GatewayError
 from clients.local_gateway import cancelled_by_sigterm, local_gateway
 from robosac.cli import outputs
 from robosac.cli.printing import printable
@@ -131,7 +131,9 @@ def run(trial: Coroutine[Any, Any, T], console: Console, what: str, *others: typ
         console.print(f"[red]{what} was ended.[/red]")
         sys.exit(143)
     except failures as error:
-        console.print(Text.assemble((f"{what} stopped:", "red"), " ", printable(str(error), lines=True)))
+        unknown = isinstance(error, AccessDenied) and error.status == 401
+        hint = f" (by {API_KEY_VARIABLE} or --api-key)" if unknown else ""
+        console.print(Text.assemble((f"{what} stopped:", "red"), " ", printable(str(error), lines=True), hint))
         sys.exit(1)
 
 

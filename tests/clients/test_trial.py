@@ -11,7 +11,7 @@ import typer
 from rich.console import Console
 
 from clients import trial
-from clients.errors import GatewayUnreachable
+from clients.errors import AccessDenied, GatewayUnreachable
 
 
 @pytest.mark.parametrize("url", ["http://127.0.0.1:8000", "HTTPS://gateway.example/gw/", "http://[::1]:8000", None])
@@ -42,6 +42,18 @@ def test_what_a_gateway_said_is_shown_as_it_is_and_obeyed_by_nobody():
     with pytest.raises(SystemExit, match="1"):
         trial.run(fails(), console, "The trial")
     assert console.file.getvalue() == "The trial stopped: [red]a[/red] [/b] \\x1b[2J\n"
+
+
+def test_a_key_that_is_missing_is_said_to_be_an_option():
+    async def refused():
+        raise AccessDenied(401, "urn:robosac:problem:unauthenticated", "an API key is needed as a bearer token")
+
+    console = Console(file=io.StringIO(), width=200)
+    with pytest.raises(SystemExit):
+        trial.run(refused(), console, "The trial")
+    assert console.file.getvalue().endswith(
+        "an API key is needed as a bearer token (by ROBOSAC_API_KEY or --api-key)\n"
+    )
 
 
 def test_a_report_is_told_of_by_its_name_as_it_is(tmp_path):
