@@ -144,6 +144,9 @@ class BoundedHTTP(HttpToolsProtocol):
         self._waited_s = 0.0
 
     def on_header(self, name: bytes, value: bytes) -> None:
+        if self._in_body:  # a trailer field: nothing of it may count as of the head, by which a request is let in
+            self._count_piece(0)
+            return
         super().on_header(name, value)
         if len(self.headers) > HEADERS:
             self._refuse("431 Request Header Fields Too Large", f"A head may have {HEADERS} headers.")
@@ -159,11 +162,14 @@ class BoundedHTTP(HttpToolsProtocol):
             self._refuse("429 Too Many Requests", f"At most {PIPELINED} requests may wait on a connection.")
 
     def on_body(self, body: bytes) -> None:
+        self._count_piece(len(body))
+        super().on_body(body)
+
+    def _count_piece(self, size: int) -> None:
         self._pieces += 1
-        self._body_bytes += len(body)
+        self._body_bytes += size
         if self._pieces > PIECES and self._body_bytes < self._pieces * PIECE_BYTES:
             self._refuse("400 Bad Request", f"The pieces of a body must have {PIECE_BYTES} bytes on average.")
-        super().on_body(body)
 
     def on_message_complete(self) -> None:
         self._in_body = False

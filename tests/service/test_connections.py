@@ -34,7 +34,8 @@ async def application(scope, receive, send):
             pass
     if scope["path"] == "/slow":
         await asyncio.sleep(2 * TIMEOUT_S)
-    body = {"/large": bytes(LARGE), "/waited": b"%5.3f" % waited_s}.get(scope["path"], b"ok")
+    told = {"/large": bytes(LARGE), "/waited": b"%5.3f" % waited_s, "/head": repr(scope["headers"]).encode()}
+    body = told.get(scope["path"], b"ok")
     await send({"type": "http.response.start", "status": 200, "headers": [(b"content-length", b"%d" % len(body))]})
     await send({"type": "http.response.body", "body": body})
 
@@ -158,6 +159,7 @@ CHUNKED = b"POST / HTTP/1.1\r\nHost: x\r\nTransfer-Encoding: chunked\r\n\r\n"
     [
         (GET[:-2] + b"a:\r\n" * HEADERS + b"\r\n", b"HTTP/1.1 431"),
         (CHUNKED + b"1\r\nx\r\n" * (PIECES + 1), b"HTTP/1.1 400"),
+        (CHUNKED + b"0\r\n" + b"a: b\r\n" * (PIECES + 1), b"HTTP/1.1 400"),
         (GET * (PIPELINED + 2), b""),
     ],
 )
@@ -179,6 +181,20 @@ async def test_a_body_may_come_in_pieces(port, sent):
     async with connected(port) as (reader, writer):
         writer.write(sent + b"0\r\n\r\n")
         assert b"200" in await reader.readuntil(b"\r\n\r\n")
+
+
+async def test_what_follows_a_body_is_not_of_the_head(port):
+    """By which a request is let in, here and by whatever stands before the gateway (RFC 9110, 6.5.1)."""
+    trailer = b"0\r\nAuthorization: Bearer key\r\nHost: y\r\nOrigin: z\r\n\r\n"
+    async with connected(port) as (reader, writer):
+        for begun in (b"", b"1\r\nx\r\n"):
+            writer.write(CHUNKED.replace(b"/", b"/head", 1) + begun + trailer)
+            head = await reader.readuntil(b"\r\n\r\n")
+            told = await reader.readexactly(int(head.rpartition(b": ")[2]))
+            assert told == repr([(b"host", b"x"), (b"transfer-encoding", b"chunked")]).encode()
+        writer.write(GET[:-2].replace(b"/", b"/head", 1) + b"Origin: z\r\n\r\n")
+        await reader.readuntil(b"\r\n\r\n")
+        assert b"origin" in await reader.readuntil(b"]")
 
 
 async def test_requests_may_be_pipelined(port):
