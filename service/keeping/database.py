@@ -23,7 +23,7 @@ from typing import Any, Protocol, TypeVar
 
 from sqlalchemy import Connection, Engine, create_engine, event
 from sqlalchemy.engine import URL, ExceptionContext
-from sqlalchemy.exc import SQLAlchemyError
+from sqlalchemy.exc import DisconnectionError, SQLAlchemyError
 from sqlalchemy.ext.asyncio import create_async_engine
 from sqlalchemy.pool import NullPool, QueuePool
 
@@ -143,6 +143,7 @@ class Postgres(_Failing):
             },
         )
         event.listen(self._engine.sync_engine, "handle_error", _leave_what_only_reads)
+        event.listen(self._engine.sync_engine, "checkout", _leave_what_is_closed)
         self._reader = self._engine.execution_options(isolation_level="AUTOCOMMIT")
 
     async def read(self, work: Work[T]) -> T:
@@ -174,6 +175,12 @@ def _leave_what_only_reads(context: ExceptionContext) -> None:
     """Connect anew after a refusal to write: a connection to what has become a standby would stay good for nothing."""
     if getattr(context.original_exception, "sqlstate", None) == READ_ONLY:
         context.is_disconnect = True
+
+
+def _leave_what_is_closed(connection: Any, _record: object, _proxy: object) -> None:
+    """Connect anew where the server, or what is between, has hung up on a connection that was idle."""
+    if connection.driver_connection.is_closed():
+        raise DisconnectionError
 
 
 class Sqlite(_Failing):

@@ -283,6 +283,20 @@ async def test_a_server_that_goes_away_and_comes_back(postgres):
         assert "again" in (await check_chain(store, sid))[-1]
 
 
+async def test_a_server_that_hung_up_on_idle_connections_is_connected_to_anew(postgres):
+    url = await postgres.new_database()
+    async with opened(url) as store:
+        sid = await added(store)
+        await all_of(*(store.get(sid) for _ in range(5)))
+        name = make_url(url).database
+        await postgres.do(f"SELECT pg_terminate_backend(pid) FROM pg_stat_activity WHERE datname = '{name}'")
+        await asyncio.sleep(0.1)
+        assert await store.log(sid, note()) is None
+        assert (await store.get(sid)).session_id == sid
+        await store.ping()
+        assert len(await check_chain(store, sid)) == 2
+
+
 async def test_a_write_goes_on_when_who_asked_has_gone(store):
     sid = await added(store)
     asking = asyncio.create_task(store.log(sid, note()))
