@@ -20,6 +20,7 @@ from robosac.wire import MAX_FRAME
 from service.keeping.urls import read_url
 
 _HOST = re.compile(r"[A-Za-z0-9_.-]+|\[[0-9A-Fa-f:.]+\]")
+_ADDRESS = re.compile(rf"[A-Za-z]+://(?:{_HOST.pattern})(?::[1-9][0-9]*)?(?:/[!-~]*)?")
 PREFIX = "ROBOSAC_"
 OTHERS = ("ROBOSAC_API_KEY", "ROBOSAC_FUZZ_CASES")
 """Variables of the clients and of the tests."""
@@ -191,6 +192,8 @@ class Settings(BaseSettings):
             read_origin(value)
             if "?" in value or "#" in value:
                 raise ValueError("must have neither query nor fragment: paths are put behind it")
+            if _ADDRESS.fullmatch(value) is None:
+                raise ValueError("must have a name or an address as its host, and beside it at most a port and a path")
         return value
 
     @property

@@ -65,6 +65,35 @@ def test_what_would_leave_every_frame_without_an_answer_is_refused_with_the_leas
     settings_of_environment()
 
 
+@pytest.mark.parametrize(
+    "url",
+    [
+        *(
+            "http://a b",
+            "http://a\tb/",
+            "http://user:pw@host",
+            "http://a:0",
+            "http://*",
+            "http://a/b c",
+            "http://a:99999",
+        ),
+        *("ftp://a", "a", "http://", "http://a?b", "http://a#b"),
+    ],
+)
+def test_a_public_address_under_which_nobody_can_ask_is_refused(url, environment):
+    environment(ROBOSAC_PUBLIC_URL=url)
+    with pytest.raises(SettingsError, match=r"^ROBOSAC_PUBLIC_URL: "):
+        settings_of_environment()
+
+
+@pytest.mark.parametrize(
+    "url", ["https://Gateway.example", "http://[::1]:8000/", "http://10.0.0.1/a/b", "http://x:80/v"]
+)
+def test_a_public_address_is_taken(url, environment):
+    environment(ROBOSAC_PUBLIC_URL=url)
+    assert settings_of_environment().public_url == url
+
+
 @pytest.mark.parametrize("value", ["", " "])
 def test_a_path_that_is_set_to_nothing_is_none(value, environment):
     paths = [name for name, field in Settings.model_fields.items() if field.annotation == Path | None]
