@@ -185,7 +185,8 @@ def _straying(
     for name, (joined, without) in asked.items():
         anew = memory.frame - found.lies.audited.get(name, -AUDIT_FRAMES) >= AUDIT_FRAMES
         by = strays(found.shown[joined], found.shown[without], name)
-        if weight := memory.straying.learn(name, by, anew=anew):
+        weight = memory.straying.learn(name, by, anew=anew)
+        if weight and name not in memory.placing.lost:
             weights[name] = weight
         found.lies.audited[name] = memory.frame
     for name in set(found.team) & memory.straying.levels.keys() - set(answer) - found.named:

@@ -150,11 +150,11 @@ class JudgedFrame:
     def _is_attacker(self, name: str, suspicion: float, naming_bound: float) -> bool:
         """Whether a teammate is to be named. It is suspected, and lied about objects too often where the ego is steady;
         or it is suspected for certain by several tests, and its own fusions are too unsteady. Nobody is suspected here
-        for straying.
+        for straying, nor named whose message lies elsewhere.
         """
         memory = self._known.memory
         suspicion = memory.straying.without(name, suspicion)
-        if suspicion < CLEARED_BELOW:
+        if suspicion < CLEARED_BELOW or name in memory.placing.lost:
             return False
         if memory.steadiness.calm >= CALM and memory.lies.guilt(name, memory.frame) >= 1.0:
             return True

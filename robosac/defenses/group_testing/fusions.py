@@ -2,13 +2,13 @@
 
 from __future__ import annotations
 
-from collections.abc import Collection, Sequence
+from collections.abc import Callable, Collection, Sequence
 from functools import cached_property
 
 import numpy as np
 
 from robosac.boxes import BoolArray, FloatArray, IntArray
-from robosac.defenses.group_testing.claims import LEANS, NOT_TOGETHER, SUPPORTS
+from robosac.defenses.group_testing.claims import LEANS, NOT_TOGETHER, SUPPORTS, Claims
 from robosac.defenses.group_testing.geometry import WITNESS_SCORE, followed
 from robosac.defenses.group_testing.hearing import Hearing
 from robosac.defenses.group_testing.knowledge import Knowledge
@@ -20,17 +20,22 @@ from robosac.defenses.group_testing.lateness import (
     lately,
     motions,
     moved_since,
+    replayed,
     senders,
     sent,
     turned_since,
 )
 from robosac.defenses.group_testing.objects import PLACED_SCORE, Shown
-from robosac.defenses.group_testing.placing import DOUBTED_M, ego_misplaced, misplaced
+from robosac.defenses.group_testing.placing import DOUBTED_M, ego_misplaced, elsewhere, misplaced
 from robosac.defenses.protocol import EGO, Hypothesis, Outcome
 from robosac.testimony import Testimony
 
 FEWEST_DENIED = 3
 """The ego leans against so many vehicles that others see before it is in doubt itself."""
+DENIED = 2
+"""Whose message denies so many vehicles may be elsewhere."""
+LOST_S, LOST_FRAMES = 1.0, 5
+"""Whose message is elsewhere is to blame for nothing so long, and in at least so many frames."""
 NOTHING = np.zeros((0, 4))
 UNHEARD = 0.9
 """The testimony of those suspected more than this counts for nothing."""
@@ -122,7 +127,31 @@ class Fusions:
         far = misplaced(centres, supporting, everybody.origins, heard).tolist()
         off = {name: by for name, by in zip(everybody.agents, far, strict=True) if not np.isnan(by)}
         self._place_ego(sorted(off.values()))
-        placing.learn(off, self.team)
+        found = self._search(shown.boxes[placed, :2], shown.everybody.of_boxes(placed), heard)
+        placing.lose(found, max(LOST_FRAMES, round(LOST_S / self.known.period_s)))
+        placing.learn({**off, **found}, self.team)
+
+    def _search(self, vehicles: FloatArray, said: Claims, heard: BoolArray) -> dict[str, float]:
+        """How far those messages lie from where they should that lie elsewhere as a whole. It is asked of those that
+        deny some of the vehicles (n, 2) that the ego or two others see.
+        """
+        witnesses = said.supporting & heard[:, None]
+        shared = witnesses[0] | (witnesses.sum(axis=0) - witnesses >= 2)
+        denying = (said.denying & shared).sum(axis=1)
+        found, hearing = dict[str, float](), self.heard()
+        origins = hearing.everybody.origins
+        for index in np.flatnonzero(denying[1:] >= DENIED) + 1:
+            name = said.witnesses[index]
+            if name in self.named:
+                continue
+            own, others = hearing.everybody.of({name}), np.delete(origins, index, axis=0)
+            far = elsewhere(own, vehicles[shared[index]], hearing.seen_by(name), others)
+            lost = self.known.memory.placing.lost
+            if (name in lost or not np.isnan(far)) and self._replays(name):
+                lost.pop(name, None)
+            elif not np.isnan(far) and not self.late(name):
+                found[name] = far
+        return found
 
     def _place_ego(self, off: Sequence[float]) -> None:
         """Learn whether the ego itself is not where it says, by how far ``off`` its teammates are, the least first.
@@ -163,8 +192,12 @@ class Fusions:
         decoded, or by those that the ego sees alone, as all others may be late, too.
         """
         if sender not in self._late:
-            self._late[sender] = self._late_beside(sender, self._without(sender)) or self._late_beside(sender, ())
+            self._late[sender] = self._fits_beside(late, sender)
         return self._late[sender]
+
+    def _replays(self, sender: str) -> bool:
+        """Whether a teammate's message is older than a late one may be, by the same vehicles."""
+        return self._fits_beside(replayed, sender)
 
     @cached_property
     def ego_late(self) -> bool:
@@ -175,7 +208,7 @@ class Fusions:
             return False
         shown, teammates, told = self._told_by_several()
         centres, agreed = self.heard().everybody.agreed(shown.boxes[told, :2], teammates[:, told])
-        return self._fits_late(EGO, shown, told[agreed], centres[agreed])
+        return self._fits(late, EGO, shown, told[agreed], centres[agreed])
 
     @property
     def _ego_differs(self) -> bool:
@@ -215,26 +248,29 @@ class Fusions:
         return shown, teammates, told
 
     def excused(self, sender: str) -> bool:
-        """Whether what is wrong about a teammate's message may be because it is late, or because the ego's own is, now
-        or not long ago, or because the ego is not where it says.
+        """Whether what is wrong about a teammate's message may be because it is late or lies elsewhere as a whole, or
+        because the ego's own is late, now or not long ago, or because the ego is not where it says.
         """
         memory = self.known.memory
-        return self.late(sender) or memory.ego_is_late or self.ego_late or memory.placing.ego_astray
+        at_fault = memory.ego_is_late or self.ego_late or memory.placing.ego_astray
+        return at_fault or sender in memory.placing.lost or self.late(sender)
 
     def _without(self, sender: str) -> Hypothesis:
         without = [fused for fused in self.shown if sender not in fused]
         return max(without or self.shown, key=len, default=())
 
-    def _late_beside(self, sender: str, fused: Hypothesis) -> bool:
-        shown = self.shown.get(fused) or self.of_ego
-        if shown is None:
-            return False
-        others = shown.everybody.without({sender}).supporting.any(axis=0)
-        told = np.flatnonzero(others & (shown.boxes[:, 5] >= WITNESS_SCORE))
-        return self._fits_late(sender, shown, told, shown.boxes[told, :2])
+    def _fits_beside(self, fits: Callable[..., bool], sender: str) -> bool:
+        for fused in (self._without(sender), ()):
+            shown = self.shown.get(fused) or self.of_ego
+            if shown is not None:
+                others = shown.everybody.without({sender}).supporting.any(axis=0)
+                told = np.flatnonzero(others & (shown.boxes[:, 5] >= WITNESS_SCORE))
+                if self._fits(fits, sender, shown, told, shown.boxes[told, :2]):
+                    return True
+        return False
 
-    def _fits_late(self, sender: str, shown: Shown, told: IntArray, centres: FloatArray) -> bool:
-        """Whether a sender's message is late by some boxes (n,) of a fusion, of vehicles centred there (n, 2)."""
+    def _fits(self, fits: Callable[..., bool], sender: str, shown: Shown, told: IntArray, centres: FloatArray) -> bool:
+        """Whether a sender's message is `late`, or `replayed`, by some boxes (n,) of a fusion, of vehicles (n, 2)."""
         memory, own, ego = self.known.memory, self._moved(sender), self._moved(EGO)
         if self._testimony is None or own is None or ego is None:
             return False
@@ -248,4 +284,4 @@ class Fusions:
             centres, moved = np.vstack([centres, np.zeros(2)]), np.vstack([moved, ego @ turn])
         frames = WHILE_S / self.known.period_s
         turned = frames * self._turned(sender)
-        return late(self._testimony, sender, frames * (own @ turn), centres, frames * moved, turned)
+        return fits(self._testimony, sender, frames * (own @ turn), centres, frames * moved, turned)

@@ -61,10 +61,15 @@ class Hearing:
         said = np.minimum(np.maximum(over[:, rows, columns], -WEIGHTY), WEIGHTY)
         supported, _ = Claims(places[rows, columns], self.everybody.agents, said).in_conflict(unheard)
         surest = np.argsort(-over[index, rows, columns], kind="stable")
-        left, count = places[rows, columns][surest[supported[index, surest]]], 0
-        while len(left):
-            left, count = left[np.hypot(*(left - left[0]).T) > APART_M], count + 1
-        return count
+        return len(_apart(places[rows, columns][surest[supported[index, surest]]]))
+
+    def seen_by(self, agent: str) -> FloatArray:
+        """Centres (n, 2) of the vehicles that an agent sees, `APART_M` apart, the surest first."""
+        over, places = self.everybody.over_ego[self.everybody.agents.index(agent)], self.everybody.ego_places()
+        rows, columns = np.nonzero(over >= CERTAIN)
+        surest = np.argsort(-over[rows, columns], kind="stable")
+        found = _apart(places[rows, columns][surest])
+        return self.everybody.of({agent}).centres(found, np.ones((1, len(found)), dtype=bool))
 
     def seen_near(self, places: FloatArray) -> FloatArray:
         """Centres (n, 2) of vehicles near places (k, 2) of which somebody is certain, and nobody says the contrary; of
@@ -103,3 +108,12 @@ class Hearing:
         shown = (far > OWN_M) & (outermost <= self.heard.half_extent_m - EDGE_M)
         standing: FloatArray = centres[shown & (np.hypot(*(centres - places).T) <= REACH_M)]
         return standing
+
+
+def _apart(places: FloatArray) -> FloatArray:
+    """Those of places (n, 2) that are `APART_M` from all that come before."""
+    kept = []
+    while len(places):
+        kept.append(places[0])
+        places = places[np.hypot(*(places - places[0]).T) > APART_M]
+    return np.array(kept).reshape(-1, 2)

@@ -9,11 +9,12 @@ replay.
 
 from __future__ import annotations
 
-from collections.abc import Mapping
+from collections.abc import Iterator, Mapping
 
 import numpy as np
 
 from robosac.boxes import FloatArray
+from robosac.defenses.group_testing.claims import DENIES, SUPPORTS
 from robosac.defenses.group_testing.geometry import ACROSS_M, ALONG_M, same_vehicles
 from robosac.testimony import Testimony
 
@@ -21,7 +22,9 @@ WHILE_S = 0.2
 """Delays are counted in this, however far apart frames are."""
 DELAYS = np.array([0.0, 0.5, 1.0, 1.5, 2.0, 2.5, 3.0, 3.5, 4.0, 4.5, 5.0, 6.0])
 """How late a message may be."""
-_A_WHILE = DELAYS.tolist().index(1.0)
+AGES = np.arange(0.0, 12.5, 0.5)
+"""How old one may be that is replayed. In both, the third is `WHILE_S`."""
+_A_WHILE = 2
 LATEST = 4.0
 """What is later than .8 s is no late message, but a replay."""
 MOVED_M = 1.0
@@ -60,7 +63,7 @@ def late(
     motions: FloatArray,
     turned: float = 0.0,
 ) -> bool:
-    """Whether a sender's message is late.
+    """Whether a sender's message is late, and no replay.
 
     Parameters
     ----------
@@ -73,20 +76,49 @@ def late(
     turned : float
         How far the sender turns in it, radians.
     """
-    said_by, delays = testimony.of({sender}), DELAYS[:, None, None]
-    if any(_fits(said_by, centres, centres + delays * off) for off in (moved - motions, -motions)):
-        return True
-    if abs(turned) < TURNING:
-        return False
-    origin = testimony.origins[testimony.agents.index(sender)]
-    about = centres - origin + delays * (moved - motions)
-    c, s = np.cos(delays * turned), np.sin(delays * turned)
-    x, y = about[..., :1], about[..., 1:]
-    return _fits(said_by, centres, origin + np.concatenate([c * x - s * y, s * x + c * y], axis=2))
+    return any(delay <= LATEST for delay, _ in _delays(testimony, sender, moved, centres, motions, turned, DELAYS))
 
 
-def _fits(testimony: Testimony, centres: FloatArray, places: FloatArray) -> bool:
-    """Whether one sender's testimony fits a late message best, which shows vehicles in ``places`` (delays, n, 2)."""
+def replayed(
+    testimony: Testimony,
+    sender: str,
+    moved: FloatArray,
+    centres: FloatArray,
+    motions: FloatArray,
+    turned: float = 0.0,
+) -> bool:
+    """Whether a sender's message is older than a late one may be, by most vehicles. Parameters as for `late`."""
+    return any(
+        age > LATEST and of_most for age, of_most in _delays(testimony, sender, moved, centres, motions, turned, AGES)
+    )
+
+
+def _delays(
+    testimony: Testimony,
+    sender: str,
+    moved: FloatArray,
+    centres: FloatArray,
+    motions: FloatArray,
+    turned: float,
+    asked: FloatArray,
+) -> Iterator[tuple[float, bool]]:
+    """How late a message is of the delays asked for, with the pose of now, of then, and turned, as `_best` has it."""
+    said_by, delays = testimony.of({sender}), asked[:, None, None]
+    for off in (moved - motions, -motions):
+        yield _best(said_by, centres, centres + delays * off, asked)
+    if abs(turned) >= TURNING:
+        origin = testimony.origins[testimony.agents.index(sender)]
+        about = centres - origin + delays * (moved - motions)
+        c, s = np.cos(delays * turned), np.sin(delays * turned)
+        x, y = about[..., :1], about[..., 1:]
+        yield _best(said_by, centres, origin + np.concatenate([c * x - s * y, s * x + c * y], axis=2), asked)
+
+
+def _best(testimony: Testimony, centres: FloatArray, places: FloatArray, delays: FloatArray) -> tuple[float, bool]:
+    """The delay of those (k,) that one sender's testimony fits best if a message so late shows vehicles in ``places``
+    (k, n, 2); not a number if it fits none. And whether it supports most of them there: more than three quarters, less
+    those that it denies.
+    """
     telling = np.hypot(*(places[_A_WHILE] - centres).T) >= MOVED_M
     places = places[:, telling]
     said = testimony.likelihood(places.reshape(-1, 2)).reshape(places.shape[:2])
@@ -95,7 +127,8 @@ def _fits(testimony: Testimony, centres: FloatArray, places: FloatArray) -> bool
     gain = said[best] - said[0]
     better, worse = int((gain >= CLEAR).sum()), int((gain <= -CLEAR).sum())
     enough = bool(sums[best] >= FITS and gain.sum() >= FITS and better >= max(FEWEST, 2 * worse))
-    return enough and bool(DELAYS[best] <= LATEST)
+    of_most = 4 * int((said[best] >= SUPPORTS).sum() - (said[best] <= DENIES).sum()) > 3 * int(telling.sum())
+    return float(delays[best]) if enough else np.nan, of_most
 
 
 def senders(testimony: Testimony, pose: FloatArray) -> dict[str, Place]:

@@ -1,18 +1,21 @@
 """Whose messages lie in a wrong place as a whole: their senders are not where they say, or they are late.
 
 One vehicle tells little about that, all together much: where a sender sees vehicles, and where all others do, differs
-by a shift and a turn about the sender that are known to some .1 m and .2 degrees in each frame.
+by a shift and a turn about the sender that are known to some .1 m and .2 degrees in each frame. Whoever is some metres
+off sees none of them where the others do; then both are searched for.
 """
 
 from __future__ import annotations
 
-from collections.abc import Collection, Mapping
+from collections.abc import Collection, Iterator, Mapping
 from dataclasses import dataclass, field
 from typing import Any
 
 import numpy as np
 
 from robosac.boxes import BoolArray, FloatArray, IntArray
+from robosac.defenses.group_testing.claims import DENIES, SUPPORTS
+from robosac.testimony import Testimony
 
 FEWEST = 4
 """A sender is placed by so many vehicles that others see, too."""
@@ -38,6 +41,12 @@ frame. Teams that err by .6 m each make it seem .3 m off, seldom .6 m.
 """
 DOUBTED_M = 0.2
 """Where the middle one of the team is so far off, the ego is placed, too."""
+FARTHEST_M, TURNS, MOST_TURNS = 30.0, np.deg2rad(np.arange(-20, 21, 4)), 4
+"""A message is searched for within so many metres along each axis, and by these turns, of which so many are tried."""
+BIN_M = 2.0
+"""Vehicles are off alike if they are within so much."""
+COPY_M = 1.5
+"""A message comes from where another sender is if it comes from so near."""
 
 
 def misplaced(centres: FloatArray, supporting: BoolArray, origins: FloatArray, heard: BoolArray) -> FloatArray:
@@ -91,6 +100,89 @@ def ego_misplaced(seen: FloatArray, centres: FloatArray) -> float:
     return float(_off((seen - centres)[None], centres[None], np.ones((1, len(seen)), dtype=bool))[0])
 
 
+def elsewhere(said: Testimony, vehicles: FloatArray, seen: FloatArray, taken: FloatArray) -> float:
+    """How far a message lies from where its sender says it is, if it lies elsewhere as a whole.
+
+    For each turn that shift is taken by which most of the vehicles that the sender sees come to lie where others see
+    one (a generalised Hough transform: Ballard, Generalizing the Hough Transform to Detect Arbitrary Shapes,
+    Pattern Recognition 13, 1981), and corrected by the rigid motion of those (Kabsch, A Solution for the Best Rotation
+    to Relate Two Sets of Vectors, Acta Crystallographica A32, 1976). Of the turns that counts which the sender's own
+    testimony fits best.
+
+    Parameters
+    ----------
+    said : Testimony
+        The sender's alone.
+    vehicles : (n, 2) ndarray
+        Where the ego sees vehicles, or two others do; ego frame, metres.
+    seen : (m, 2) ndarray
+        Where the sender does.
+    taken : (k, 2) ndarray
+        Where the others are. A message that would come from there is a copy of theirs: two cannot be in one place.
+
+    Returns
+    -------
+    float
+        Root mean square over the vehicles that the sender then supports, metres. Not a number unless those are, less
+        the vehicles that it then denies, more than half of all, or of what the sender sees; and four more than where
+        it says that it is, and at least four.
+    """
+    if min(len(vehicles), len(seen)) < FEWEST:
+        return np.nan
+    in_place, (origin,) = _agreeing(said.likelihood(vehicles)[0]), said.origins
+    best, far = 0.0, np.nan
+    for of, to in _alike((vehicles - origin) @ _turning(TURNS) + origin, seen):
+        moved = _rigidly(vehicles, vehicles[of], seen[to])
+        comes_from = _rigidly(origin, seen[to], vehicles[of])
+        if np.hypot(*(taken - comes_from).T).min(initial=np.inf) <= COPY_M:
+            return np.nan
+        likelihood = said.likelihood(moved)[0]
+        agreeing = _agreeing(likelihood)
+        fits = agreeing >= max(FEWEST, in_place + FEWEST) and 2 * agreeing > min(len(vehicles), len(seen))
+        if fits and likelihood.sum() > best:
+            best, off = float(likelihood.sum()), moved - vehicles
+            far = float(np.sqrt((off[likelihood >= SUPPORTS] ** 2).sum(axis=1).mean()))
+    return far
+
+
+def _agreeing(likelihood: FloatArray) -> int:
+    """How many more vehicles are supported than denied, by L (n,) of each."""
+    return int((likelihood >= SUPPORTS).sum() - (likelihood <= DENIES).sum())
+
+
+def _turning(angles: FloatArray) -> FloatArray:
+    """By these (..., 2, 2), rows of coordinates are turned by angles (...,), radians."""
+    c, s = np.cos(angles), np.sin(angles)
+    return np.stack([np.stack([c, s], axis=-1), np.stack([-s, c], axis=-1)], axis=-2)
+
+
+def _alike(places: FloatArray, seen: FloatArray) -> Iterator[tuple[IntArray, IntArray]]:
+    """Which of places go with which others (m, 2) by the shift that most of them have in common: of those (turns, n, 2)
+    by which most do, at least four, the `MOST_TURNS` first.
+    """
+    apart = (seen - places[:, :, None]).reshape(len(places), -1, 2)
+    size = int(2 * FARTHEST_M / BIN_M)
+    x, y = np.floor((apart + FARTHEST_M) / BIN_M).astype(np.int64).transpose(2, 0, 1)
+    cells = (np.arange(len(places))[:, None] * size + x) * size + y
+    inside = (x >= 0) & (x < size) & (y >= 0) & (y < size)
+    votes = np.bincount(cells[inside], minlength=len(places) * size * size).reshape(-1, size, size)
+    four = votes[:, :-1, :-1] + votes[:, 1:, :-1] + votes[:, :-1, 1:] + votes[:, 1:, 1:]
+    most = four.max(axis=(1, 2))
+    for turn in np.argsort(-most, kind="stable")[:MOST_TURNS]:
+        corner = np.array(np.unravel_index(four[turn].argmax(), four[turn].shape)) + 1
+        near = np.flatnonzero(np.hypot(*(apart[turn] - corner * BIN_M + FARTHEST_M).T) <= BIN_M)
+        if len(near) >= FEWEST:
+            yield near // len(seen), near % len(seen)
+
+
+def _rigidly(places: FloatArray, of: FloatArray, to: FloatArray) -> FloatArray:
+    """Places (..., 2), moved as points (k, 2) are to others (k, 2), as far as a shift and a turn can do that."""
+    middle, aim = of.mean(axis=0), to.mean(axis=0)
+    (xx, xy), (yx, yy) = (of - middle).T @ (to - aim)
+    moved: FloatArray = (places - middle) @ _turning(np.arctan2(xy - yx, xx + yy)) + aim
+    return moved
+
+
 def _off(apart: FloatArray, arms: FloatArray, shared: BoolArray) -> FloatArray:
     """How far senders (k,) are off who see vehicles ``apart`` (k, n, 2) from where those are, at the ends of ``arms``
     (k, n, 2) from the sender, so far as shared (k, n); not a number with fewer than four of them.
@@ -135,6 +227,10 @@ class Placing:
     """By teammate: a running mean of how far it is `misplaced`, metres."""
     out: frozenset[str] = frozenset()
     """Who is out of place."""
+    lost: dict[str, int] = field(default_factory=dict)
+    """By teammate whose message lies `elsewhere`: for how many frames more nothing is held against it. A frame in which
+    that cannot be told may lie between two in which it can.
+    """
     ego_off: float = EXPECTED_M
     """The running mean of the ego itself."""
     ego_astray: bool = False
@@ -145,6 +241,11 @@ class Placing:
         far = EXPECTED_M if np.isnan(far) else far
         self.ego_off = round(self.ego_off + RATE * (far - self.ego_off), 4)
         self.ego_astray = differs or far > EGO_ONCE_M or self.ego_off > EGO_MEAN_M
+
+    def lose(self, found: Collection[str], frames: int) -> None:
+        """Take in whose messages lie `elsewhere` in a frame, and for how many frames that counts."""
+        left = {name: more - 1 for name, more in self.lost.items() if more > 1}
+        self.lost = {**left, **dict.fromkeys(sorted(found), frames)}
 
     def learn(self, placed: Mapping[str, float], team: Collection[str] = ()) -> None:
         """Take in how far teammates are `misplaced` in a frame.
@@ -163,7 +264,8 @@ class Placing:
             return
         usual = self._usual()
         mean, once = max(MEAN_M, MEAN * usual), max(ONCE_M, ONCE * usual)
-        self.out = frozenset(name for name, far in placed.items() if self.off[name] > mean or far > once)
+        out = {name for name, far in placed.items() if self.off[name] > mean or far > once}
+        self.out = frozenset(out.union(self.lost))
 
     def _usual(self) -> float:
         ranked = sorted(self.off.values())
@@ -172,16 +274,18 @@ class Placing:
     def forget(self, teammate: str) -> None:
         """It left."""
         self.off.pop(teammate, None)
+        self.lost.pop(teammate, None)
         self.out -= {teammate}
 
     def to_state(self) -> dict[str, Any]:
         """JSON values that `from_state` reads."""
         ego = {"ego_off": self.ego_off, "ego_astray": self.ego_astray}
-        return {"off": self.off, "out": sorted(self.out), **ego}
+        return {"off": self.off, "out": sorted(self.out), "lost": self.lost, **ego}
 
     @classmethod
     def from_state(cls, state: Mapping[str, Any]) -> Placing:
         """What `to_state` wrote; of nothing, as in the states of older versions, nothing is learned yet."""
         off = {str(name): float(far) for name, far in state.get("off", {}).items()}
         out = frozenset(str(name) for name in state.get("out", ()))
-        return cls(off, out, float(state.get("ego_off", EXPECTED_M)), bool(state.get("ego_astray", False)))
+        lost = {str(name): int(more) for name, more in state.get("lost", {}).items()}
+        return cls(off, out, lost, float(state.get("ego_off", EXPECTED_M)), bool(state.get("ego_astray", False)))

@@ -25,6 +25,7 @@ from robosac.defenses.group_testing.placing import (
     RATE,
     Placing,
     ego_misplaced,
+    elsewhere,
     misplaced,
 )
 from robosac.defenses.group_testing.posterior import Posterior
@@ -143,6 +144,53 @@ def test_the_ego_is_placed_by_what_others_agree_on():
     assert np.isnan(ego_misplaced(PLACES[: FEWEST - 1], PLACES[: FEWEST - 1]))
 
 
+STANDS = pose_matrix(5, -3, 0, np.radians(40))
+VIEWED = np.random.default_rng(11).uniform(-20, 20, (14, 2))
+NOBODY = np.zeros((0, 2))
+
+
+def one_sees(places, denied=()):
+    """The testimony of one sender that stands at `STANDS`, and where it sees vehicles."""
+    said = [*((x, y, 5.5) for x, y in places), *((x, y, -5.0) for x, y in denied)]
+    return saying({"": [], LIAR: said}, {LIAR: STANDS}, {LIAR: places}).of({LIAR}), np.asarray(places)
+
+
+@pytest.mark.parametrize(("shift", "degrees"), [((4.0, 0.0), 0), ((-9.0, 5.0), 0), ((0.0, 0.0), 10), ((3.0, 2.0), -7)])
+def test_a_message_that_lies_elsewhere_as_a_whole_is_found(shift, degrees):
+    where = turned(VIEWED, STANDS[:2, 3], degrees) + shift
+    apart = np.hypot(*(VIEWED[:, None] - where[None]).transpose(2, 0, 1)).min(axis=1)
+    said, seen = one_sees(where, VIEWED[apart > 5.0])
+    off = np.sqrt(((where - VIEWED) ** 2).sum(axis=1).mean())
+    assert elsewhere(said, VIEWED, seen, NOBODY) == pytest.approx(off, abs=0.5)
+    stands = turned(STANDS[:2, 3] - shift, STANDS[:2, 3], -degrees)  # where it is in truth
+    assert np.isnan(elsewhere(said, VIEWED, seen, np.array([[30.0, 30.0], stands + [0.8, 0.8]])))
+
+
+def test_a_message_that_lies_where_it_should_is_not_elsewhere():
+    assert np.isnan(elsewhere(*swapped(one_sees(VIEWED))))
+    liar = one_sees([*VIEWED[:10], (25.0, 25.0), (-25.0, 25.0)], VIEWED[10:])  # four are erased, two made up
+    assert np.isnan(elsewhere(*swapped(liar)))
+
+
+@pytest.mark.parametrize("seed", range(5))
+def test_what_shows_other_vehicles_is_not_elsewhere(seed):
+    others = np.random.default_rng(seed).uniform(-20, 20, (14, 2))
+    apart = np.hypot(*(VIEWED[:, None] - others[None]).transpose(2, 0, 1)).min(axis=1)
+    assert np.isnan(elsewhere(*swapped(one_sees(others, VIEWED[apart > 5.0]))))
+
+
+def test_a_few_vehicles_do_not_tell_where_a_message_lies():
+    for count in (0, 1, FEWEST - 1):
+        said, seen = one_sees(VIEWED[:count] + [6.0, 0.0], VIEWED[:count])
+        assert np.isnan(elsewhere(said, VIEWED[:count], seen, NOBODY))
+    assert np.isnan(elsewhere(one_sees(VIEWED)[0], VIEWED, np.zeros((0, 2)), NOBODY))
+
+
+def swapped(told):
+    said, seen = told
+    return said, VIEWED, seen, NOBODY
+
+
 def told(*frames):
     """A placing after frames of how far the liar is off, of a team that is off by .1 m else."""
     placing = Placing()
@@ -201,10 +249,11 @@ def test_whoever_is_in_place_again_or_can_no_longer_be_placed_is_back():
 def test_it_is_kept_and_forgotten():
     placing = told(*[1.0] * 10)
     placing.learn_ego(2.0, differs=False)
+    placing.lose([LIAR], 5)
     memory = Memory.from_state(json.loads(json.dumps(Memory(placing=placing).to_state())))
     assert memory.placing == placing
     memory.leave(LIAR, 0.5)
-    assert LIAR not in {*memory.placing.off, *memory.placing.out}
+    assert LIAR not in {*memory.placing.off, *memory.placing.out, *memory.placing.lost}
     assert Memory.from_state({**Memory().to_state(), "placing": {}}).placing == Placing()
 
 
@@ -230,6 +279,45 @@ def test_who_is_out_of_place_is_left_out_while_it_is_and_not_suspected():
     after = HONEST.play(10, before=Displaced(), quiet=10)
     assert LIAR not in after[0][0].accepted
     assert LIAR in after[-1][0].accepted
+
+
+class Lost(World):
+    """The liar sees all vehicles 6 m off, and denies them where they are, in some frames at least."""
+
+    def __init__(self, silent=()):
+        super().__init__({}, nothing)
+        places = {name: [(x, y, 5.5) for x, y in SEEN[:, :2]] for name in (EGO, *TEAM) if name != LIAR}
+        where = SEEN[:, :2] + [6.0, 0.0]
+        denied = [(x, y, -5.5) for x, y in SEEN[:, :2]]
+        says = {**places, LIAR: [*denied, *((x, y, 5.5) for x, y in where)]}
+        self.testimony = saying({EGO: places[EGO], **{n: says[n] for n in TEAM}}, seen={LIAR: where})
+
+
+def test_whose_message_lies_elsewhere_is_left_out_while_it_does_and_not_named():
+    met = Lost().play(12)
+    assert all(LIAR not in decision.accepted for decision, _ in met)
+    assert not any(decision.named for decision, _ in met)
+    last, _ = met[-1]
+    assert set(last.accepted) == set(TEAM) - {LIAR}
+    assert last.rejected[LIAR].evidence["misplaced_m"] > 3.0
+    assert last.state["memory"]["placing"]["lost"] == {LIAR: 5}
+    after = HONEST.play(30, before=Lost(), quiet=12)
+    assert LIAR in after[-1][0].accepted
+    assert not any(decision.named for decision, _ in after)
+
+
+def test_what_lies_elsewhere_counts_against_nobody_for_some_frames():
+    placing = Placing()
+    placing.lose([LIAR], 3)
+    for left in (2, 1):
+        placing.lose([], 3)
+        placing.learn({LIAR: 0.1})
+        assert placing.lost == {LIAR: left}
+        assert placing.out == {LIAR}
+    placing.lose([], 3)
+    placing.learn({LIAR: 0.1})
+    assert placing.lost == {}
+    assert placing.out == set()
 
 
 def test_while_the_ego_is_astray_everybody_is_excused_and_whole_fusions_tell_nothing():
@@ -372,9 +460,9 @@ def test_without_time_for_a_test_the_answer_goes_without_who_is_out_of_place():
     assert set(decision.accepted) == set(TEAM) - {LIAR}
 
 
-def played(campaign, frames=14, number=1700, *, turned_from=None):
+def played(campaign, frames=14, number=1700, *, turned_from=None, astray=None):
     """Who is accepted in each frame of a validation scene with one attacker, and who is named. From some frame on the
-    ego's heading is wrong by 15 degrees.
+    ego's heading is wrong by 15 degrees; or the first teammate is not where it says, by a motion (4, 4).
     """
     detector, scene = load(), IntersectionScene(number)
     ego, team = scene.egos[0], sorted(set(scene.agents) - {scene.egos[0]})
@@ -385,6 +473,8 @@ def played(campaign, frames=14, number=1700, *, turned_from=None):
         mine = messages.pop(ego)
         if turned_from is not None and index >= turned_from:
             mine = Message(mine.pose @ pose_matrix(0, 0, 0, np.radians(15)), mine.tensors)
+        if astray is not None:
+            messages[team[0]] = Message(astray @ messages[team[0]].pose, messages[team[0]].tensors)
         lies = load_campaign(campaign).messages(detector, mine, messages, team[:1], index, np.random.default_rng(index))
         answer = session.answer(index, mine, {**messages, **lies})
         accepted.append(set(answer.accepted))
@@ -405,3 +495,11 @@ def test_nobody_is_named_where_the_ego_turns_out_not_to_be_where_it_says():
     _, accepted, named = played("honest", 12, 1704, turned_from=5)
     assert not named
     assert all(not of_frame for of_frame in accepted[7:])
+
+
+@pytest.mark.parametrize("astray", [pose_matrix(3.2, -2.4, 0, 0), pose_matrix(-8, 0, 0, 0)])
+def test_a_teammate_that_is_metres_from_where_it_says_is_left_out_and_not_named(astray):
+    team, accepted, named = played("honest", 10, 1705, astray=astray)
+    assert not named
+    assert all(team[0] not in of_frame for of_frame in accepted[1:])
+    assert all(set(team[1:]) <= of_frame for of_frame in accepted[2:])
