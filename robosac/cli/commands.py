@@ -6,7 +6,10 @@ Other packages add commands by the entry point group ``robosac.commands``, so th
 from __future__ import annotations
 
 import ast
+import errno
 import inspect
+import os
+import sys
 from collections.abc import Sequence
 from importlib.metadata import entry_points
 from importlib.util import find_spec
@@ -37,6 +40,8 @@ OWN = {
 """Commands of the library, each ``module:attribute``: a function, or a typer application with commands of its own."""
 GROUP = "robosac.commands"
 """Entry points of other packages' commands, in the same form."""
+UNWRITTEN = {errno.ENOSPC, errno.EDQUOT, errno.EFBIG, errno.EIO}
+"""How writing fails where there is no room."""
 _OURS = ("robosac", "service", "clients")
 
 
@@ -100,6 +105,17 @@ class Commands(TyperGroup):
     def resolve_command(self, ctx: Any, args: list[str]) -> Any:
         name, _, rest = super().resolve_command(ctx, args)
         return name, None if name is None else load(name, self._places[name]), rest
+
+    def main(self, *args: Any, **settings: Any) -> Any:
+        """Run a command; where what it prints cannot be written, end with 2, as 1 may be the outcome of a check."""
+        try:
+            return super().main(*args, **settings)
+        except OSError as error:
+            if error.errno not in UNWRITTEN or error.filename is not None:
+                raise
+            os.dup2(os.open(os.devnull, os.O_WRONLY), 1)  # what is left of it would fail again at the very end
+            typer.echo(f"Error: {error.strerror}", err=True)
+            sys.exit(2)
 
     def invoke(self, ctx: Any) -> Any:
         words = [*ctx._protected_args, *ctx.args]

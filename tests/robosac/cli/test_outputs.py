@@ -2,6 +2,9 @@
 
 import io
 import json
+import subprocess
+import sys
+from pathlib import Path
 
 import pytest
 import typer
@@ -166,3 +169,15 @@ def test_the_name_of_a_file_is_told_as_it_is_and_whole():
     for path in ("out[1]/[/x]/[red]:smile:.json", "a/" * 20 + "[bold]"):
         tell(console, f"Written: {path}")
         assert console.file.getvalue().endswith(f"Written: {path}\n")
+
+
+@pytest.mark.skipif(not Path("/dev/full").exists(), reason="there is no /dev/full")
+@pytest.mark.parametrize("words", [["--version"], ["audit", "verify", "LOG"]])
+def test_what_cannot_be_printed_ends_with_a_line_and_is_no_outcome_of_a_check(words, tmp_path):
+    log = tmp_path / "log.jsonl"
+    log.write_text("{}\n")
+    words = [str(log) if word == "LOG" else word for word in words]
+    program = [sys.executable, "-c", "from robosac.cli import app; app()", *words]
+    with Path("/dev/full").open("w") as full:
+        ended = subprocess.run(program, stdout=full, stderr=subprocess.PIPE, text=True, check=False)
+    assert (ended.returncode, ended.stderr) == (2, "Error: No space left on device\n")
