@@ -11,6 +11,7 @@ import inspect
 import os
 import sys
 from collections.abc import Sequence
+from contextlib import suppress
 from importlib.metadata import entry_points
 from importlib.util import find_spec
 from pathlib import Path
@@ -113,7 +114,8 @@ class Commands(TyperGroup):
         except OSError as error:
             if error.errno not in UNWRITTEN or error.filename is not None:
                 raise
-            os.dup2(os.open(os.devnull, os.O_WRONLY), 1)  # what is left of it would fail again at the very end
+            with suppress(OSError):  # what is left of it would fail again at the very end
+                os.dup2(os.open(os.devnull, os.O_WRONLY), sys.stdout.fileno())
             typer.echo(f"Error: {error.strerror}", err=True)
             sys.exit(2)
 
