@@ -5,6 +5,7 @@ OUT ?= out
 # what is compiled is kept, as tests start hundreds of processes; but nothing is compiled before it is first used
 export PYTHONDONTWRITEBYTECODE :=
 INSTALL := $(BIN)/pip install --quiet --no-compile --constraint constraints.txt
+EXTRAS := plots,postgresql,recordings
 HOST ?= 127.0.0.1
 PORT ?= 8000
 
@@ -66,12 +67,12 @@ $(VENV)/.created:
 	touch $@
 
 $(VENV)/.installed: $(VENV)/.created pyproject.toml constraints.txt
-	$(INSTALL) --editable '.[plots,postgresql,recordings]'
+	$(INSTALL) --editable '.[$(EXTRAS)]'
 	touch $@
 
-$(VENV)/.installed-dev: $(VENV)/.installed
-	$(INSTALL) --editable '.[dev]'
-	touch $@
+$(VENV)/.installed-dev: $(VENV)/.created pyproject.toml constraints.txt
+	$(INSTALL) --editable '.[$(EXTRAS),dev]'
+	touch $(VENV)/.installed $@
 
 $(VENV)/.installed-docs: $(VENV)/.installed
 	$(INSTALL) --editable '.[docs]'

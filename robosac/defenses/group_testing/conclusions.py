@@ -185,8 +185,7 @@ def _straying(
     for name, (joined, without) in asked.items():
         anew = memory.frame - found.lies.audited.get(name, -AUDIT_FRAMES) >= AUDIT_FRAMES
         by = strays(found.shown[joined], found.shown[without], name)
-        weight = memory.straying.learn(name, by, anew=anew)
-        if weight and name not in memory.placing.lost:
+        if weight := memory.straying.learn(name, by, anew=anew):
             weights[name] = weight
         found.lies.audited[name] = memory.frame
     for name in set(found.team) & memory.straying.levels.keys() - set(answer) - found.named:

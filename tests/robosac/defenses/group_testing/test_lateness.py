@@ -18,6 +18,7 @@ from robosac.defenses.group_testing.lateness import (
     lately,
     motions,
     moved_since,
+    replayed,
     senders,
     sent,
     turned_since,
@@ -66,6 +67,12 @@ def test_a_message_is_late_up_to_a_bound(frames, is_late):
 @pytest.mark.parametrize(("frames", "is_late"), [(1, True), (2, True), (5, False)])
 def test_with_the_pose_of_then_what_it_shows_has_not_moved_along(frames, is_late):
     assert told(PLACES - frames * SPEED, moved=(0.0, 3.0)) == is_late
+
+
+@pytest.mark.parametrize(("frames", "vehicles", "is_old"), [(4, None, False), (5, None, True), (5, 2, False)])
+def test_an_old_message_shows_most_vehicles_where_they_were(frames, vehicles, is_old):
+    heard = saying({EGO: [], "d": [(*place, YES) for place in (PLACES - frames * SPEED)[:vehicles]]})
+    assert replayed(heard, "d", STILL, PLACES, np.broadcast_to(SPEED, PLACES.shape)) == is_old
 
 
 def test_where_nothing_moves_nobody_is_late():
@@ -163,6 +170,7 @@ def test_who_is_late_is_not_named_and_who_replays_is(delay, names, shown, every)
     assert ("late" in levels) == (0 < delay < 5) or delay == 5  # it was, while it had nothing older
     assert ("conflict" in levels) == (delay == 5)
     assert ("ghost" in levels) == (delay == 5 and shown)
+    assert not any(decision.state["memory"]["placing"]["lost"] for decision in found)  # late, or old, not elsewhere
 
 
 @pytest.mark.parametrize(

@@ -11,6 +11,8 @@ from robosac.attacks import load_campaign
 from robosac.boxes import pose_matrix
 from robosac.defenses import EGO
 from robosac.defenses.group_testing import GroupTesting, GroupTestingSettings
+from robosac.defenses.group_testing.evidence import Evidence
+from robosac.defenses.group_testing.frame import JudgedFrame
 from robosac.defenses.group_testing.fusions import Fusions
 from robosac.defenses.group_testing.knowledge import Knowledge
 from robosac.defenses.group_testing.memory import Memory
@@ -318,6 +320,17 @@ def test_what_lies_elsewhere_counts_against_nobody_for_some_frames():
     placing.learn({LIAR: 0.1})
     assert placing.lost == {}
     assert placing.out == set()
+
+
+def test_whose_message_lies_elsewhere_is_excused_and_not_named_whatever_is_known_of_it():
+    for lost in ({}, {LIAR: 2}):
+        memory = Memory(placing=Placing(lost=dict(lost)))
+        known = Knowledge(MODEL, Posterior(len(MODEL.kinds), 0.5, 0.25, TEAM), memory)
+        assert Fusions(known, TEAM, ()).excused(LIAR) == bool(lost)
+        assert not Fusions(known, TEAM, ()).excused("car-2")
+        frame = JudgedFrame(known, Evidence(known), TEAM, frozenset())
+        memory.lies.guilt = lambda *_: 1.0
+        assert frame._is_attacker(LIAR, 0.99, 0.95) == (not lost)
 
 
 def test_while_the_ego_is_astray_everybody_is_excused_and_whole_fusions_tell_nothing():
