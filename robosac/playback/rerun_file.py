@@ -45,9 +45,9 @@ def write_rerun(session: RecordedSession, path: Path) -> None:
     need("rerun", "files of rerun")
     import rerun as rr  # noqa: PLC0415 (of an extra)
 
-    with replacing(path) as beside:
+    with replacing(path) as beside, beside.open("wb") as file:  # rerun itself hangs where a disk is full
         stream = rr.RecordingStream(APPLICATION, recording_id=session.opening.session_id)
-        stream.save(beside)
+        written = stream.memory_recording()
         stream.log("world", rr.ViewCoordinates.RIGHT_HAND_Z_UP, static=True)
         origin = _origin(session)
         if origin.any():
@@ -57,8 +57,7 @@ def write_rerun(session: RecordedSession, path: Path) -> None:
             stream.set_time("time", timestamp=np.datetime64(frame.time_ns, "ns"))
             stream.set_time("frame", sequence=frame.number)
             _log(stream, rr, frame, session.opening.ego_id, origin)
-        stream.flush()
-        stream.disconnect()
+        file.write(written.drain_as_bytes())
 
 
 def _origin(session: RecordedSession) -> FloatArray:

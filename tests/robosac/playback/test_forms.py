@@ -1,5 +1,6 @@
 import json
 from dataclasses import replace
+from pathlib import Path
 
 import numpy as np
 import pytest
@@ -36,6 +37,15 @@ def test_rerun_reads_what_is_written_for_it(session, tmp_path):
         rows[part.entity_path] = rows.get(part.entity_path, 0) + part.num_rows
     assert {"/world/boxes", "/world/truth", "/world/vehicles/car-1", "/suspicion/car-2", "/decision"} <= rows.keys()
     assert rows["/world/boxes"] == 2
+
+
+@pytest.mark.skipif(not Path("/dev/full").exists(), reason="there is no /dev/full")
+def test_a_full_disk_is_told_and_not_waited_for(session):
+    pytest.importorskip("rerun", reason="rerun-sdk is not installed")
+    from robosac.playback.rerun_file import write_rerun
+
+    with pytest.raises(OSError, match="No space left"):
+        write_rerun(session, Path("/dev/full"))
 
 
 def test_far_from_the_origin_rerun_keeps_its_precision(session, tmp_path):
