@@ -14,6 +14,7 @@ class Kind(StrEnum):
 
     MALFORMED_JSON = "malformed-json"
     INCOMPLETE_BODY = "incomplete-body"
+    HUNG_UP = "hung-up"
     UNAUTHENTICATED = "unauthenticated"
     TOKEN_EXPIRED = "token-expired"
     BAD_SIGNATURE = "bad-signature"

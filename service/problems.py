@@ -35,6 +35,7 @@ _CLOSE = {"Connection": "close"}  # as the rest of the body may still come, or n
 ANSWERS: Mapping[Kind, tuple[int, Mapping[str, str]]] = {
     Kind.MALFORMED_JSON: (400, {}),
     Kind.INCOMPLETE_BODY: (400, {}),
+    Kind.HUNG_UP: (400, {}),
     Kind.UNAUTHENTICATED: (401, _CHALLENGE),
     Kind.TOKEN_EXPIRED: (401, _CHALLENGE),
     Kind.BAD_SIGNATURE: (401, {}),

@@ -5,6 +5,7 @@ from __future__ import annotations
 import json
 import re
 from collections.abc import AsyncIterator
+from functools import partial
 from typing import Annotated
 
 import structlog
@@ -19,7 +20,7 @@ from robosac.answers import LogReceipt
 from service import description
 from service.arriving.arrival import arrival_of
 from service.arriving.bodies import JSON_BYTES, MSGPACK, MSGPACK_TYPES, STREAMED, check_type, read_json
-from service.arriving.limits import expected_bytes, read_bounded
+from service.arriving.limits import expected_bytes, hung_up, read_bounded
 from service.callers import Ego, GatewayDep, KeyId, ProvenEgo, ProvenRenewing, Token, Vehicle
 from service.deciding.asked import Answered
 from service.errors import Kind, Refused
@@ -232,7 +233,8 @@ async def post_message(
     gateway.frames.check_waiting(caller)
     with (room := _room(gateway, caller)).holding(expected_bytes(request, limit)):
         body = await _read_body(request, caller, gateway, limit)
-        answer = await gateway.frames.post_message(caller, body, arrival_of(request.scope), room)
+        gone, arrived = partial(hung_up, request), arrival_of(request.scope)
+        answer = await gateway.frames.post_message(caller, body, arrived, room, gone)
     return _negotiated(answer, accept, 202) if isinstance(answer, Receipt) else _handed_over(answer, accept, gateway)
 
 

@@ -4,10 +4,11 @@ from __future__ import annotations
 
 import asyncio
 import contextlib
+import math
 import os
 import sys
 import time
-from collections.abc import AsyncIterator, Callable
+from collections.abc import AsyncIterator, Awaitable, Callable
 from contextlib import AbstractContextManager
 from dataclasses import dataclass, field
 from functools import partial
@@ -36,6 +37,8 @@ from service.turns import Work
 from service.watching.metrics import Metrics
 
 T = TypeVar("T")
+HungUp = Callable[[], Awaitable[None]]
+"""Returns when whoever asked hangs up."""
 
 SLACK_BYTES = 64 * 1024
 """What a message may have besides its tensors."""
@@ -46,6 +49,8 @@ READ_S = 0.005
 """For how long about a body is read before others have their turns: one of many messages may take ten times as long."""
 READING_MOST_S = 5.0
 """After which a turn to read holds up no other: none takes so long."""
+LONG_S = 0.5
+"""Of a wait for teammates' messages, which ends early if the ego hangs up: its next frame would wait behind it."""
 READING_SHARE = 0.5
 """Of its budget, for which a body may wait until it is read: later there is hardly time to answer it."""
 _COMPRESSED = wire.ZSTD.encode()
@@ -68,10 +73,12 @@ class Frames:
     sends many at once is read before all others.
     """
 
-    async def post_message(self, caller: Caller, body: bytes, arrived: float, room: Share) -> Answered | Receipt:
+    async def post_message(
+        self, caller: Caller, body: bytes, arrived: float, room: Share, hung_up: HungUp
+    ) -> Answered | Receipt:
         """A vehicle's own message, whose request came then: kept for a teammate, answered for the ego.
 
-        ``room`` is that of bodies, in which this one is counted as it came.
+        ``room`` is that of bodies, in which this one is counted as it came; ``hung_up`` ends when its sender hangs up.
         """
         frame, received = await self._read(caller, body, read_message)
         if not caller.is_ego:
@@ -80,7 +87,7 @@ class Frames:
         asked = Asked(caller, frame, received, arrived)
         asked.spent("receive", arrived)
         with self.admission.waiting(caller.record.session_id), room.holding(_expanded_by(asked, body)):
-            return await self._answer(asked, gather=True)
+            return await self._answer(asked, hung_up)
 
     async def post_frame(self, caller: Caller, body: bytes, arrived: float, room: Share, expected: Work) -> Answered:
         """A whole frame from the ego, whose request came then. A teammate whose part is malformed is left out, and the
@@ -93,7 +100,7 @@ class Frames:
         asked = Asked(caller, frame, parts.ego, arrived, parts.messages, parts.unusable, whole=True)
         asked.spent("receive", arrived)
         with self.admission.waiting(caller.record.session_id), room.holding(_expanded_by(asked, body)):
-            return await self._answer(asked, gather=False)
+            return await self._answer(asked)
 
     def coming(self, caller: Caller, arrived: float) -> AbstractContextManager[Work]:
         """As `service.deciding.admission.Admission.coming`, for an ego's frame whose request came then."""
@@ -158,15 +165,16 @@ class Frames:
             detail = "bodies of other requests took the time that this one had"
             raise Refused(Kind.OVERLOADED, detail, retry_after_s=1) from None
 
-    async def _answer(self, asked: Asked, *, gather: bool) -> Answered:
+    async def _answer(self, asked: Asked, hung_up: HungUp | None = None) -> Answered:
+        """The answer to a frame; one that came as the ego's message alone, whose sender may hang up, is gathered."""
         caller, session_id = asked.caller, asked.caller.record.session_id
         try:
             async with _its_turn(asked):
                 await self._check_ego_on_record(asked)
-                if gather:
+                if hung_up is not None:
                     began, until = time.perf_counter(), asked.arrived + caller.record.gather_ms / 1e3
                     await self.sessions.moving.hold(caller, until)
-                    asked.messages = await self._gathered(asked, until)
+                    asked.messages = await self._gathered(asked, until, hung_up)
                     asked.spent("gather", began)
                 with self.admission.frame(caller.live.key, session_id, asked.due, caller.live.budget_s) as work:
                     return await self.deciding.answer(asked, work)
@@ -175,12 +183,13 @@ class Frames:
                 self.metrics.late()
             raise
 
-    async def _gathered(self, asked: Asked, until: float) -> dict[str, Received]:
+    async def _gathered(self, asked: Asked, until: float, hung_up: HungUp) -> dict[str, Received]:
         """Messages of teammates; what can be worked out before the last of them is, while they are waited for."""
         live = asked.caller.live
         asked.begun = begun = self.deciding.engine.begin(live.session, asked.ego.message)
         try:
-            return await live.gathering.collect(asked.frame, until, begun.add)
+            async with _as_long_as_wanted(until, hung_up):
+                return await live.gathering.collect(asked.frame, until, begun.add)
         except BaseException:
             begun.end()
             raise
@@ -249,6 +258,28 @@ def _expanded_by(asked: Asked, body: bytes) -> int:
     """By how many bytes the tensors of a body exceed it: they may have come compressed, or in a narrower type."""
     received = (asked.ego, *asked.messages.values())
     return max(sum(one.nbytes for one in received) - len(body), 0)
+
+
+@contextlib.asynccontextmanager
+async def _as_long_as_wanted(until: float, hung_up: HungUp) -> AsyncIterator[None]:
+    """Wait in a block until then (`time.perf_counter`), if that is long only as long as whoever asked is there."""
+    if until - time.perf_counter() < LONG_S:
+        yield
+        return
+
+    async def watch(wait: asyncio.Timeout) -> None:
+        await hung_up()
+        wait.reschedule(-math.inf)
+
+    try:
+        async with asyncio.timeout(None) as wait:
+            watching = asyncio.create_task(watch(wait))
+            try:
+                yield
+            finally:
+                watching.cancel()
+    except TimeoutError:
+        raise Refused(Kind.HUNG_UP, "the ego hung up before its teammates' messages were there") from None
 
 
 @contextlib.asynccontextmanager

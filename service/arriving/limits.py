@@ -61,6 +61,12 @@ async def read_bounded(request: Request, limit: int, came: Callable[[], None] = 
     return bytes(body)
 
 
+async def hung_up(request: Request) -> None:
+    """Wait until whoever sent a request, whose body is read, hangs up."""
+    while (await request.receive())["type"] != "http.disconnect":
+        pass
+
+
 class Unfinished:
     """The bodies that a process waits for."""
 

@@ -10,13 +10,15 @@ from sqlalchemy import Connection, insert
 
 from robosac.audit import Unsealed, digest
 from service.errors import SessionChanged, SessionInUse, SessionOver, TokenReplaced
-from service.keeping.partitions import day
+from service.keeping.clock import Today
 from service.keeping.record import SessionRecord
 from service.keeping.rows import CHANGE, GET_BUT_STATE, GET_TO_CHANGE, GET_TOUCHED, columns, read_row
 from service.keeping.tables import audit_lines
 
 GROWTH = ("audit_seq", "audit_head", "kept_bytes")
 """Fields that change with every line."""
+ADD_LINE = insert(audit_lines).values(day=Today())
+"""With `line_row`."""
 Change = Callable[[SessionRecord], Mapping[str, Any]]
 """Of a session as it is, the fields that change."""
 
@@ -57,13 +59,13 @@ def append(  # a transaction's work, and what was made ready for it
     )
     changed = columns(after, *changes, *GROWTH, "revision", state=state)
     connection.execute(CHANGE, {"this": session_id, **changed})  # not `values`, so that it is compiled once
-    connection.execute(insert(audit_lines), line_row(session_id, after.audit_seq, line))
+    connection.execute(ADD_LINE, line_row(session_id, after.audit_seq, line))
     return after
 
 
 def line_row(session_id: str, seq: int, line: str) -> Mapping[str, Any]:
     """A line of a log as it is kept."""
-    return {"session_id": session_id, "seq": seq, "line": line, "day": day()}
+    return {"session_id": session_id, "seq": seq, "line": line}
 
 
 def check_revision(now: SessionRecord, worked_out_from: SessionRecord) -> None:

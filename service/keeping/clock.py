@@ -6,10 +6,12 @@ import sqlite3
 import time
 from typing import Any
 
-from sqlalchemy import Connection, Double, select
+from sqlalchemy import BigInteger, Connection, Double, select
 from sqlalchemy.ext.compiler import compiles
 from sqlalchemy.sql.compiler import SQLCompiler
 from sqlalchemy.sql.functions import FunctionElement
+
+DAY_S = 86_400
 
 
 class Now(FunctionElement[float]):
@@ -17,6 +19,13 @@ class Now(FunctionElement[float]):
 
     inherit_cache = True
     type = Double()
+
+
+class Today(FunctionElement[int]):
+    """Number of the day (Unix time, UTC) by the same clock."""
+
+    inherit_cache = True
+    type = BigInteger()
 
 
 @compiles(Now)
@@ -27,6 +36,16 @@ def _of_server(_: Now, __: SQLCompiler, **___: Any) -> str:
 @compiles(Now, "sqlite")
 def _of_machine(_: Now, __: SQLCompiler, **___: Any) -> str:
     return "unix_time()"
+
+
+@compiles(Today)
+def _day_of_server(_: Today, __: SQLCompiler, **___: Any) -> str:
+    return f"CAST(floor(extract(epoch FROM clock_timestamp()) / {DAY_S}) AS bigint)"
+
+
+@compiles(Today, "sqlite")
+def _day_of_machine(_: Today, __: SQLCompiler, **___: Any) -> str:
+    return f"CAST(unix_time() / {DAY_S} AS INTEGER)"  # whose own floor is not everywhere
 
 
 def tell_time(connection: sqlite3.Connection) -> None:

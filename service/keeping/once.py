@@ -14,7 +14,7 @@ from secrets import token_hex
 from sqlalchemy import Connection, Delete, delete, func, insert, literal, select, text
 
 from service.errors import Kind, Refused
-from service.keeping.partitions import day
+from service.keeping.clock import Today
 from service.keeping.tables import audit_lines, secrets, sessions, used_proofs
 from service.keeping.urls import file_of
 
@@ -50,7 +50,7 @@ def change(connection: Connection, room: int = LINE_BYTES) -> None:
         raise OSError(errno.ENOSPC, os.strerror(errno.ENOSPC))
     undone = connection.begin_nested()
     line = literal(token_hex(LINE_BYTES // 2))  # at random, as it may be compressed
-    of_any = select(sessions.c.session_id, literal(0), line, literal(day())).limit(1)
+    of_any = select(sessions.c.session_id, literal(0), line, Today()).limit(1)
     connection.execute(insert(audit_lines).from_select(["session_id", "seq", "line", "day"], of_any))
     undone.rollback()
     connection.execute(_CHANGED, {"value": token_hex(min(room, MOST_ROOM) // 2)})

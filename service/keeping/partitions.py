@@ -1,6 +1,7 @@
 """The audit log in PostgreSQL, in a part for each day: to forget a day is to drop its part, not to delete its lines.
 
-A line is put into the part of the day on which it is written (UTC). What was there before the log had parts is the part
+A line is put into the part of the day on which it is written (UTC), by the database's clock: a gateway whose own is set
+to another day finds its part all the same. What was there before the log had parts is the part
 of day 0. A part can be dropped when no session whose log can still be read has a line in it.
 """
 
@@ -8,18 +9,17 @@ from __future__ import annotations
 
 import logging
 import re
-import time
 from datetime import UTC, datetime
 
-from sqlalchemy import Connection, TextClause, text
+from sqlalchemy import Connection, TextClause, select, text
 from sqlalchemy.exc import DBAPIError
 
 from robosac.faults import describe
 from service.keeping import migrations
+from service.keeping.clock import DAY_S, Today
 
 logger = logging.getLogger(__name__)
 
-DAY_S = 86_400
 AHEAD = 3
 """Days after today for which there are parts already."""
 LOCK_MS = 50
@@ -30,9 +30,9 @@ BEFORE = "audit_lines_before"
 _PARTS = text("SELECT inhrelid::regclass::text FROM pg_inherits WHERE inhparent = 'audit_lines'::regclass ORDER BY 1")
 
 
-def day(moment: float | None = None) -> int:
-    """Number of a day (Unix time); by default today."""
-    return int((time.time() if moment is None else moment) // DAY_S)
+def day(moment: float) -> int:
+    """Number of a moment's day (Unix time)."""
+    return int(moment // DAY_S)
 
 
 def are_there(connection: Connection) -> bool:
@@ -48,7 +48,7 @@ def make_ahead(connection: Connection) -> None:
     """
     if not are_there(connection):
         return
-    today = day()
+    today: int = connection.execute(select(Today())).scalar_one()
     wanted = {name_of(number): number for number in range(today, today + AHEAD + 1)}
     if set(connection.execute(_PARTS).scalars()) >= wanted.keys():
         return

@@ -15,6 +15,7 @@ from typing import Any
 from sqlalchemy import Column, Delete, Select, Table, Update, delete, exists, select, tuple_, update
 
 from service.keeping import partitions
+from service.keeping.clock import DAY_S
 from service.keeping.database import Database
 from service.keeping.rows import ENDED
 from service.keeping.tables import audit_lines, kept_messages, sessions
@@ -33,7 +34,7 @@ async def purge(database: Database, moment: float, *forget: Callable[[str], None
     Each of ``forget`` is told of each. A log that is half gone is not shown any more.
     """
     has_parts = await database.write(partitions.are_there)
-    in_parts = has_parts and moment < time.time() - partitions.DAY_S
+    in_parts = has_parts and moment < time.time() - DAY_S
     ended = select(sessions.c.session_id).where(ENDED, sessions.c.touched_at < moment)
     if in_parts:
         while some := await _ids(database, ended.where(sessions.c.token_ids != "{}").limit(SESSIONS_TOGETHER)):
@@ -76,7 +77,7 @@ async def _drop_parts(database: Database, moment: float) -> None:
         while await _done(database, _lines([session_id])):
             pass
     # all other lines are of parts that are still there
-    gone = ENDED, purged, sessions.c.touched_at < partitions.day(moment) * partitions.DAY_S, ~exists().where(its_line)
+    gone = ENDED, purged, sessions.c.touched_at < partitions.day(moment) * DAY_S, ~exists().where(its_line)
     some = select(sessions.c.session_id).where(*gone).limit(BARE_TOGETHER).scalar_subquery()
     while await _done(database, delete(sessions).where(sessions.c.session_id.in_(some))):
         pass

@@ -23,7 +23,7 @@ from service.errors import (
     TokenReplaced,
 )
 from service.keeping import clock, migrations, once, partitions, purging, usage
-from service.keeping.appending import Change, append, check_revision, check_unused, line_row, renewal
+from service.keeping.appending import ADD_LINE, Change, append, check_revision, check_unused, line_row, renewal
 from service.keeping.database import connect
 from service.keeping.limits import Limits
 from service.keeping.patience import Patience
@@ -100,7 +100,7 @@ class Store:
             line = draft.made
             kept = replace(record, audit_seq=1, audit_head=digest(line), kept_bytes=len(line.encode()))
             connection.execute(ADD, columns(kept, *FIELDS))
-            connection.execute(insert(audit_lines), line_row(kept.session_id, 1, line))
+            connection.execute(ADD_LINE, line_row(kept.session_id, 1, line))
             return kept
 
         await asyncio.to_thread(draft.write)

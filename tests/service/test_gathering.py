@@ -6,7 +6,7 @@ import msgpack
 import numpy as np
 
 from robosac import wire
-from tests.service.conftest import EGO, TEAM, problem, serve
+from tests.service.conftest import EGO, MSGPACK, TEAM, problem, serve
 
 
 async def test_vehicles_send_their_own_messages(served, messages):
@@ -24,6 +24,54 @@ async def test_the_ego_does_not_wait_longer_than_for_all(served, messages):
         await served.teammate(session, name).send(0, messages[name])
     answer = await served.ego(session).ask(0, messages[EGO])
     assert answer.timings_ms["gather"] < 1000
+
+
+async def test_an_ego_that_hangs_up_is_not_waited_for(messages):
+    """Its next request would wait behind it for all of the time."""
+    async with serve() as served:
+        session = await served.open(gather_ms=15_000)
+        gone, sent = asyncio.Event(), []
+        first = asyncio.create_task(post_until(gone, served, session, wire.pack_message(0, EGO, messages[EGO]), sent))
+        for name in TEAM[1:]:
+            await served.teammate(session, name).send(0, messages[name])
+        await asyncio.sleep(0.1)
+        assert not first.done()
+        gone.set()
+        await first
+        assert sent[0]["status"] == 400
+        assert b"problem:hung-up" in sent[1]["body"]
+        await served.teammate(session, TEAM[0]).send(0, messages[TEAM[0]])
+        again = await served.ego(session).ask(0, messages[EGO])
+        assert again.timings_ms["gather"] < 5000
+        assert "missing" not in {entry.reason for entry in again.rejected.values()}
+
+
+async def post_until(gone, served, session, body, sent):
+    """Post an ego's message as a server would that hears of hanging up; what is answered is put into ``sent``."""
+    told = iter([{"type": "http.request", "body": body, "more_body": False}])
+    headers = {"host": "gateway", **MSGPACK, "authorization": f"Bearer {session.ego_token}"}
+    scope = {
+        "type": "http",
+        "http_version": "1.1",
+        "method": "POST",
+        "scheme": "http",
+        "path": f"/v1/sessions/{session.session_id}/messages",
+        "query_string": b"",
+        "headers": [(name.lower().encode(), value.encode()) for name, value in headers.items()],
+        "client": ("127.0.0.1", 1),
+        "server": ("gateway", 80),
+    }
+
+    async def receive():
+        if (message := next(told, None)) is None:
+            await gone.wait()
+            return {"type": "http.disconnect"}
+        return message
+
+    async def send(message):
+        sent.append(message)
+
+    await served.http._transport.app(scope, receive, send)
 
 
 async def test_missing_teammates_are_waited_for_and_then_left_out(served, messages):

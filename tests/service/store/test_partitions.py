@@ -12,12 +12,17 @@ from sqlalchemy import text
 
 from service.errors import SessionInUse, SessionOver, StoreUnavailable
 from service.keeping import partitions
+from service.keeping.clock import DAY_S
 from service.keeping.database import connect
 from service.keeping.limits import Limits
-from service.keeping.partitions import AHEAD, DAY_S, day, name_of
+from service.keeping.partitions import AHEAD, day, name_of
 from service.keeping.store import Store
 from tests.service.store.conftest import THE_END, added, all_of, check_chain, decided, note, opened
 from tests.service.store.test_database import INI
+
+
+def today():
+    return day(time.time())
 
 
 @pytest.fixture
@@ -73,9 +78,9 @@ async def test_there_are_parts_for_today_and_the_next_days(url):
         sid = await added(store)
         await decided(store, sid, 1)
         await check_chain(store, sid)
-    today = [name_of(day() + ahead) for ahead in range(AHEAD + 1)]
-    assert await parts(url) == sorted([*today, partitions.BEFORE])
-    assert (await run(url, f"SELECT count(*) FROM {today[0]}"))[0][0] == 2
+    days = [name_of(today() + ahead) for ahead in range(AHEAD + 1)]
+    assert await parts(url) == sorted([*days, partitions.BEFORE])
+    assert (await run(url, f"SELECT count(*) FROM {days[0]}"))[0][0] == 2
 
 
 async def test_what_was_there_before_stays_and_the_log_goes_on(url):
@@ -115,7 +120,7 @@ async def test_what_was_there_before_stays_and_the_log_goes_on(url):
 
 
 async def test_a_day_goes_as_a_whole_once_nobody_can_read_its_logs(url):
-    now, old = time.time(), day() - 9
+    now, old = time.time(), today() - 9
     async with opened(url) as store:
         ended, other, open_one = [await added(store, number) for number in range(3)]
         for sid in (ended, other):
@@ -144,7 +149,7 @@ async def test_a_day_goes_as_a_whole_once_nobody_can_read_its_logs(url):
 
 async def test_many_sessions_of_a_day_go_a_few_at_a_time(url, monkeypatch):
     monkeypatch.setattr("service.keeping.purging.BARE_TOGETHER", 10)
-    store, old, now = Store(url, limits=Limits(statement_s=0.5)), day() - 9, time.time()
+    store, old, now = Store(url, limits=Limits(statement_s=0.5)), today() - 9, time.time()
     try:
         await store.start()
         for number in range(100):
@@ -164,7 +169,7 @@ async def test_many_sessions_of_a_day_go_a_few_at_a_time(url, monkeypatch):
 
 
 async def test_parts_go_where_logs_are_kept_for_less_than_a_day(url):
-    now, old = time.time(), day() - 2
+    now, old = time.time(), today() - 2
     async with opened(url) as store:
         sid = await added(store)
         await store.end(sid, THE_END)
@@ -177,7 +182,7 @@ async def test_parts_go_where_logs_are_kept_for_less_than_a_day(url):
 
 async def test_a_line_that_is_written_while_its_day_is_about_to_go_is_kept(url, monkeypatch):
     monkeypatch.setattr(partitions, "LOCK_MS", 5000)
-    old = day() - 9
+    old = today() - 9
     async with opened(url) as store:
         sid = await added(store)
         await written_on(url, "nobody", old)
@@ -190,19 +195,34 @@ async def test_a_line_that_is_written_while_its_day_is_about_to_go_is_kept(url, 
 async def test_two_may_forget_the_same_days_at_once(url):
     async with opened(url) as one, opened(url) as other:
         for number in range(2, 6):
-            await written_on(url, "nobody", day() - number)
+            await written_on(url, "nobody", today() - number)
         await asyncio.gather(*(store.purge(time.time() - DAY_S) for store in (one, other, one)))
-        assert name_of(day() - 2) not in await parts(url)
+        assert name_of(today() - 2) not in await parts(url)
 
 
 async def test_readiness_makes_the_part_of_a_day_that_has_none(url):
     async with opened(url) as store:
         sid = await added(store)
-        await run(url, "DELETE FROM audit_lines", f"DROP TABLE {name_of(day())}")  # as after a leap of the clock
+        await run(url, "DELETE FROM audit_lines", f"DROP TABLE {name_of(today())}")  # as after a leap of the clock
         with pytest.raises(StoreUnavailable):
             await store.log(sid, note())
         await store.ping()
         await store.log(sid, note())
+
+
+@pytest.mark.parametrize("days", [-400, 5, 400])
+async def test_a_gateway_whose_clock_is_set_to_another_day_keeps_lines(url, days, monkeypatch):
+    right = time.time
+    async with opened(url) as store:
+        sid = await added(store)
+        monkeypatch.setattr(time, "time", lambda: right() + days * DAY_S)
+        await decided(store, sid, 1)
+        await added(store, 1)
+        await store.ping()
+        await check_chain(store, sid)
+    monkeypatch.undo()
+    assert name_of(today() + days) not in await parts(url)
+    assert (await run(url, f"SELECT count(*) FROM {name_of(today())}"))[0][0] == 3
 
 
 @pytest.mark.parametrize(
@@ -211,7 +231,7 @@ async def test_readiness_makes_the_part_of_a_day_that_has_none(url):
     ids=["backup", "vacuum", "change"],
 )
 async def test_a_day_begins_while_somebody_has_the_log_locked(url, mode, made, caplog):
-    last = name_of(day() + AHEAD)
+    last = name_of(today() + AHEAD)
     other = await asyncpg.connect(url.replace("+asyncpg", ""))
     try:
         async with opened(url) as store:
@@ -237,7 +257,7 @@ async def test_a_day_begins_while_somebody_has_the_log_locked(url, mode, made, c
 async def test_without_a_part_for_today_there_is_no_start(url):
     async with opened(url):
         pass
-    await run(url, f"DROP TABLE {name_of(day())}")
+    await run(url, f"DROP TABLE {name_of(today())}")
     other = await asyncpg.connect(url.replace("+asyncpg", ""))
     try:
         async with other.transaction():
@@ -255,10 +275,10 @@ async def test_a_part_that_is_attached_is_as_the_others(url):
     async with opened(url) as store:
         sid = await added(store)
         keys = "SELECT count(*) FROM pg_constraint WHERE conrelid = '{}'::regclass AND contype = ANY('{{p,f}}'::char[])"
-        for name in (name_of(day()), name_of(day() + AHEAD)):
+        for name in (name_of(today()), name_of(today() + AHEAD)):
             assert (await run(url, keys.format(name)))[0][0] == 2  # its key, and that of its session
         await run(url, f"DELETE FROM sessions WHERE session_id = '{sid}'")
-        assert (await run(url, f"SELECT count(*) FROM {name_of(day())}"))[0][0] == 0
+        assert (await run(url, f"SELECT count(*) FROM {name_of(today())}"))[0][0] == 0
 
 
 async def test_a_part_of_young_lines_is_kept_though_nobody_reads_it(url):
@@ -267,7 +287,7 @@ async def test_a_part_of_young_lines_is_kept_though_nobody_reads_it(url):
         await store.end(sid, THE_END)
         await run(url, f"UPDATE sessions SET touched_at = {time.time() - 3 * DAY_S}")
         await store.purge(time.time() - 2 * DAY_S)
-        assert name_of(day()) in await parts(url)
+        assert name_of(today()) in await parts(url)
         kept = await store.get(sid)
         assert kept.purging  # and goes with the day
 
