@@ -29,6 +29,7 @@ from robosac.defenses import Defense, build
 from robosac.detectors import Detector
 from robosac.extras import need
 from robosac.figures import check_film, need_figures
+from robosac.files import is_special
 from robosac.recording.reading import RecordedSession, RecordingError, sessions
 
 app = typer.Typer(no_args_is_help=True, add_completion=False, help=__doc__)
@@ -54,6 +55,9 @@ class Form(StrEnum):
     VIDEO = "video"
     CPM = "cpm"
     ROS2 = "ros2"
+
+
+SUFFIXES = {Form.RERUN: ".rrd", Form.CPM: ".jsonl", Form.ROS2: ".mcap"}
 
 
 @app.command()
@@ -136,8 +140,8 @@ def export(
     to: Annotated[
         Form,
         typer.Option(
-            help="rerun: an .rrd file; pictures: a folder with one of each frame; video: .gif, or .mp4 where there is "
-            "ffmpeg; cpm: perceived objects as JSON Lines; ros2: MCAP with messages of ROS 2 alone."
+            help="rerun: .rrd; pictures: a folder with one of each frame; video: .gif, or .mp4 where there is ffmpeg; "
+            "cpm: perceived objects as JSON Lines, .jsonl; ros2: .mcap with messages of ROS 2 alone."
         ),
     ],
     out: Annotated[Path, typer.Option(help="The file, or for pictures the folder.")],
@@ -149,7 +153,7 @@ def export(
 
     _check_form(to, out)
     if to is not Form.PICTURES:
-        check_file(out, "--out", force)
+        check_file(out, "--out", force, *(file.iterdir() if file.is_dir() else [file]))
     (chosen,) = _with_frames([_one(_read(file), session)])
     if to is Form.PICTURES:
         make_folder(out, "--out", force, *(f"{frame.number:06d}.png" for frame in chosen.frames[:1]))
@@ -170,7 +174,7 @@ def export(
 
 
 def _check_form(to: Form, out: Path) -> None:
-    """Refuse before any work what cannot be written here."""
+    """Refuse before any work what cannot be written here, or would have a name by which nobody opens it."""
     if to is Form.RERUN:
         need("rerun", "files of rerun")
     elif to is Form.ROS2:
@@ -180,6 +184,8 @@ def _check_form(to: Form, out: Path) -> None:
     elif to is Form.VIDEO:
         with blaming("--out", ValueError):
             check_film(out)
+    if (suffix := SUFFIXES.get(to)) and out.suffix != suffix and not is_special(out):
+        raise typer.BadParameter(f"{out}: the name has to end in {suffix}", param_hint="--out")
 
 
 def _read(file: Path) -> list[RecordedSession]:

@@ -25,7 +25,8 @@ from typing import Any, Generic, TypeVar
 
 T = TypeVar("T")
 
-_REFERENCE = re.compile(r"[\w.]+:[\w.]+")
+_PLACE = r"[^\W\d]\w*(\.[^\W\d]\w*)*"
+_REFERENCE = re.compile(f"{_PLACE}:{_PLACE}")
 
 
 def classes(package: str) -> Iterator[type[Any]]:

@@ -26,13 +26,18 @@ if TYPE_CHECKING:
 
 PLAN, CHECK = "capacity", "check"
 """Names of the reports: each with .json, and as a page with .md."""
+MOST_VEHICLES = 100_000_000
 VEHICLES_OF_A_CROSSING = 10
 """On average, at the peak."""
+_OF_CHECKS = {"report", "check", "out", "force"}
 
 
 def main(  # the options of a command line
+    context: typer.Context,
     report: Annotated[Path, typer.Argument(help="What `robosac load-test --out` wrote: load_test.json.")],
-    vehicles: Annotated[int, typer.Option(min=1, help="Vehicles at the peak, each with a session.")] = 100_000,
+    vehicles: Annotated[
+        int, typer.Option(min=1, max=MOST_VEHICLES, help="Vehicles at the peak, each with a session.")
+    ] = 100_000,
     rate: Annotated[float, typer.Option(min=1.0, help="Frames a second of a vehicle.")] = 5.0,
     teammates: Annotated[int, typer.Option(min=1, help="Teammates of a vehicle.")] = 5,
     attacked: Annotated[float, typer.Option(min=0, max=1, help="Share of the sessions with an attacker.")] = 0.05,
@@ -64,6 +69,8 @@ def main(  # the options of a command line
     With --check it ends with 1 where the model is further off than 20 %.
     """
     need("simpy", "simulations")
+    if check:
+        _refuse_other_options(context)
     console = Console()
     name = CHECK if check else PLAN
     trial.make_folder(out, "--out", f"{name}.json", force)
@@ -93,6 +100,14 @@ def main(  # the options of a command line
     if not all(one.holds for one in found):
         console.print(f"[red]The model is further off than {WITHIN:.0%}.[/red]")
         sys.exit(1)
+
+
+def _refuse_other_options(context: typer.Context) -> None:
+    """A check takes everything from the report; what is asked for besides would be passed over without a word."""
+    for option in context.command.params:
+        source = context.get_parameter_source(option.name or "")
+        if source is not None and source.name == "COMMANDLINE" and option.name not in _OF_CHECKS:
+            raise typer.BadParameter("--check takes all figures from the report", param_hint=option.opts[0])
 
 
 def _planned(

@@ -23,6 +23,8 @@ frame costs by the load test:
 from __future__ import annotations
 
 import math
+from bisect import bisect_left
+from collections.abc import Callable
 from dataclasses import asdict, dataclass
 from typing import Any
 
@@ -144,8 +146,9 @@ def needs_of(costs: Costs, scenario: Scenario, machine: Machine, sessions: int |
     sessions = math.floor(most_hz / scenario.rate_hz) if sessions is None else sessions
     if sessions < 1:
         own = costs.mixed(costs.latency_ms, scenario.teammates, scenario.attacked)
-        wanted = f"{scenario.rate_hz:g} frames a second within {scenario.budget_ms:g} ms"
-        raise NoneInTime(f"no process answers {wanted}: one takes {own:.3g} ms by itself")
+        wanted = f"{scenario.rate_hz:g} frames a second within {scenario.budget_ms:g} ms: one takes {own:.3g} ms"
+        late = f", and if they came at random, more than {scenario.late:.2g} of them would wait too long for others"
+        raise NoneInTime(f"no process answers {wanted} by itself{late if patience and sessions == 0 else ''}")
     if scenario.message_bytes is not None:
         sent = scenario.message_bytes * (1 + scenario.teammates)
     inward, outward = (
@@ -192,6 +195,9 @@ def _pool(scenario: Scenario, service: queueing.Service, patience: float, enough
     """The least number of servers at which a pool is no busier, and no later, than it may be."""
     rate = scenario.frames_s / 1e3
     least = max(1, math.ceil(rate * service.mean / scenario.busy))
-    while least < enough and queueing.pool_late(rate, service, least, patience) > scenario.late:
-        least += 1
-    return least
+    if least >= enough:
+        return least
+    in_time: Callable[[int], bool] = lambda servers: (  # noqa: E731
+        queueing.pool_late(rate, service, servers, patience) <= scenario.late
+    )
+    return least + bisect_left(range(least, enough), True, key=in_time)

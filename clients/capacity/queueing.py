@@ -41,15 +41,13 @@ def one_server_wait(rate: float, service: Service) -> float:
 def erlang_c(servers: int, load: float) -> float:
     r"""The share of arrivals that have to wait, M/M/c, for a load of :math:`a = \lambda E[S]`.
 
-    :math:`C = \frac{B}{1 - (a / c)(1 - B)}` with Erlang's loss formula by :math:`B_k = a B_{k-1} / (k + a B_{k-1})`,
-    :math:`B_0 = 1`. Source: R. B. Cooper, Introduction to Queueing Theory, 2nd edition, 1981, section 3.5. It is 1
-    where :math:`a \geq c`.
+    :math:`C = \frac{B}{1 - (a / c)(1 - B)}` with Erlang's loss formula :math:`B = P(N = c) / P(N \leq c)` of a Poisson
+    number with mean :math:`a`. Source: R. B. Cooper, Introduction to Queueing Theory, 2nd edition, 1981, section 3.5.
+    It is 1 where :math:`a \geq c`.
     """
     if load >= servers:
         return 1.0
-    loss = 1.0
-    for k in range(1, servers + 1):
-        loss = load * loss / (k + load * loss)
+    loss = math.exp(poisson.logpmf(servers, load) - poisson.logcdf(servers, load))
     return loss / (1 - load / servers * (1 - loss))
 
 

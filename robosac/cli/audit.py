@@ -158,7 +158,7 @@ def report(
     2 if the vehicle was never in the session.
     """
     if out is not None:
-        check_file(out, "--out", force)
+        check_file(out, "--out", force, file)
     try:
         with blaming("FILE", OSError), _open_again_and_again(file) as lines:
             log = _Counted(lines_in(lines))

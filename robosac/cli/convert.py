@@ -26,7 +26,7 @@ def run(
 ) -> None:
     """Convert a published V2X-Sim checkpoint into a weights file. Nothing in the checkpoint is executed."""
     check_known([fusion], FUSIONS, "--fusion")
-    check_file(out, "OUT", force)
+    check_file(out, "OUT", force, checkpoint)
     with blaming("CHECKPOINT", WeightsError), blaming("OUT", OSError):
         recipe = write_weights(read_state(checkpoint), fusion, out)
     typer.echo(f"{out}: {recipe['detector']}, {out.stat().st_size / 1e6:.1f} MB")

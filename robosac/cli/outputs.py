@@ -34,8 +34,12 @@ def tell(console: Console, line: str) -> None:
     console.print(Text(line), soft_wrap=True)
 
 
-def check_file(path: Path, option: str, force: bool) -> None:
-    """Refuse a file that is there already or could not be written; the folder for it is made."""
+def check_file(path: Path, option: str, force: bool, *inputs: Path) -> None:
+    """Refuse a file that is there already or could not be written, and by whatever name one of those that are read; the
+    folder for it is made.
+    """
+    if path.is_file() and any(one.is_file() and path.samefile(one) for one in inputs):
+        raise typer.BadParameter(f"{path} is what is to be read", param_hint=option)
     _refuse_existing(path, option, force)
     with blaming(option, OSError):
         if path.is_dir():

@@ -141,7 +141,7 @@ def comparison(
     """Draw a figure of a comparison as a heat map: a line for each attack, a column for each defence."""
     with blaming("--out", ValueError):
         check_picture(out)
-    check_file(out, "--out", force)
+    check_file(out, "--out", force, table)
     with blaming("TABLE", OSError, TableError), blaming("--column", UnknownColumn):
         heat = read_table(table, column)
     with blaming("--out", OSError, ValueError):

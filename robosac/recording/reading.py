@@ -147,7 +147,7 @@ def sessions(path: Path) -> list[RecordedSession]:
     Raises
     ------
     RecordingError
-        If there is none.
+        If there is none, or two files differ in a frame that both hold.
     OSError
         If a file cannot be read.
     """
@@ -157,15 +157,24 @@ def sessions(path: Path) -> list[RecordedSession]:
     parts: dict[str, list[RecordedFile]] = {}
     for file in sorted(files, key=lambda file: file.frames[0].time_ns if file.frames else 0):
         parts.setdefault(file.opening.session_id, []).append(file)
-    return [
-        RecordedSession(group[0].opening, sorted((f for file in group for f in file.frames), key=_number), group)
-        for group in parts.values()
-    ]
+    return [RecordedSession(group[0].opening, _in_order(group), group) for group in parts.values()]
 
 
-def _number(frame: RecordedFrame) -> int:
-    """Its place among those of its session, which several processes may have answered by turns."""
-    return frame.number
+def _in_order(files: Sequence[RecordedFile]) -> list[RecordedFrame]:
+    """Frames of a session by their numbers: several processes may have answered them by turns. Of a file there may be a
+    copy in the folder.
+    """
+    found: dict[int, RecordedFrame] = {}
+    for frame in (frame for file in files for frame in file.frames):
+        other = found.setdefault(frame.number, frame)
+        if other is not frame and _shown(other) != _shown(frame):
+            both = " and ".join(dict.fromkeys(str(each.file.path) for each in (other, frame)))
+            raise RecordingError(f"frame {frame.number} is recorded twice, and not as the same, in {both}")
+    return [found[number] for number in sorted(found)]
+
+
+def _shown(frame: RecordedFrame) -> tuple[int, str, str]:
+    return frame.time_ns, frame.decided.model_dump_json(), frame.answer.model_dump_json()
 
 
 def _of_folder(folder: Path) -> list[RecordedFile]:

@@ -14,7 +14,7 @@ from typer.testing import CliRunner
 from clients.fleet import FleetOptions, run_fleet
 from clients.local_gateway import GatewayProcess
 from clients.playing import play_against
-from clients.record import app
+from clients.record import SUFFIXES, app
 from robosac import cli
 from robosac.recording.reading import RecordingError, sessions
 from robosac.recording.truth import Truth
@@ -133,29 +133,50 @@ def test_replay_ends_with_1_only_if_the_recorded_defence_differs(path, detector,
         (("replay", "{path}", "--url", "http://127.0.0.1:9", "--detector", "x"), "the gateway has its own"),
         (("export", "{path}", "--to", "video", "--out", "{folder}/x.avi"), "ends with .gif or .mp4, not with .avi"),
         (("export", "{path}", "--to", "video", "--out", "{folder}/x.mp4"), "ffmpeg is not installed"),
-        (("export", "{path}", "--to", "cpm", "--out", "{path}"), "is there already; --force"),
+        (("export", "{path}", "--to", "cpm", "--out", "{folder}/there.jsonl"), "is there already; --force"),
+        (("export", "{path}", "--to", "ros2", "--out", "{path}", "--force"), "is what is to be read"),
+        (("export", "{path}", "--to", "ros2", "--out", "{folder}/link.mcap", "--force"), "is what is to be read"),
+        (("export", "{path.parent}", "--to", "ros2", "--out", "{path}", "--force"), "is what is to be read"),
+        (("export", "{path}", "--to", "rerun", "--out", "{folder}/x.mcap"), "has to end in .rrd"),
+        (("export", "{path}", "--to", "cpm", "--out", "{folder}/x"), "has to end in .jsonl"),
+        (("export", "{path}", "--to", "ros2", "--out", "{folder}/x.bag"), "has to end in .mcap"),
         (
-            ("export", "{path}", "--to", "cpm", "--out", "{folder}/x", "--session", "nonesuch"),
+            ("export", "{path}", "--to", "cpm", "--out", "{folder}/x.jsonl", "--session", "nonesuch"),
             "must choose one of 5e5e5e5e",
         ),
     ],
 )
 def test_what_cannot_be_done_is_said_before_it_is_begun(words, why, path, tmp_path, monkeypatch):
     monkeypatch.setenv("PATH", str(tmp_path))  # no ffmpeg
+    (tmp_path / "there.jsonl").touch()
+    (tmp_path / "link.mcap").symlink_to(path)
+    before = path.read_bytes()
     status, said = run(*(word.format(path=path, folder=tmp_path) for word in words))
     assert status == 2
     assert why in said
+    assert path.read_bytes() == before
+
+
+def test_a_copy_beside_a_recording_is_no_second_time(path, detector, recorded_moments, tmp_path):
+    for name in ("a.mcap", "b.mcap"):
+        (tmp_path / name).write_bytes(path.read_bytes())
+    (session,) = sessions(tmp_path)
+    assert [frame.number for frame in session.frames] == [0, 1, 2]
+    rewrite(path, tmp_path / "b.mcap", {"deadline_met": False})
+    with pytest.raises(RecordingError, match=r"frame 0 is recorded twice, and not as the same, in .*a.mcap and .*b"):
+        sessions(tmp_path)
 
 
 @pytest.mark.parametrize(("form", "package"), [("pictures", "matplotlib"), ("ros2", "rosbags"), ("rerun", "rerun")])
 def test_a_form_that_needs_an_extra_is_refused_before_any_work(form, package, path, tmp_path, monkeypatch):
     monkeypatch.setitem(sys.modules, package, None)
-    words = ["record", "export", path, "--to", form, "--out", tmp_path / "out"]
+    out = tmp_path / f"out{SUFFIXES.get(form, '')}"
+    words = ["record", "export", path, "--to", form, "--out", out]
     result = CliRunner().invoke(cli.app, list(map(str, words)))
     assert result.exit_code == 2
     assert result.output.startswith(f"Error: {package} is not installed, for ")
     assert "frames" not in result.output
-    assert not (tmp_path / "out").exists()
+    assert not out.exists()
 
 
 def test_a_defence_that_does_not_ship_has_to_be_named(detector, recorded_moments, tmp_path):

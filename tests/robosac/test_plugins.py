@@ -100,6 +100,7 @@ def test_an_argument_follows_the_name_where_the_kind_takes_one():
     ("text", "complaint"),
     [
         ("nonesuch", "no shape 'nonesuch': give one of sized, square, wall, or module:callable$"),
+        ("square:2", "no shape 'square:2': give one of sized, square, wall, or module:callable$"),
         ("wall", r"wall made no shape but a house.others.Wall, which lacks area \(Square metres.\)$"),
         ("house.others:Wall", r"others:Wall made no shape but .* which lacks area"),
         ("house.others:fail", r"^house.others:fail: KeyError: 'two\\nlines'$"),

@@ -62,14 +62,25 @@ def test_a_check_that_could_compare_nothing_says_so(report):
     assert "no load to compare with" in said(result)
 
 
+@pytest.mark.parametrize("option", ["--city", "--vehicles=9", "--budget-ms=200"])
+def test_what_a_check_would_pass_over_is_refused(report, option):
+    result = run("--check", report, option)
+    assert result.exit_code == 2
+    assert f"for {option.partition('=')[0]}: --check takes all figures from the report" in said(result)
+
+
+def test_a_fleet_may_not_be_larger_than_mankind_has_vehicles(report):
+    assert "100000000" in said(run(report, "--vehicles", 10**20))
+
+
 @pytest.mark.parametrize("cost", ["gateway_cpu_ms", "client_cpu_ms"])
-@pytest.mark.parametrize("options", [(), ("--check",)])
+@pytest.mark.parametrize("options", [("--frames", 10), ("--check",)])
 def test_without_processor_time_nothing_is_told(report, options, cost, tmp_path):
     told = json.loads(report.read_text())
     for load in told["loads"]:
         load["used_a_frame"][cost] = None
     report.write_text(json.dumps(told))
-    result = run(report, *options, "--frames", 10, "--out", tmp_path / "out")
+    result = run(report, *options, "--out", tmp_path / "out")
     assert result.exit_code == 2
     assert f"the report has no {cost}" in said(result)
     assert not list((tmp_path / "out").iterdir())

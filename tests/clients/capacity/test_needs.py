@@ -5,7 +5,7 @@ import pytest
 from clients.capacity.checking import MOST_BUSY, OVERLAP, checks, predicted_fps
 from clients.capacity.costs import costs_of, others_at_work
 from clients.capacity.needs import Machine, Scenario, needs_of, on_the_wire, patience_ms
-from clients.capacity.queueing import one_server_late
+from clients.capacity.queueing import one_server_late, pool_late
 from clients.capacity.report import MeasuredPace, Report
 from tests.clients.capacity.reports import a_report
 
@@ -58,6 +58,19 @@ def test_processes_are_no_busier_on_average_than_they_may_be():
         for processes in placed.values():
             assert 5 * service.mean / processes <= 0.7 + 1e-9
         assert placed["even"] <= placed["hashed"]
+
+
+def test_a_pool_is_the_least_that_is_in_time_however_large_the_fleet():
+    service = COSTS.service(5, 0.0)
+    for vehicles in (10, 20, 40, 700):
+        scenario = replace(CITY, vehicles=vehicles, budget_ms=120)
+        found, patience = needs_of(COSTS, scenario, MACHINE).processes["pool"], patience_ms(COSTS, scenario)
+        busy = [scenario.frames_s * service.mean / 1e3 / servers > 0.7 for servers in (found, found - 1 or 0.1)]
+        late = [pool_late(scenario.frames_s / 1e3, service, servers, patience) > 0.01 for servers in (found, found - 1)]
+        assert (busy[0], late[0]) == (False, False)
+        assert busy[1] or late[1]
+    huge = needs_of(COSTS, replace(CITY, vehicles=100_000_000), MACHINE).processes
+    assert huge["pool"] <= huge["even"]
 
 
 def test_what_breaks_first_follows_the_scenario():
