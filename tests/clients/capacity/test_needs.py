@@ -62,13 +62,18 @@ def test_processes_are_no_busier_on_average_than_they_may_be():
 
 def test_a_pool_is_the_least_that_is_in_time_however_large_the_fleet():
     service = COSTS.service(5, 0.0)
-    for vehicles in (10, 20, 40, 700):
-        scenario = replace(CITY, vehicles=vehicles, budget_ms=120)
+    by_lateness = 0
+    for vehicles in (3, 11, 23, 40, 700):
+        scenario = replace(CITY, vehicles=vehicles, late=0.003, busy=0.95)
         found, patience = needs_of(COSTS, scenario, MACHINE).processes["pool"], patience_ms(COSTS, scenario)
-        busy = [scenario.frames_s * service.mean / 1e3 / servers > 0.7 for servers in (found, found - 1 or 0.1)]
-        late = [pool_late(scenario.frames_s / 1e3, service, servers, patience) > 0.01 for servers in (found, found - 1)]
-        assert (busy[0], late[0]) == (False, False)
-        assert busy[1] or late[1]
+        rate, late = scenario.frames_s / 1e3, []
+        for servers in (found, found - 1):
+            late.append(pool_late(rate, service, servers, patience) > scenario.late)
+        too_few_to_be_idle = found - 1 < rate * service.mean / scenario.busy
+        assert not late[0]
+        assert late[1] or too_few_to_be_idle
+        by_lateness += not too_few_to_be_idle
+    assert by_lateness >= 2
     huge = needs_of(COSTS, replace(CITY, vehicles=100_000_000), MACHINE).processes
     assert huge["pool"] <= huge["even"]
 
