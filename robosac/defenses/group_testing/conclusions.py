@@ -55,7 +55,7 @@ def conclude(found: Findings, answer: Hypothesis) -> None:
                 asked[suspect] = joined, tuple(name for name in joined if name != suspect)
             counting = [lie for lie in lies if enough or lie.counts_as == "ghost"]
             counting = [lie for lie in counting if found.calm or not lie.veiled]
-            counting = _borne_out(found, suspect, counting, others)
+            counting = _borne_out(found, suspect, joined, counting, others)
             found.note(joined, tuple(name for name in joined if name != suspect), counting)
             blamed[suspect] += counting
     for name, lie in _together(found, answer):
@@ -88,13 +88,15 @@ def conclude(found: Findings, answer: Hypothesis) -> None:
             _accuse(found, name, weight, kinds, lies, sum(conflicts.get(name, {}).values()))
 
 
-def _borne_out(found: Findings, suspect: str, lies: Sequence[Lie], others: int) -> list[Lie]:
-    """The lies that count by the word of those who say so; what is doubtful counts as late, which names nobody."""
+def _borne_out(found: Findings, suspect: str, joined: Hypothesis, lies: Sequence[Lie], others: int) -> list[Lie]:
+    """The lies that count by the word of those who say so, and are not another's; what is doubtful counts as late,
+    which names nobody.
+    """
     counting = []
     for lie in lies:
-        word = found.lies.hear(suspect, lie.by, others)
-        if word is not Word.NOTHING:
-            counting.append(lie if word is Word.GOOD else replace(lie, along=True))
+        words = {found.proof(joined, suspect, lie), found.lies.hear(suspect, lie.by, others)}
+        if Word.NOTHING not in words:
+            counting.append(replace(lie, along=True) if Word.DOUBTFUL in words else lie)
     return counting
 
 

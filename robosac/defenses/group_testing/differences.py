@@ -114,6 +114,23 @@ def blame(found: Mapping[str, Sequence[Lie]], joined: Shown) -> dict[str, list[L
     return blamed
 
 
+def persists(lie: Lie, part: Shown, without: Shown) -> bool:
+    """Whether what is wrong in a fusion, and is not ``without`` a suspect, is so in a part of it, too, in which the
+    suspect is fused.
+    """
+    at = lie.place[None]
+    if lie.kind == "moved":
+        nearest = [_nearest(shown, lie.place) for shown in (part, without)]
+        return nearest[0] <= SAME_BOX_M and nearest[0] < nearest[1]
+    drop = float(part.odds_at(at)[0] - without.odds_at(at)[0])
+    return drop >= EFFECT if lie.kind == "ghost" else -drop >= GONE_EFFECT
+
+
+def _nearest(shown: Shown, place: FloatArray) -> float:
+    boxes = shown.boxes[shown.boxes[:, 5] >= PLACED_SCORE, :2]
+    return float(np.hypot(*(boxes - place).T).min(initial=np.inf))
+
+
 def misplaced(joined: Shown, without: Shown, joining: Collection[str]) -> float:
     """How much farther boxes are from where others see the vehicles than they are without those who join.
 

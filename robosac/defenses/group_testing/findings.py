@@ -9,18 +9,20 @@ import numpy as np
 
 from robosac.boxes import FloatArray
 from robosac.defenses.group_testing.claims import SUPPORTS
-from robosac.defenses.group_testing.differences import SAME_LIE_M, effects, gone
+from robosac.defenses.group_testing.differences import SAME_LIE_M, blame, effects, gone, persists
 from robosac.defenses.group_testing.fusions import NOTHING, Fusions
 from robosac.defenses.group_testing.geometry import followed, gone_since
 from robosac.defenses.group_testing.hearing import REACH_M
 from robosac.defenses.group_testing.knowledge import Knowledge
-from robosac.defenses.group_testing.lies import Lies
+from robosac.defenses.group_testing.lies import Lies, Word
 from robosac.defenses.group_testing.objects import Lie
 from robosac.defenses.group_testing.shapes import BLAMING, agreeing, reshaped, to_ask
 from robosac.defenses.protocol import EGO, Difference, Hypothesis
 
 CALM = 0.5
 """From here on the ego counts as steady."""
+GROUPS = 4
+"""Of those without whom a lie has to be there, too."""
 DONE = {"ghost": "invented", "gone": "removed", "moved": "displaced", "reshaped": "reshaped"}
 """What was done to an object, by the kind of a lie."""
 
@@ -113,6 +115,52 @@ class Findings(Fusions):
         if asked not in self._shapes:
             self._shapes[asked] = reshaped(self.shown[joined], self.shown[without], suspects).T.tolist()
         return self._shapes[asked]
+
+    def proof(self, joined: Hypothesis, suspect: str, lie: Lie) -> Word:
+        """What it is worth that a lie of which a suspect's own message says nothing is not there without the suspect.
+
+        Others may make it show only beside the suspect. So a ghost is its own doing once it shows with the suspect
+        alone. What it takes away or moves beside enough others is so once it was without each of them (`Lies.spared`);
+        if it is put right without one of them, too, that is worth nothing. It is doubtful as long as it is not known.
+        """
+        if lie.along or lie.alone or lie.kind == "reshaped" or self.shown[joined].goes_with(suspect, lie):
+            return Word.GOOD
+        frame, without = self.known.memory.frame, self.shown[tuple(name for name in joined if name != suspect)]
+        needed = set[str]()
+        for part in self._proving(joined, suspect, lie):
+            if part in self.shown:
+                others = set(joined).difference(part)
+                if persists(lie, self.shown[part], without):
+                    self.lies.spare(suspect, others, frame)
+                else:
+                    needed |= others
+        left = self.lies.not_spared(suspect, set(joined) - {suspect}, frame)
+        return Word.GOOD if not left else Word.NOTHING if left & needed else Word.DOUBTFUL
+
+    def to_prove(self, joined: Hypothesis) -> Iterator[Hypothesis]:
+        """What is to be decoded to see whether a lie of which the message of its only suspect says nothing shows only
+        beside somebody else.
+        """
+        if joined not in self.shown:
+            return
+        parts = one_out(joined, self.shown)
+        done = {suspect: self.effects(joined, part, (suspect,)) for suspect, part in parts.items()}
+        for suspect, lies in blame(done, self.shown[joined]).items():
+            for lie in lies:
+                if self.proof(joined, suspect, lie) is Word.DOUBTFUL:
+                    left = self.lies.not_spared(suspect, joined, self.known.memory.frame)
+                    yield from (part for part in self._proving(joined, suspect, lie) if left.difference(part))
+
+    @staticmethod
+    def _proving(joined: Hypothesis, suspect: str, lie: Lie) -> list[Hypothesis]:
+        """Parts of a fusion, with a suspect, in which a lie is to be seen: a ghost with the suspect alone; else without
+        each of the others, of many without each of a few groups, as in small fusions one message changes much.
+        """
+        if lie.kind == "ghost":
+            return [(suspect,)]
+        others = [name for name in joined if name != suspect]
+        groups = [others[first::GROUPS] for first in range(min(GROUPS, len(others)))]
+        return [tuple(name for name in joined if name not in group) for group in groups]
 
     def note(self, joined: Hypothesis, without: Hypothesis, lies: Sequence[Lie]) -> None:
         """Note for whoever looks on what is wrong in a fusion by the fault of those whom the other one does without."""

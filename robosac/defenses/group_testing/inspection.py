@@ -92,6 +92,7 @@ class Inspection:
             groups = [self._found.vouching(answer, lie) for lie in lies]
             for group in (*filter(None, groups), *((name,) for name in self._candidates(answer, lies))):
                 yield self._without(answer, *group)
+        yield from self._found.to_prove(answer)
         if len(self._found.team) <= EXACT and self._whole in self._found.shown:
             yield from self._vanished(self._whole)
         again = (*self._straying(self._whole), *self._due(self._whole))
@@ -155,7 +156,8 @@ class Inspection:
         self._suspects = suspects[-2:][::-1] if self._suspects is None else self._suspects
         begun = [name for name in self._suspects if name in suspects]
         for suspect in (*begun, *(name for name in reversed(suspects) if name not in begun))[:2]:
-            asked += [(suspect,), self._with(answer, [suspect])]
+            beside = self._with(answer, [suspect])
+            asked += [(suspect,), beside, *self._found.to_prove(beside)]
         return asked
 
     def _with(self, answer: Hypothesis, others: Collection[str]) -> Hypothesis:

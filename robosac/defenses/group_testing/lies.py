@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import math
-from collections.abc import Mapping, Sequence
+from collections.abc import Collection, Mapping, Sequence
 from dataclasses import dataclass, field
 from enum import Enum
 from typing import Any
@@ -72,6 +72,8 @@ SEARCHED_FRAMES = 25
 """So long a place is not searched again."""
 PLACE_FRAMES = 50
 """See `Rule.times`."""
+SPARED_FRAMES = 10
+"""So long nobody is asked again whether a lie shows only beside it."""
 
 
 class Word(Enum):
@@ -109,6 +111,21 @@ class Lies:
     """Places where a vehicle vanished, and everybody was left out to see who took it away: x, y (world, metres), the
     frame of the session.
     """
+
+    spared: dict[str, dict[str, int]] = field(default_factory=dict)
+    """By teammate: without whom a lie that nobody else tells was still there, and without it not; the frame of the
+    session in which that was seen last.
+    """
+
+    def spare(self, teammate: str, others: Collection[str], frame: int) -> None:
+        """A lie of a teammate is there without these others, too."""
+        if others:
+            self.spared.setdefault(teammate, {}).update(dict.fromkeys(sorted(others), frame))
+
+    def not_spared(self, teammate: str, others: Collection[str], frame: int) -> set[str]:
+        """Of the others those beside whom alone a teammate's lies may show, for all that was seen lately."""
+        known = self.spared.get(teammate, {})
+        return {name for name in others if frame - known.get(name, -SPARED_FRAMES) >= SPARED_FRAMES}
 
     def recently_left_out(self, teammate: str, frame: int) -> bool:
         """Whether it was left out in this frame or one just before."""
@@ -227,8 +244,10 @@ class Lies:
         self.audited.pop(teammate, None)
         self.accusers.pop(teammate, None)
         self.effects.pop(teammate, None)
-        for said in self.accusers.values():
-            said.pop(teammate, None)
+        self.spared.pop(teammate, None)
+        for of in (self.accusers, self.spared):
+            for others in of.values():
+                others.pop(teammate, None)
 
     def to_state(self) -> dict[str, Any]:
         """JSON values that `from_state` reads."""
@@ -244,6 +263,7 @@ class Lies:
             "accusers": self.accusers,
             "effects": self.effects,
             "searched": [list(entry) for entry in self.searched],
+            "spared": self.spared,
         }
 
     @classmethod
@@ -267,6 +287,10 @@ class Lies:
             },
             {str(name): int(frame) for name, frame in state.get("effects", {}).items()},
             [(float(x), float(y), int(frame)) for x, y, frame in state.get("searched", ())],
+            {
+                str(name): {str(other): int(frame) for other, frame in others.items()}
+                for name, others in state.get("spared", {}).items()
+            },
         )
 
 

@@ -55,9 +55,9 @@ def test_who_lies_about_an_object_is_named_and_nobody_else(world, kind):
     assert all(item["log_likelihood_ratio"] > 0 for item in items)
     assert all(item["kinds"] or item["conflicts"] for item in items)
     audited = [item for item in items if item["kinds"]]
-    assert audited
+    assert any(kind in item["kinds"] for item in audited)
     for item in audited:
-        assert {kind} <= set(item["kinds"]) <= {kind, "straying"}
+        assert set(item["kinds"]) <= {kind, "straying", "late"}
         assert item["places"][0] == pytest.approx(PLACE + [world.speed * item["frame"], 0.0], abs=2.0)
 
 
@@ -230,7 +230,7 @@ def test_whoever_tells_a_lie_is_not_cleared_by_another_one_that_it_has_no_part_i
         conclude(each, without)
         assert each.lies.levels.keys() == {LIAR}
         assert each.known.suspicion()[LIAR] > before
-    assert more.known.suspicion()[LIAR] == pytest.approx(found.known.suspicion()[LIAR], abs=0.01)
+    assert more.known.suspicion()[LIAR] == pytest.approx(found.known.suspicion()[LIAR], abs=0.05)
 
 
 def test_a_hole_may_be_somebodys_doing_though_the_ego_misses_the_vehicle_too():
@@ -273,7 +273,7 @@ def test_who_denies_its_own_ghosts_or_says_nothing_of_them_is_named_too(world):
     met = world.play(12)
     assert {name for decision, _ in met for name in decision.named} == {LIAR}
     items = [item for item in met[-1][0].state["memory"]["evidence"][LIAR] if item["test"] == "objects"]
-    assert {kind for item in items for kind in item["kinds"]} == {"veiled"}
+    assert "veiled" in {kind for item in items for kind in item["kinds"]} <= {"veiled", "late"}
 
 
 @pytest.mark.parametrize("denied", [{"": NO}, {"car-2": NO, "car-3": NO, "": -4.0}])
@@ -348,7 +348,9 @@ def test_two_may_lie_together_as_long_as_three_others_than_the_suspect_are_heard
     two = World({"car-2": YES, "car-3": YES}, with_liar(ASIDE, NEAR))
     fused = tuple(name for name in TEAM if name == LIAR or name not in named)
     without = tuple(name for name in fused if name != LIAR)
-    assert set(concluded(two, fused, without, named=named).lies.levels[LIAR]) == {kind}
+    parts = [tuple(name for name in fused if name != other) for other in fused]
+    assert without in parts
+    assert set(concluded(two, fused, *parts, named=named).lies.levels[LIAR]) == {kind}
 
 
 @pytest.mark.parametrize(

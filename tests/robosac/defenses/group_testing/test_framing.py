@@ -1,0 +1,55 @@
+"""Lies that show only beside an honest teammate, which is to be blamed for them."""
+
+import pytest
+
+from robosac.defenses import EGO
+from robosac.defenses.group_testing.lies import SPARED_FRAMES, Lies
+from tests.robosac.defenses.group_testing.one_place import ASIDE, CAR, DRIVING_VEILED, LIAR, NEAR, NO, YES, World
+
+FRAMED, UNSURE = "rsu", -0.5
+OTHERS = ("car-2", "car-3", "car-5")
+DENIED, SUPPORTED = dict.fromkeys((EGO, *OTHERS), NO), dict.fromkeys(OTHERS, YES)
+
+
+def beside(shown, otherwise, *liars):
+    """What fusions of the framed and any of the liars show, and all others."""
+    return lambda subset: shown if FRAMED in subset and set(liars) & set(subset) else otherwise
+
+
+WORLDS = {
+    "ghost": World({**DENIED, LIAR: NO, FRAMED: UNSURE}, beside(CAR, CAR[:0], LIAR), speed=1.0),
+    "ghost of either of two": World({**DENIED, LIAR: NO, FRAMED: UNSURE}, beside(CAR, CAR[:0], LIAR, "car-5"), 1.0),
+    "gone": World({**SUPPORTED, LIAR: YES, FRAMED: UNSURE}, beside(CAR[:0], CAR, LIAR), speed=4.0),
+    "moved": World({**SUPPORTED, LIAR: UNSURE, FRAMED: UNSURE}, beside(ASIDE, NEAR, LIAR), speed=4.0),
+}
+
+
+@pytest.mark.parametrize("quiet", [0, 10])
+@pytest.mark.parametrize("world", WORLDS.values(), ids=WORLDS)
+def test_who_is_needed_for_anothers_lie_is_not_named_for_it(world, quiet):
+    met = world.play(25, quiet=quiet)
+    assert not any(FRAMED in decision.named for decision, _ in met)
+    assert max(decision.suspicion[FRAMED] for decision, _ in met) < 0.7  # as either of the two may be behind it
+    assert quiet == 0 or FRAMED in met[-1][0].accepted
+
+
+def test_who_shows_a_ghost_alone_is_named_for_it_though_its_own_message_denies_it():
+    met = DRIVING_VEILED.play(12, quiet=10)
+    assert met[-1][0].named == (LIAR,)
+    assert any((LIAR,) in tested for _, tested in met)
+
+
+def test_without_whom_a_lie_was_there_is_known_for_some_frames():
+    lies = Lies()
+    assert lies.not_spared(LIAR, OTHERS, 3) == set(OTHERS)
+    lies.spare(LIAR, ["car-2"], 3)
+    lies.spare(LIAR, ["car-5"], 5)
+    lies.spare(LIAR, [], 6)
+    lies = Lies.from_state(lies.to_state())
+    assert lies.not_spared(LIAR, OTHERS, 3 + SPARED_FRAMES - 1) == {"car-3"}
+    assert lies.not_spared(LIAR, OTHERS, 3 + SPARED_FRAMES) == {"car-2", "car-3"}
+    assert lies.not_spared(FRAMED, OTHERS, 5) == set(OTHERS)
+    lies.forget("car-5")
+    assert lies.not_spared(LIAR, OTHERS, 6) == {"car-3", "car-5"}
+    lies.forget(LIAR)
+    assert lies.to_state()["spared"] == {}
