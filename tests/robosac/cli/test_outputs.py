@@ -115,7 +115,7 @@ def test_a_place_that_cannot_be_written_to_is_refused_before_the_work(name, plac
 def test_a_file_in_the_place_of_a_folder_is_called_one(words, tmp_path):
     file = tmp_path / "file"
     file.write_text("")
-    place = file / "x" if words[0] == "record" else file
+    place = file / "x.jsonl" if words[0] == "record" else file
     result = runner.invoke(app, [*words, str(place)], env={"COLUMNS": "400"})
     assert result.exit_code == 2
     assert f"Invalid value for {words[-1]}: {file} is a file; a folder is wanted" in result.output
