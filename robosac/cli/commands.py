@@ -9,6 +9,7 @@ import ast
 import errno
 import inspect
 import os
+import signal
 import sys
 from collections.abc import Sequence
 from contextlib import suppress
@@ -43,6 +44,8 @@ GROUP = "robosac.commands"
 """Entry points of other packages' commands, in the same form."""
 UNWRITTEN = {errno.ENOSPC, errno.EDQUOT, errno.EFBIG, errno.EIO}
 """How writing fails where there is no room."""
+READ_NO_MORE = 128 + signal.SIGPIPE
+"""Status where nobody reads what is printed, as of whatever a shell runs: the outcome is unknown."""
 _OURS = ("robosac", "service", "clients")
 
 
@@ -114,8 +117,7 @@ class Commands(TyperGroup):
         except OSError as error:
             if error.errno not in UNWRITTEN or error.filename is not None:
                 raise
-            with suppress(OSError):  # what is left of it would fail again at the very end
-                os.dup2(os.open(os.devnull, os.O_WRONLY), sys.stdout.fileno())
+            _print_nowhere()
             typer.echo(f"Error: {error.strerror}", err=True)
             sys.exit(2)
 
@@ -127,6 +129,9 @@ class Commands(TyperGroup):
         except typer.BadParameter as refused:
             refused.param_hint = _as_typed(refused, words)
             raise
+        except BrokenPipeError as closed:  # of which typer makes a 1, as if a check had failed
+            _print_nowhere()
+            raise typer.Exit(READ_NO_MORE) from closed
         except MissingExtra as missing:
             typer.echo(f"Error: {missing}", err=True)
             raise typer.Exit(2) from missing
@@ -138,6 +143,12 @@ class Commands(TyperGroup):
                 raise
             typer.secho(f"Error: {place}: {in_one_line(error)}", fg="red", err=True)
             raise typer.Exit(1) from error
+
+
+def _print_nowhere() -> None:
+    """Let what is left of the output not fail again at the very end."""
+    with suppress(OSError):
+        os.dup2(os.open(os.devnull, os.O_WRONLY), sys.stdout.fileno())
 
 
 def _as_typed(refused: Any, words: Sequence[str]) -> Any:

@@ -2,6 +2,7 @@
 
 import io
 import json
+import signal
 import subprocess
 import sys
 from pathlib import Path
@@ -169,6 +170,17 @@ def test_the_name_of_a_file_is_told_as_it_is_and_whole():
     for path in ("out[1]/[/x]/[red]:smile:.json", "a/" * 20 + "[bold]"):
         tell(console, f"Written: {path}")
         assert console.file.getvalue().endswith(f"Written: {path}\n")
+
+
+def test_what_nobody_reads_is_no_outcome_of_a_check(tmp_path):
+    log = tmp_path / "log.jsonl"
+    log.write_text("{}\n")
+    program = [sys.executable, "-c", "from robosac.cli import app; app()", "audit", "verify", str(log)]
+    running = subprocess.Popen(program, stdout=subprocess.PIPE, stderr=subprocess.PIPE, text=True)
+    running.stdout.close()
+    with running.stderr as said:
+        assert said.read() == ""
+    assert running.wait() == 128 + signal.SIGPIPE
 
 
 @pytest.mark.skipif(not Path("/dev/full").exists(), reason="there is no /dev/full")
