@@ -15,6 +15,7 @@ from robosac.defenses.group_testing.claims import DENIES, SUPPORTS, WEIGHTY, two
 from robosac.defenses.group_testing.hearing import CERTAIN, OWN_M
 from robosac.defenses.group_testing.objects import AWAY, CRISP_SCORE, PLACED_SCORE, SHOWN_SCORE, Lie, Shown
 
+CRISP_ODDS = float(np.log(CRISP_SCORE / (1 - CRISP_SCORE)))
 OWN_DENIES = -4.0
 """Whose own message denies a place so far is not to blame for a box there."""
 GONE_EFFECT = 1.5
@@ -116,14 +117,15 @@ def blame(found: Mapping[str, Sequence[Lie]], joined: Shown) -> dict[str, list[L
 
 def persists(lie: Lie, part: Shown, without: Shown) -> bool:
     """Whether what is wrong in a fusion, and is not ``without`` a suspect, is so in a part of it, too, in which the
-    suspect is fused.
+    suspect is fused: a ghost is crisp there, and what is moved is nearer to where the lie has it than by half.
     """
-    at = lie.place[None]
     if lie.kind == "moved":
         nearest = [_nearest(shown, lie.place) for shown in (part, without)]
-        return nearest[0] <= SAME_BOX_M and nearest[0] < nearest[1]
-    drop = float(part.odds_at(at)[0] - without.odds_at(at)[0])
-    return drop >= EFFECT if lie.kind == "ghost" else -drop >= GONE_EFFECT
+        return nearest[0] <= SAME_BOX_M and nearest[0] <= nearest[1] / 2
+    here, there = (float(shown.odds_at(lie.place[None])[0]) for shown in (part, without))
+    if lie.kind == "ghost":
+        return here >= CRISP_ODDS and here - there >= EFFECT
+    return there - here >= GONE_EFFECT
 
 
 def _nearest(shown: Shown, place: FloatArray) -> float:

@@ -131,11 +131,13 @@ class Findings(Fusions):
             if part in self.shown:
                 others = set(joined).difference(part)
                 if persists(lie, self.shown[part], without):
-                    self.lies.spare(suspect, others, frame)
+                    self.lies.spare(suspect, lie.kind, others, frame)
                 else:
                     needed |= others
-        left = self.lies.not_spared(suspect, set(joined) - {suspect}, frame)
-        return Word.GOOD if not left else Word.NOTHING if left & needed else Word.DOUBTFUL
+        if needed:
+            return Word.NOTHING
+        left = self.lies.not_spared(suspect, lie.kind, set(joined) - {suspect}, frame)
+        return Word.DOUBTFUL if left else Word.GOOD
 
     def to_prove(self, joined: Hypothesis) -> Iterator[Hypothesis]:
         """What is to be decoded to see whether a lie of which the message of its only suspect says nothing shows only
@@ -148,7 +150,7 @@ class Findings(Fusions):
         for suspect, lies in blame(done, self.shown[joined]).items():
             for lie in lies:
                 if self.proof(joined, suspect, lie) is Word.DOUBTFUL:
-                    left = self.lies.not_spared(suspect, joined, self.known.memory.frame)
+                    left = self.lies.not_spared(suspect, lie.kind, joined, self.known.memory.frame)
                     yield from (part for part in self._proving(joined, suspect, lie) if left.difference(part))
 
     @staticmethod

@@ -63,7 +63,9 @@ class Inspection:
 
     def asked_again(self, answer: Hypothesis) -> Hypothesis | None:
         """The subset to decode next to ask those again beside the answer that are left out; None if nobody is."""
-        return self._first_not_decoded(subset for subset in self._again(answer) if set(answer) <= set(subset))
+        asked = [subset for subset in self._again(answer) if set(answer) <= set(subset)]
+        proving = (part for subset in asked for part in self._found.to_prove(subset))
+        return self._first_not_decoded((*asked, *proving))
 
     def _first_not_decoded(self, subsets: Iterable[Hypothesis]) -> Hypothesis | None:
         return next((subset for subset in subsets if subset and subset not in self._found.decoded), None)
@@ -134,7 +136,7 @@ class Inspection:
         """What is to be decoded to ask those again that are neither in the answer nor named: of those only in doubt,
         beside the answer, in one frame as many together as are more likely all honest than not, in the next the least
         suspected, in a large team of those who are not as good as cleared; each of the two most suspected ones, or that
-        lied lately, alone and beside the answer. Whoever is only out of place is in no doubt.
+        lied lately, beside the answer and alone. Whoever is only out of place is in no doubt.
         """
         posterior, suspicion = self._found.known.posterior, self._found.known.suspicion()
         left = [name for name in self._found.team if name not in answer and name not in self._found.named]
@@ -157,7 +159,8 @@ class Inspection:
         begun = [name for name in self._suspects if name in suspects]
         for suspect in (*begun, *(name for name in reversed(suspects) if name not in begun))[:2]:
             beside = self._with(answer, [suspect])
-            asked += [(suspect,), beside, *self._found.to_prove(beside)]
+            # what a lie is worth is found out first, or where little can be asked nobody would ever be named for it
+            asked += [beside, *self._found.to_prove(beside), (suspect,)]
         return asked
 
     def _with(self, answer: Hypothesis, others: Collection[str]) -> Hypothesis:

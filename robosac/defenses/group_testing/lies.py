@@ -112,19 +112,18 @@ class Lies:
     frame of the session.
     """
 
-    spared: dict[str, dict[str, int]] = field(default_factory=dict)
-    """By teammate: without whom a lie that nobody else tells was still there, and without it not; the frame of the
-    session in which that was seen last.
+    spared: dict[str, dict[str, dict[str, int]]] = field(default_factory=dict)
+    """By teammate and kind: without whom a lie that nobody else tells was still there, and without it not; the frame of
+    the session in which that was seen last.
     """
 
-    def spare(self, teammate: str, others: Collection[str], frame: int) -> None:
+    def spare(self, teammate: str, kind: str, others: Collection[str], frame: int) -> None:
         """A lie of a teammate is there without these others, too."""
-        if others:
-            self.spared.setdefault(teammate, {}).update(dict.fromkeys(sorted(others), frame))
+        self.spared.setdefault(teammate, {}).setdefault(kind, {}).update(dict.fromkeys(sorted(others), frame))
 
-    def not_spared(self, teammate: str, others: Collection[str], frame: int) -> set[str]:
+    def not_spared(self, teammate: str, kind: str, others: Collection[str], frame: int) -> set[str]:
         """Of the others those beside whom alone a teammate's lies may show, for all that was seen lately."""
-        known = self.spared.get(teammate, {})
+        known = self.spared.get(teammate, {}).get(kind, {})
         return {name for name in others if frame - known.get(name, -SPARED_FRAMES) >= SPARED_FRAMES}
 
     def recently_left_out(self, teammate: str, frame: int) -> bool:
@@ -245,9 +244,8 @@ class Lies:
         self.accusers.pop(teammate, None)
         self.effects.pop(teammate, None)
         self.spared.pop(teammate, None)
-        for of in (self.accusers, self.spared):
-            for others in of.values():
-                others.pop(teammate, None)
+        for others in (*self.accusers.values(), *(of for kinds in self.spared.values() for of in kinds.values())):
+            others.pop(teammate, None)
 
     def to_state(self) -> dict[str, Any]:
         """JSON values that `from_state` reads."""
@@ -288,8 +286,8 @@ class Lies:
             {str(name): int(frame) for name, frame in state.get("effects", {}).items()},
             [(float(x), float(y), int(frame)) for x, y, frame in state.get("searched", ())],
             {
-                str(name): {str(other): int(frame) for other, frame in others.items()}
-                for name, others in state.get("spared", {}).items()
+                str(name): {kind: {str(other): int(at) for other, at in of.items()} for kind, of in kinds.items()}
+                for name, kinds in state.get("spared", {}).items()
             },
         )
 
