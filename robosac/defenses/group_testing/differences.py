@@ -16,6 +16,7 @@ from robosac.defenses.group_testing.hearing import CERTAIN, OWN_M
 from robosac.defenses.group_testing.objects import AWAY, CRISP_SCORE, PLACED_SCORE, SHOWN_SCORE, Lie, Shown
 
 CRISP_ODDS = float(np.log(CRISP_SCORE / (1 - CRISP_SCORE)))
+"""Logarithm of the odds of a box of that score."""
 OWN_DENIES = -4.0
 """Whose own message denies a place so far is not to blame for a box there."""
 GONE_EFFECT = 1.5

@@ -126,15 +126,13 @@ class Findings(Fusions):
         if lie.along or lie.alone or lie.kind == "reshaped" or self.shown[joined].goes_with(suspect, lie):
             return Word.GOOD
         frame, without = self.known.memory.frame, self.shown[tuple(name for name in joined if name != suspect)]
-        needed = set[str]()
-        for part in self._proving(joined, suspect, lie):
-            if part in self.shown:
-                others = set(joined).difference(part)
-                if persists(lie, self.shown[part], without):
-                    self.lies.spare(suspect, lie.kind, others, frame)
-                else:
-                    needed |= others
-        if needed:
+        put_right = False
+        for part in filter(self.shown.__contains__, self._proving(joined, suspect, lie)):
+            if persists(lie, self.shown[part], without):
+                self.lies.spare(suspect, lie.kind, set(joined).difference(part), frame)
+            else:
+                put_right = True
+        if put_right:
             return Word.NOTHING
         left = self.lies.not_spared(suspect, lie.kind, set(joined) - {suspect}, frame)
         return Word.DOUBTFUL if left else Word.GOOD

@@ -3,9 +3,9 @@
 import numpy as np
 import pytest
 
-from robosac.defenses.group_testing.differences import carried, effects, gone, misplaced
+from robosac.defenses.group_testing.differences import carried, effects, gone, misplaced, persists
 from robosac.defenses.group_testing.hearing import Hearing
-from robosac.defenses.group_testing.objects import SLACK_ACROSS_M, Shown
+from robosac.defenses.group_testing.objects import SLACK_ACROSS_M, Lie, Shown
 from tests.robosac.defenses.group_testing.fusions import (
     DENIED,
     NO,
@@ -173,3 +173,24 @@ def test_what_a_fusion_has_lost_is_found_by_its_part():
     assert gone(Shown(TEAM, REST, heard), part).tolist() == [0]
     assert gone(Shown(TEAM, np.vstack([REST, car()]), heard), part).tolist() == []
     assert gone(Shown(TEAM, REST, hearing()), Shown(("b", "c"), np.vstack([car(), REST]), hearing())).size == 0
+
+
+@pytest.mark.parametrize(
+    ("kind", "part", "without", "there"),
+    [
+        ("ghost", car(), NOTHING, True),
+        ("ghost", car(score=0.55), NOTHING, True),
+        ("ghost", car(score=0.45), NOTHING, False),  # as a detector makes many of them up by itself
+        ("ghost", car(score=0.6), car(score=0.45), False),
+        ("gone", NOTHING, car(), True),
+        ("gone", car(), car(), False),
+        ("moved", car(off=(0.0, 0.1)), car(off=(0.0, 1.3)), True),
+        ("moved", car(off=(0.0, 0.5)), car(off=(0.0, 1.3)), True),
+        ("moved", car(off=(0.0, 1.2)), car(off=(0.0, 1.3)), False),  # put right but for some centimetres
+        ("moved", NOTHING, car(off=(0.0, 1.3)), False),
+    ],
+)
+def test_a_lie_is_there_in_a_part_of_a_fusion_too(kind, part, without, there):
+    heard = hearing()
+    shown, other = (Shown(("a", "d"), np.vstack([REST, boxes]), heard) for boxes in (part, without))
+    assert persists(Lie(kind, PLACE), shown, other) == there
