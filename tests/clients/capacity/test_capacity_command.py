@@ -69,7 +69,7 @@ def test_what_a_check_would_pass_over_is_refused(report, option):
     assert f"for {option.partition('=')[0]}: --check takes all figures from the report" in said(result)
 
 
-def test_a_fleet_may_not_be_larger_than_mankind_has_vehicles(report):
+def test_a_fleet_that_is_too_large_is_refused(report):
     assert "100000000" in said(run(report, "--vehicles", 10**20))
 
 
