@@ -117,29 +117,34 @@ class Findings(Fusions):
         return self._shapes[asked]
 
     def proof(self, joined: Hypothesis, suspect: str, lie: Lie) -> Word:
-        """What it is worth that a lie of which a suspect's own message says nothing is not there without the suspect.
+        """What it is worth that a lie is not there without a suspect.
 
-        Others may make it show only beside the suspect. So a ghost is its own doing once it shows with the suspect
-        alone. What it takes away or moves beside enough others is so once it was without each of them (`Lies.spared`);
-        if it is put right without one of them, too, that is worth nothing. It is doubtful as long as it is not known.
+        Others may make it show only beside the suspect, whose own message may go with it by mistake. So a ghost is its
+        own doing once it shows with the suspect alone. What it takes away or moves beside enough others is so once it
+        was without each of them (`Lies.spared`). If it is put right without one of them, too, that is worth nothing,
+        unless the messages of both go with it: those may lie together. As long as it is not known, it is doubtful where
+        the suspect's own message does not go with it.
         """
-        if lie.along or lie.alone or lie.kind == "reshaped" or self.shown[joined].goes_with(suspect, lie):
+        if not _takes_proof(lie):
             return Word.GOOD
         frame, without = self.known.memory.frame, self.shown[tuple(name for name in joined if name != suspect)]
+        going = set(self.shown[joined].going_with(lie))
         put_right = False
         for part in filter(self.shown.__contains__, self._proving(joined, suspect, lie)):
             if persists(lie, self.shown[part], without):
                 self.lies.spare(suspect, lie.kind, set(joined).difference(part), frame)
-            else:
+            elif suspect not in going or set(joined).difference(part) - going:
                 put_right = True
         if put_right:
             return Word.NOTHING
         left = self.lies.not_spared(suspect, lie.kind, set(joined) - {suspect}, frame)
-        return Word.DOUBTFUL if left else Word.GOOD
+        return Word.DOUBTFUL if left and suspect not in going else Word.GOOD
 
-    def to_prove(self, joined: Hypothesis) -> Iterator[Hypothesis]:
-        """What is to be decoded to see whether a lie of which the message of its only suspect says nothing shows only
-        beside somebody else.
+    def to_prove(
+        self, joined: Hypothesis, words: Collection[Word] = (Word.DOUBTFUL, Word.GOOD)
+    ) -> Iterator[Hypothesis]:
+        """What is to be decoded to see whether a lie, of which the `proof` is one of these words yet, shows only beside
+        somebody else than its suspect.
         """
         if joined not in self.shown:
             return
@@ -147,7 +152,7 @@ class Findings(Fusions):
         done = {suspect: self.effects(joined, part, (suspect,)) for suspect, part in parts.items()}
         for suspect, lies in blame(done, self.shown[joined]).items():
             for lie in lies:
-                if self.proof(joined, suspect, lie) is Word.DOUBTFUL:
+                if _takes_proof(lie) and self.proof(joined, suspect, lie) in words:
                     left = self.lies.not_spared(suspect, lie.kind, joined, self.known.memory.frame)
                     yield from (part for part in self._proving(joined, suspect, lie) if left.difference(part))
 
@@ -237,6 +242,11 @@ class Findings(Fusions):
         """A place (2,) of the ego's frame in the world."""
         placed: FloatArray = self.pose[:2, :2] @ place + self.pose[:2, 3]
         return placed
+
+
+def _takes_proof(lie: Lie) -> bool:
+    """Whether anybody may be named for such a lie."""
+    return not (lie.along or lie.alone or lie.kind == "reshaped")
 
 
 def one_out(fused: Hypothesis, decoded: Iterable[Hypothesis]) -> dict[str, Hypothesis]:

@@ -13,7 +13,7 @@ from robosac.defenses.group_testing.candidates import UNRESOLVED
 from robosac.defenses.group_testing.claims import SUPPORTS
 from robosac.defenses.group_testing.conclusions import conclude
 from robosac.defenses.group_testing.findings import Findings, one_out
-from robosac.defenses.group_testing.lies import AUDIT_FRAMES
+from robosac.defenses.group_testing.lies import AUDIT_FRAMES, Word
 from robosac.defenses.group_testing.objects import Lie, Shown
 from robosac.defenses.group_testing.posterior import EXACT
 from robosac.defenses.group_testing.standing import judge
@@ -156,12 +156,13 @@ class Inspection:
             asked = [self._with(answer, groups[int(honest.argmax())])] if honest.any() else asked
         # whoever is asked alone is less suspected by it, and others would be asked in its place before it is done with
         self._suspects = suspects[-2:][::-1] if self._suspects is None else self._suspects
-        begun = [name for name in self._suspects if name in suspects]
+        begun, last = [name for name in self._suspects if name in suspects], list[Hypothesis]()
         for suspect in (*begun, *(name for name in reversed(suspects) if name not in begun))[:2]:
             beside = self._with(answer, [suspect])
             # what a lie is worth is found out first, or where little can be asked nobody would ever be named for it
-            asked += [beside, *self._found.to_prove(beside), (suspect,)]
-        return asked
+            asked += [beside, *self._found.to_prove(beside, [Word.DOUBTFUL]), (suspect,)]
+            last += self._found.to_prove(beside)
+        return [*asked, *last]
 
     def _with(self, answer: Hypothesis, others: Collection[str]) -> Hypothesis:
         """The answer and others, in the order of the team."""

@@ -22,7 +22,7 @@ from tests.robosac.defenses.group_testing.one_place import (
 FRAMED, UNSURE = "rsu", -0.5
 DRIVING_MUTE = World({"car-2": YES, "car-3": YES, "rsu": YES}, with_liar(CAR[:0], CAR), speed=4.0)
 OTHERS = ("car-2", "car-3", "car-5")
-DENIED, SUPPORTED = dict.fromkeys((EGO, *OTHERS), NO), dict.fromkeys(OTHERS, YES)
+DENIED, SUPPORTED = dict.fromkeys((EGO, *OTHERS), NO), {EGO: UNSURE, **dict.fromkeys(OTHERS, YES)}
 
 
 def beside(shown, otherwise, *liars):
@@ -57,6 +57,22 @@ def test_who_is_needed_for_anothers_lie_is_not_named_for_it(world, quiet):
     assert not any(FRAMED in decision.named for decision, _ in met)
     assert max(decision.suspicion[FRAMED] for decision, _ in met) < 0.7  # as either of the two may be behind it
     assert quiet == 0 or FRAMED in met[-1][0].accepted
+
+
+@pytest.mark.parametrize("quiet", [0, 10])
+@pytest.mark.parametrize(
+    ("said", "shown", "otherwise", "mistaken"),
+    [
+        ({**DENIED, LIAR: NO}, CAR, CAR[:0], YES),
+        ({**DENIED, LIAR: UNSURE}, CAR, CAR[:0], YES),
+        ({**SUPPORTED, LIAR: YES}, CAR[:0], CAR, NO),
+        ({**SUPPORTED, LIAR: UNSURE}, CAR[:0], CAR, NO),
+    ],
+    ids=["ghost denied", "ghost", "gone denied", "gone"],
+)
+def test_nor_is_whose_own_message_goes_with_it_by_mistake(said, shown, otherwise, mistaken, quiet):
+    world = World({**said, FRAMED: mistaken}, beside(shown, otherwise, LIAR), speed=4.0)
+    assert not any(FRAMED in decision.named for decision, _ in world.play(12, quiet=quiet))
 
 
 @pytest.mark.parametrize("quiet", [0, 10])
