@@ -69,6 +69,18 @@ def calibration_digest(info: DetectorInfo) -> str | None:
         return None
 
 
+def digest_beside(info: DetectorInfo) -> str:
+    """SHA-256 (hexadecimal) of what there is beside a detector's weights: attacks and defences read it.
+
+    Raises
+    ------
+    OSError
+        If it cannot be read.
+    """
+    files = [path for path in (info.calibration, info.witness) if path is not None and path.exists()]
+    return _digest(*((path, path.stat().st_mtime_ns) for path in files))
+
+
 def witness_of(info: DetectorInfo) -> Witness | None:
     """The witness network beside a detector's weights; None if there is none.
 

@@ -16,7 +16,7 @@ import sys
 import sysconfig
 from collections.abc import Callable, Collection, Iterator, Mapping
 from dataclasses import dataclass, field
-from functools import cached_property
+from functools import cache, cached_property
 from importlib import import_module
 from importlib.metadata import entry_points
 from importlib.util import resolve_name
@@ -149,6 +149,12 @@ def code_of(*kinds: Kind[Any]) -> str:
     return digest_of(*files.values()) if files else ""
 
 
+@cache
+def package_code() -> str:
+    """A digest of this package's own code."""
+    return digest_of(*Path(__file__).parent.rglob("*.py"))
+
+
 def digest_of(*files: Path) -> str:
     """A digest of the contents of files, whatever their order."""
     contents = sorted(hashlib.sha256(file.read_bytes()).digest() for file in files)
@@ -220,19 +226,25 @@ def lacks(candidate: object, contract: type[Any], needed: Collection[str] | None
 
 
 def misfits(candidate: object, contract: type[Any]) -> str:
-    """Which methods of an object cannot be called as those of a contract are.
+    """Which methods of an object cannot be called as those are of a contract, or of a class of this package that it
+    derives from.
 
     Returns
     -------
     str
         ``has a method NAME that cannot be called with (PARAMETERS)``; empty if all can.
     """
-    for name, part in _parts(contract).items():
+    package = __name__.partition(".")[0]
+    ours = [base for base in reversed(type(candidate).__mro__) if base.__module__.partition(".")[0] == package]
+    called = [(name, part) for base in ours for name, part in vars(base).items() if not name.startswith("_")]
+    for name, part in (*_parts(contract).items(), *called):
         method = getattr(candidate, name, None) if inspect.isfunction(part) else None
         if callable(method):
-            called_with = list(inspect.signature(part).parameters)[1:]
+            parameters = list(inspect.signature(part).parameters.values())[1:]
+            called_with = [each.name for each in parameters]
+            named = {each.name: each for each in parameters if each.kind is each.KEYWORD_ONLY}
             try:
-                inspect.signature(method).bind(*called_with)
+                inspect.signature(method).bind(*(name for name in called_with if name not in named), **named)
             except TypeError as error:
                 return f"has a method {name} that cannot be called with ({', '.join(called_with)}): {error}"
             except ValueError:  # of what is written in another language nothing is known

@@ -16,12 +16,14 @@ import numpy as np
 
 from robosac.attacks.situation import Lie
 from robosac.boxes import FloatArray
+from robosac.calibrated import digest_beside
 from robosac.defenses import EGO
 from robosac.detectors import Detector, Message
 from robosac.detectors.base import check_boxes
 from robosac.evaluation.encounters import NOBODY_ACTS, Act, Encounters
 from robosac.evaluation.frames import DecodedOnce, EvaluationFrame, Subset
 from robosac.files import replacing
+from robosac.plugins import package_code
 from robosac.scenes import DEFAULT_DATA
 
 FORMAT = 2
@@ -68,7 +70,7 @@ class Recordings(Encounters):
     data: str = DEFAULT_DATA
     """Name of the scenes' source."""
     code: str = ""
-    """Digest of the user's own code that makes them; empty where all of it ships."""
+    """Digest of the user's own code that makes them, besides this package; empty where there is none."""
     _recorded: dict[Act, dict[int, DecodedOnce]] = field(default_factory=dict, init=False)
 
     def met(self, act: Act, indices: Sequence[int]) -> Iterator[DecodedOnce]:
@@ -93,7 +95,8 @@ class Recordings(Encounters):
         info, scene = self.detector.info, self.scene.number
         data = [self.data] if self.data != DEFAULT_DATA else []
         code = [self.code] if self.code else []
-        identity = [FORMAT, *data, *code, info.name, info.weights_digest, scene, act.attack, *act.acting]
+        made_by = [package_code(), *code, info.name, info.weights_digest, digest_beside(info)]
+        identity = [FORMAT, *data, *made_by, scene, act.attack, *act.acting]
         digest = hashlib.sha256(json.dumps([*identity, self.seed, self.pose_error_m]).encode()).hexdigest()
         return f"{scene}-{re.sub('[^A-Za-z0-9-]', '-', act.attack)}-{len(act.acting)}-{digest[:16]}.npz"
 

@@ -12,6 +12,7 @@ from typing import Protocol
 import pytest
 
 import robosac
+from robosac.attacks import ATTACKS, PGD, Attack
 from robosac.plugins import Kind, lacks, misfits, parts
 
 FILES = {
@@ -154,6 +155,43 @@ def test_a_method_is_called_as_the_contract_says():
     assert misfits(SimpleNamespace(area=lambda scale=1: scale), Shape) == ""
     with pytest.raises(ValueError, match=f"x made no shape but .* which {re.escape(told)}$"):
         shapes().check(Scaled(), Shape, "x")
+
+
+def test_a_method_is_called_as_a_class_that_ships_says_from_which_it_derives():
+    class Mine(PGD):
+        def objective(self, known, logits):
+            return logits.sum()
+
+    told = "has a method objective that cannot be called with (known, logits, delta): too many positional arguments"
+    assert misfits(Mine(), Attack) == told
+    assert all(misfits(kind(), Attack) == "" for kind in ATTACKS.values())
+
+    class Descending(PGD):
+        def optimise(self, surface, attackers, rng, situation, *, terms=(), warm=False):
+            return {}
+
+        around = None
+
+    assert "too many positional arguments" in misfits(Descending(), Attack)
+
+
+def test_a_parameter_that_is_named_is_given_by_its_name():
+    class Shape:
+        def area(self, *, scale):
+            """Square metres."""
+
+    Shape.__module__ = "robosac.shapes"
+
+    class Named(Shape):
+        def area(self, *, scale=1):
+            return scale
+
+    class Other(Shape):
+        def area(self, *, size):
+            return size
+
+    assert misfits(Named(), object) == ""
+    assert "area" in misfits(Other(), object)
 
 
 def test_all_parts_of_a_protocol_are_asked_for_those_inherited_too():

@@ -14,8 +14,7 @@ from typing import Any
 import msgpack
 import numpy as np
 
-import robosac
-from robosac.calibrated import calibration_digest
+from robosac.calibrated import digest_beside
 from robosac.defenses.registry import DEFENSES
 from robosac.evaluation.average_precision import Matched
 from robosac.evaluation.comparison.playing import Naming, Plan, Played, PlayedScene
@@ -23,7 +22,7 @@ from robosac.evaluation.comparison.settings import Setting
 from robosac.evaluation.objects import Judged, ObjectHistory
 from robosac.evaluation.standing import TrueBoxes
 from robosac.files import replacing, write_text
-from robosac.plugins import code_of, digest_of
+from robosac.plugins import code_of, package_code
 
 _PLAN = "plan.json"
 _SEQUENCES = "*.msgpack.gz"
@@ -95,7 +94,7 @@ def _described(plan: Plan) -> dict[str, Any]:
         "version": version("robosac"),
         "code": _code(plan),
         "data": plan.data.name,
-        "detector": [info.name, info.weights_digest, calibration_digest(info)],
+        "detector": [info.name, info.weights_digest, digest_beside(info)],
         "defenses": list(plan.defenses),
         "settings": [[setting.campaign, setting.attackers] for setting in extent.settings],
         "frames": extent.frames,
@@ -107,8 +106,7 @@ def _described(plan: Plan) -> dict[str, Any]:
 
 def _code(plan: Plan) -> str:
     """A digest of this package, and of what is the user's own."""
-    package = digest_of(*(file for place in robosac.__path__ for file in Path(place).rglob("*.py")))
-    return f"{package} {plan.code} {code_of(DEFENSES)}"
+    return f"{package_code()} {plan.code} {code_of(DEFENSES)}"
 
 
 def _played(values: Mapping[str, Any]) -> Played:

@@ -1,3 +1,4 @@
+import shutil
 from dataclasses import replace
 
 import numpy as np
@@ -6,6 +7,7 @@ import pytest
 from robosac.boxes import pose_matrix
 from robosac.defenses import A2CP, EGO, Halving, OneByOne, SampleConsensus, StaticTeam, Undefended
 from robosac.detectors import Message
+from robosac.evaluation import recordings
 from robosac.evaluation.encounters import acts
 from robosac.evaluation.frames import EvaluationFrame, misplaced
 from robosac.evaluation.playing import FaultyDefense, play
@@ -191,6 +193,36 @@ def test_other_weights_seeds_and_poses_are_not_mixed_up(detector, tmp_path):
     np.testing.assert_array_equal(plain.detect(("rsu",)), seeded.detect(("rsu",)))
     assert not np.array_equal(plain.detect(("rsu",)), misled.detect(("rsu",)))
     np.testing.assert_array_equal(plain.detect(), misled.detect())
+
+
+@pytest.mark.parametrize("suffix", ["calibration.json", "witness.safetensors"])
+def test_what_was_made_with_another_calibration_or_witness_is_not_used(detector, suffix, tmp_path):
+    info = detector.info
+    beside = {"calibration": info.calibration, "witness": info.witness}
+    part = suffix.partition(".")[0]
+    beside[part] = tmp_path / suffix
+    shutil.copy(getattr(info, part), beside[part])
+    counting = Counting(detector, **beside)
+    folder = tmp_path / "recordings"
+
+    def recorded_anew():
+        before = counting.prepared
+        Recordings(counting, SCENE, folder=folder).sequence(1, "noise", ["car-3"])
+        return counting.prepared > before
+
+    assert [recorded_anew(), recorded_anew()] == [True, False]
+    beside[part].write_bytes(beside[part].read_bytes() + b" ")
+    assert [recorded_anew(), recorded_anew()] == [True, False]
+    beside[part].unlink()
+    assert [recorded_anew(), recorded_anew()] == [True, False]
+
+
+def test_what_other_code_of_this_package_recorded_is_not_used(counting, tmp_path, monkeypatch):
+    Recordings(counting, SCENE, folder=tmp_path).sequence(1, "noise", ["car-3"])
+    monkeypatch.setattr(recordings, "package_code", lambda: "another")
+    before = counting.prepared
+    Recordings(counting, SCENE, folder=tmp_path).sequence(1, "noise", ["car-3"])
+    assert counting.prepared > before
 
 
 def test_passes_are_fused_subsets_each_counted_once(recorded):
