@@ -5,6 +5,7 @@ from __future__ import annotations
 import asyncio
 from collections import Counter
 from collections.abc import Callable, Sequence
+from dataclasses import dataclass
 from datetime import UTC, datetime
 from enum import StrEnum
 from pathlib import Path
@@ -26,6 +27,7 @@ from robosac.cli.options import progress
 from robosac.cli.outputs import Force, check_file, make_folder, tell
 from robosac.cli.printing import printable
 from robosac.defenses import Defense, build
+from robosac.defenses.registry import Kinds
 from robosac.detectors import Detector
 from robosac.extras import need
 from robosac.figures import check_film, need_figures
@@ -123,10 +125,12 @@ def replay(
     console, same = Console(), True
     if url is not None and (detector, own) != (None, None):
         raise typer.BadParameter("the gateway has its own detectors and defences", param_hint="--url")
-    for session in _with_frames(_read(file)):
-        if url is None:
-            same &= _decide_again(session, detector, defense, own, console)
-        else:
+    recorded = _with_frames(_read(file))
+    made = [_Deciding.of(session, detector, defense, own) for session in recorded] if url is None else []
+    for deciding in made:
+        same &= deciding.again(console, SHOWN if (detector, defense) == (None, None) else 0)
+    if url is not None:
+        for session in recorded:
             with blaming("FILE", RecordingError), failing(GatewayError):
                 asked = None if defense is None else {"kind": defense}
                 console.print(_literally(asyncio.run(play_against(url, session, asked, api_key))))
@@ -229,33 +233,48 @@ def _span(session: RecordedSession) -> str:
     return f"{len(session.frames)}, numbers {first.number} to {last.number}, {began}, {seconds:.1f} s"
 
 
-def _decide_again(
-    session: RecordedSession, detector: str | None, defense: str | None, own: str | None, console: Console
-) -> bool:
-    """Whether all answers are the same."""
-    from robosac.playback.comparing import Compared  # noqa: PLC0415 (seconds to import)
-    from robosac.playback.replay import replay as decide  # noqa: PLC0415
+@dataclass(frozen=True)
+class _Deciding:
+    """What a recorded session is decided again with."""
 
-    opening = session.opening
-    loaded = load_named(detector, opening.detector, "recording")
-    other = None if defense is None else _defense(defense, loaded)
-    with blaming("--recorded-defense", ValueError):
-        kinds = None if own is None else defenses.known([own])
-    kind = opening.defense.get("kind")
-    if defense is None and kind not in (kinds or defenses.shipped()):
-        why = printable(f"the recorded defence is {kind}, which does not ship: say where it is")
-        raise typer.BadParameter(why, param_hint="--recorded-defense")
-    if loaded.info.weights_digest != opening.weights_digest:
-        console.print(_literally(f"{loaded.info.name} has other weights than the recorded {opening.detector}."))
-    compared = Compared()
-    with blaming("FILE", RecordingError), failing(OSError):
-        for frame in decide(session, loaded, other, kinds):
-            compared.add(frame)
-    by = defense or opening.defense.get("kind")
-    console.print(_literally(f"{opening.session_id}, {by} on {loaded.info.name}:"))
-    for line in compared.lines(SHOWN if (detector, defense) == (None, None) else 0):
-        console.print(_literally(line))
-    return compared.same == compared.frames
+    session: RecordedSession
+    detector: Detector
+    defense: Defense | None
+    """Another one than was recorded."""
+    kinds: Kinds | None
+    """What the recorded one may be; by default what ships."""
+    by: str
+
+    @classmethod
+    def of(cls, session: RecordedSession, detector: str | None, defense: str | None, own: str | None) -> _Deciding:
+        """As the user wants it, or as it was recorded."""
+        opening = session.opening
+        loaded = load_named(detector, opening.detector, f"session {opening.session_id}")
+        other = None if defense is None else _defense(defense, loaded)
+        with blaming("--recorded-defense", ValueError):
+            kinds = None if own is None else defenses.known([own])
+        kind = opening.defense.get("kind")
+        if defense is None and kind not in (kinds or defenses.shipped()):
+            why = printable(f"the defence of session {opening.session_id}, {kind}, does not ship: say where it is")
+            raise typer.BadParameter(why, param_hint="--recorded-defense")
+        return cls(session, loaded, other, kinds, str(defense or kind))
+
+    def again(self, console: Console, shown: int) -> bool:
+        """Whether all answers are the same; so many that are not are shown."""
+        from robosac.playback.comparing import Compared  # noqa: PLC0415 (seconds to import)
+        from robosac.playback.replay import replay as decide  # noqa: PLC0415
+
+        opening, info = self.session.opening, self.detector.info
+        if info.weights_digest != opening.weights_digest:
+            console.print(_literally(f"{info.name} has other weights than the recorded {opening.detector}."))
+        compared = Compared()
+        with blaming("FILE", RecordingError), failing(OSError):
+            for frame in decide(self.session, self.detector, self.defense, self.kinds):
+                compared.add(frame)
+        console.print(_literally(f"{opening.session_id}, {self.by} on {info.name}:"))
+        for line in compared.lines(shown):
+            console.print(_literally(line))
+        return compared.same == compared.frames
 
 
 def _defense(text: str, detector: Detector) -> Defense:

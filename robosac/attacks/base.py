@@ -18,7 +18,7 @@ import torch
 from torch.nn import functional
 
 from robosac.arguments import check_rng
-from robosac.attacks.returned import check_aim, of_attackers
+from robosac.attacks.returned import check_aim, check_prepared, of_attackers
 from robosac.attacks.situation import Situation
 from robosac.detectors.base import AttackSurface
 
@@ -189,7 +189,11 @@ class IterativeAttack(Attack):
             Whether to begin with the variables that the frame before ended with, and to keep those of this frame.
         """
         clean = self.around(surface, attackers, situation)
-        if not clean or not self.prepare(surface, clean, rng, situation):
+        if not clean:
+            return {}
+        attacking = self.prepare(surface, clean, rng, situation)
+        check_prepared(getattr(self, "name", type(self).__name__), attacking)
+        if not attacking:
             return {}
         harm = self.aim(surface, clean, situation)
 

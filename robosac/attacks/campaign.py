@@ -22,7 +22,17 @@ from robosac.attacks.hearing import Hearing
 from robosac.attacks.returned import check_returned, check_sent, of_attackers
 from robosac.attacks.situation import Past, Situation
 from robosac.boxes import FloatArray, pose_matrix
-from robosac.detectors.base import AttackSurface, Detector, Encoder, GeometricSurface, Message, Preparer, blank
+from robosac.detectors.base import (
+    AttackSurface,
+    Detector,
+    DetectorError,
+    Encoder,
+    GeometricSurface,
+    Message,
+    Preparer,
+    blank,
+    misfit,
+)
 from robosac.plugins import lacks
 
 SEPARATOR = "@"
@@ -195,6 +205,8 @@ class Campaign:
             If the attack or its alibi needs boxes that the detector does not show.
         NoWitness
             If it needs a witness that the detector does not have.
+        DetectorError
+            If the detector's ``perturbed`` makes no message of its layout.
         """
         acting = list(self.schedule(frame, sorted(attackers)))
         if not acting or (self.attack is None and self.pose is None):
@@ -218,6 +230,9 @@ class Campaign:
         check_returned(self.name, tensors, surface, acting)
         with np.errstate(over="ignore"):  # what is too large is told below
             attacking = {name: detector.perturbed(sent[name], tensor) for name, tensor in tensors.items()}
+        for message in attacking.values():
+            if fault := misfit(message, detector.info):
+                raise DetectorError(f"{detector.info.name}: perturbed must return {fault}")
         check_sent(self.name, attacking, known.lies)
         return {**sent, **attacking} if self.pose is not None else attacking
 
@@ -275,8 +290,22 @@ def lacking(attack: Attack | Campaign | None, detector: Preparer) -> str | None:
             "detector's weights (robosac witness makes one)"
         )
     surface = detector.attack_surface(blank(detector.info, "ego"), {"a": blank(detector.info, "teammate")})
-    missing = lacks(surface, GeometricSurface, dict.fromkeys(campaign.needs))
-    return f"{campaign.name} cannot attack the detector {name}: its attack surface {missing}" if missing else None
+    fault = lacks(surface, GeometricSurface, dict.fromkeys(campaign.needs)) or _surface_fault(surface, campaign.needs)
+    return f"{campaign.name} cannot attack the detector {name}: its attack surface {fault}" if fault else None
+
+
+def _surface_fault(surface: AttackSurface, needs: Collection[str]) -> str:
+    """What a surface of one teammate gives in another form than an attack needs; empty if nothing."""
+    messages: object = surface.messages
+    if not isinstance(messages, Mapping):
+        return f"has messages that are no mapping of teammates to tensors, but a {type(messages).__name__}"
+    for name, message in messages.items():
+        if not isinstance(message, torch.Tensor):
+            return f"has messages that must be tensors; that of {name!r} is a {type(message).__name__}"
+    logits: object = surface.class_logits(messages) if "class_logits" in needs else None
+    if logits is not None and not isinstance(logits, torch.Tensor):
+        return f"has class_logits that must return a tensor, got a {type(logits).__name__}"
+    return ""
 
 
 BEHAVIOURS: Mapping[str, Mapping[str, Any]] = {

@@ -114,6 +114,18 @@ def check_sent(name: str, sent: Mapping[str, Message], lies: Sequence[object]) -
             raise AttackError(f"{name}: a lie of kind {lie.kind!r} needs the true box of its vehicle")
 
 
+def check_prepared(name: str, attacking: object) -> None:
+    """Refuse what does not say whether to attack: without a word nobody would.
+
+    Raises
+    ------
+    AttackError
+        If it is neither True nor False.
+    """
+    if not isinstance(attacking, bool | np.bool_):
+        raise AttackError(f"{name}: prepare must return True or False, got {attacking!r:.100}")
+
+
 def check_aim(name: str, value: object) -> None:
     """Refuse an aim that cannot be descended.
 

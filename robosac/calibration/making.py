@@ -98,7 +98,7 @@ def calibrate(
             model = fit(verdicts, recipe.attacks, error)
         except TooFewVerdicts as few:
             # had it happened in one scene of as many, three times as many would have shown it with 95 %
-            raise TooFewVerdicts(f"{recipe.scenes} scenes are too few ({few}): take {3 * recipe.scenes}") from few
+            raise TooFewVerdicts(f"{recipe.scenes} are too few ({few}): try {3 * recipe.scenes}") from few
         levels.append(model)
         reliability[error] = check(GroupTesting(model), stretches(scenes[recipe.scenes :], number, _CHECK))
     made_by = {

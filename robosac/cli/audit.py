@@ -124,7 +124,7 @@ def replay_decision(
         number = wire.read_frame(body).frame if frame is None else frame
     with blaming("FILE", OSError, replay.ReplayError), file.open("rb") as lines:
         decision = replay.find(lines_in(lines), number)
-    loaded = load_named(detector, decision.session.detector, "log")
+    loaded = load_named(detector, decision.session.detector, "the log")
     kind = decision.session.defense.get("kind")
     if defense is not None and kind in defenses.shipped():
         raise typer.BadParameter(f"the log's defence is {kind}, which ships", param_hint="--defense")

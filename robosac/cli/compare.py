@@ -188,6 +188,7 @@ def _defenses(only: Sequence[str], own: Sequence[str], detector: Detector) -> tu
             if name in DEFENSES:
                 raise ValueError(f"{name} ships and has its column: see --only")
             chosen[name] = defenses.load(name)
+        defenses.known(own)  # a log names the kind alone
         made, left_out = built(chosen, detector)
     reasons = [f"{name}: {why}" for name, why in left_out.items()]
     for option, asked in (("--only", only), ("--defense", own)):

@@ -41,7 +41,7 @@ POSE_ERROR_HELP = "Standard deviation of the teammates' positions, metres."
 PoseError = Annotated[float, typer.Option(min=0.0, max=MOST_POSE_ERROR_M, help=POSE_ERROR_HELP)]
 TOLD_EVERY_S = 60.0
 """How often it is told how far the work is where no bar can be drawn, as in a file."""
-Seed = Annotated[int, typer.Option(min=0, help="Of everything random.")]
+Seed = Annotated[int, typer.Option(min=0, max=2**63 - 1, help="Of everything random.")]
 
 
 def load_detector(name: str) -> Detector:

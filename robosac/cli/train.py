@@ -13,7 +13,7 @@ from rich.console import Console
 from rich.progress import TaskID, TextColumn
 
 from robosac.cli.blame import check_known, failing
-from robosac.cli.options import progress
+from robosac.cli.options import Seed, progress
 from robosac.cli.outputs import Force, make_folder, tell
 from robosac.detectors.embedded import ADVERSARIAL_WEIGHTS, SHIPPED_WEIGHTS
 from robosac.detectors.weights_file import read_weights
@@ -29,7 +29,7 @@ _ADVERSARIAL_RATE = 1e-3
 
 def run(
     out: Annotated[Path, typer.Option(help="Folder for the checkpoint and the weights.")],
-    seed: Annotated[int, typer.Option(help="Of the initial weights and of every draw.")] = _DEFAULTS.seed,
+    seed: Seed = _DEFAULTS.seed,
     steps: Annotated[int | None, typer.Option(min=100, help="Optimiser steps; 2600, or 900 if adversarial.")] = None,
     scenes: Annotated[int, typer.Option(min=1, help="Training scenes, five frames each.")] = _DEFAULTS.scenes,
     adversarial: Annotated[str | None, typer.Option(help="pgd: go on from the shipped weights, under attack.")] = None,

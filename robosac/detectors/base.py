@@ -146,6 +146,23 @@ def blank(info: DetectorInfo, role: Role) -> Message:
     return Message(np.eye(4), tensors)
 
 
+def misfit(made: object, info: DetectorInfo) -> str | None:
+    """What a message has to be for a detector, and what it is instead; None if it is of the layout of some role."""
+    if not isinstance(made, Message):
+        return f"a Message, got a {type(made).__name__}"
+    for name, array in made.tensors.items():
+        if not isinstance(array, np.ndarray):
+            return f"numpy arrays; {name} is a {type(array).__name__}"
+    held = {name: TensorSpec(array.dtype.name, array.shape) for name, array in made.tensors.items()}
+    if any(wanted.items() <= held.items() for wanted in info.tensors.values()):
+        return None
+    wanted, got = (
+        ", ".join(f"{name} of {spec.dtype} {list(spec.shape)}" for name, spec in specs.items())
+        for specs in (info.tensors["ego"], held)
+    )
+    return f"a message with {wanted}, got {got or 'none'}"
+
+
 class PreparedFrame(Protocol):
     """One frame, encoded and warped once, to be decoded for many subsets of teammates."""
 

@@ -14,7 +14,8 @@ from typing import Literal, Protocol, runtime_checkable
 import numpy as np
 
 from robosac.boxes import FloatArray
-from robosac.detectors import DetectorError, Encoder, Message, TensorSpec
+from robosac.detectors import DetectorError, Encoder, Message
+from robosac.detectors.base import misfit
 
 Split = Literal["test", "validation"]
 """What scenes serve: defences are calibrated on validation scenes and measured on test scenes."""
@@ -129,27 +130,17 @@ def encoded(view: View, detector: Encoder) -> Message:
         If the detector encodes in another layout than it declares, or something that is no finite number.
     """
     recorded: Message | None = getattr(view, "message", None)
-    message = detector.encode(view.points, view.pose) if recorded is None else recorded
-    if not isinstance(message, Message):
-        raise DetectorError(f"{detector.info.name}: encode must return a Message, got a {type(message).__name__}")
+    if recorded is not None:
+        if fault := misfit(recorded, detector.info):
+            raise SceneError(f"of recorded messages the detector {detector.info.name} takes {fault}")
+        return Message(view.pose, recorded.tensors)
+    message = detector.encode(view.points, view.pose)
+    if fault := misfit(message, detector.info):
+        raise DetectorError(f"{detector.info.name}: encode must return {fault}")
     for name, array in message.tensors.items():
-        if not isinstance(array, np.ndarray):
-            kind = type(array).__name__
-            raise DetectorError(f"{detector.info.name}: encode must return numpy arrays; {name} is a {kind}")
-    held = {name: TensorSpec(array.dtype.name, array.shape) for name, array in message.tensors.items()}
-    if any(wanted.items() <= held.items() for wanted in detector.info.tensors.values()):
-        for name in held if recorded is None else ():
-            if not np.isfinite(message.tensors[name]).all():
-                raise DetectorError(f"{detector.info.name}: encode must return finite numbers; {name} holds others")
-        return message if recorded is None else Message(view.pose, recorded.tensors)
-    takes, found = _listed(detector.info.tensors["ego"]), _listed(held)
-    if recorded is None:
-        raise DetectorError(f"{detector.info.name}: encode must return a message with {takes}, got {found or 'none'}")
-    raise SceneError(f"the detector {detector.info.name} takes {takes}; the recorded messages hold {found}")
-
-
-def _listed(specs: Mapping[str, TensorSpec]) -> str:
-    return ", ".join(f"{name} of {spec.dtype} {list(spec.shape)}" for name, spec in specs.items())
+        if not np.isfinite(array).all():
+            raise DetectorError(f"{detector.info.name}: encode must return finite numbers; {name} holds others")
+    return message
 
 
 def first_scenes(source: SceneSource, split: Split, count: int, frames: int = 1, team: int = 1) -> list[Scene]:

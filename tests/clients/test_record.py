@@ -3,6 +3,8 @@ import dataclasses
 import io
 import json
 import sys
+from dataclasses import replace
+from types import SimpleNamespace
 
 import msgpack
 import pytest
@@ -183,7 +185,19 @@ def test_a_defence_that_does_not_ship_has_to_be_named(detector, recorded_moments
     path = write(tmp_path / "own.mcap", detector, recorded_moments[:1], defense={"kind": "of_my_own"})
     status, said = run("replay", path)
     assert status == 2
-    assert "for --recorded-defense: the recorded defence is of_my_own, which does not ship: say where it is" in said
+    assert "for --recorded-defense: the defence of session " in said
+    assert ", of_my_own, does not ship: say where it is" in said
+
+
+def test_all_sessions_of_a_folder_can_be_replayed_or_none_is(detector, recorded_moments, tmp_path):
+    write(tmp_path / "a.mcap", detector, recorded_moments[:1])
+    other = replace(detector.info, name="another")
+    write(tmp_path / "b.mcap", SimpleNamespace(info=other), recorded_moments[:1], session_id="6f" * 16)
+    status, said = run("replay", tmp_path)
+    assert status == 2
+    assert "for --detector: the detector of session " in said
+    assert ", 'another', does not ship; give it" in said
+    assert " on " not in said.partition("Error")[0]
 
 
 def test_a_recording_of_digests_cannot_be_replayed(detector, recorded_moments, tmp_path):

@@ -233,3 +233,31 @@ def test_what_a_detector_lacks_for_a_scene_is_said_with_its_purpose(detector):
     )
     said = lacking(PGD(), Sensing(detector))
     assert "with the attack 'pgd': it lacks attack_surface (Show a frame to an attacker.), perturbed (Put " in said
+
+
+class Shaped:
+    """A detector whose attack surface gives something in another form."""
+
+    def __init__(self, detector, **given):
+        self._detector, self._given = detector, given
+
+    def attack_surface(self, ego, teammates):
+        surface = self._detector.attack_surface(ego, teammates)
+        found = {"messages": surface.messages, "class_logits": surface.class_logits, "perceive": surface.perceive}
+        return SimpleNamespace(**{**found, **self._given})
+
+    def __getattr__(self, name):
+        return getattr(self._detector, name)
+
+
+@pytest.mark.parametrize(
+    ("given", "words"),
+    [
+        ({"messages": []}, "has messages that are no mapping of teammates to tensors, but a list"),
+        ({"messages": {"a": np.zeros(3)}}, "has messages that must be tensors; that of 'a' is a ndarray"),
+        ({"class_logits": lambda _: np.zeros(3)}, "has class_logits that must return a tensor, got a ndarray"),
+    ],
+)
+def test_a_surface_of_another_form_is_told_before(detector, given, words):
+    said = lacking(PGD(), Shaped(detector, **given))
+    assert said == f"pgd cannot attack the detector intersection-mean: its attack surface {words}"

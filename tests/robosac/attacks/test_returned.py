@@ -4,8 +4,19 @@ import numpy as np
 import pytest
 import torch
 
-from robosac.attacks import PGD, Attack, AttackError, Campaign, IterativeAttack, Lie, OnObjects, load_campaign
+from robosac.attacks import (
+    PGD,
+    Attack,
+    AttackError,
+    Campaign,
+    GaussianNoise,
+    IterativeAttack,
+    Lie,
+    OnObjects,
+    load_campaign,
+)
 from robosac.attacks.returned import check_returned
+from robosac.detectors import DetectorError, Message
 from robosac.scenes import IntersectionScene
 from tests.robosac.attacks.linear import Linear
 
@@ -87,6 +98,18 @@ def test_an_aim_that_cannot_be_descended_is_told(value, words):
         Mine().run(Linear(), ["a"], np.random.default_rng(0))
 
 
+@pytest.mark.parametrize("said", [None, "yes"])
+def test_an_attack_says_whether_it_attacks(said):
+    class Mine(PGD):
+        name = "mine"
+
+        def prepare(self, surface, attackers, rng, situation):
+            return said
+
+    with pytest.raises(AttackError, match=f"^mine: prepare must return True or False, got {said!r}$"):
+        Mine().run(Linear(), ["a"], np.random.default_rng(0))
+
+
 class Nothing(Attack):
     """Forgets to return anything."""
 
@@ -103,6 +126,42 @@ def test_a_campaign_looks_at_what_its_attack_returns(detector):
     ego = messages.pop("car-1")
     with pytest.raises(AttackError, match="nothing: run must return a mapping"):
         Campaign(Nothing()).messages(detector, ego, messages, ["rsu"], 0, np.random.default_rng(0))
+
+
+def in_torch(message):
+    return Message(message.pose, {name: torch.from_numpy(array) for name, array in message.tensors.items()})
+
+
+class Perturbing:
+    """A detector that makes something else of an attacker's tensor."""
+
+    def __init__(self, detector, make):
+        self._detector, self._make = detector, make
+
+    def perturbed(self, message, tensor):
+        return self._make(self._detector.perturbed(message, tensor))
+
+    def __getattr__(self, name):
+        return getattr(self._detector, name)
+
+
+@pytest.mark.parametrize(
+    ("make", "words"),
+    [
+        (lambda _: None, "a Message, got a NoneType"),
+        (lambda message: message.tensors["features"], "a Message, got a ndarray"),
+        (in_torch, "numpy arrays; features is a Tensor"),
+        (lambda message: Message(message.pose, {}), r"a message with features of .*, got none"),
+        (
+            lambda message: Message(message.pose, {"features": message.tensors["features"].astype("f8")}),
+            r"a message with features of float16 .*, got features of float64 .*",
+        ),
+    ],
+)
+def test_what_a_detector_makes_of_an_attack_has_to_be_what_it_declares(detector, ego_message, benign, make, words):
+    campaign, rng = Campaign(GaussianNoise()), np.random.default_rng(0)
+    with pytest.raises(DetectorError, match=f"^{detector.info.name}: perturbed must return {words}$"):
+        campaign.messages(Perturbing(detector, make), ego_message, benign, ["rsu"], 0, rng)
 
 
 def test_needs_are_a_tuple_of_names():

@@ -67,6 +67,8 @@ def test_the_version_is_told():
         (["show", "frame", "--out", "x.png", "--pose-error", "inf"], "'--pose-error'"),
         (["calibrate", "--out", "x.json", "--pose-error", "inf"], "'--pose-error'"),
         (["fleet", "--seed", "-1"], "'--seed'"),
+        (["train", "--out", "x", "--seed", "-1"], "'--seed'"),
+        (["witness", "--out", "x.safetensors", "--seed", "99999999999999999999"], "'--seed'"),
         (["load-test", "--seconds", "inf"], "'--seconds'"),
         (["load-test", "--rate", "inf"], "'--rate'"),
         (["overload", "--factor", "inf"], "'--factor'"),
@@ -115,6 +117,9 @@ class Silent(OneByOne):
     def converse(self, team, state, rng):
         yield []
 
+class Another(OneByOne):
+    kind: Literal["halving"] = "halving"
+
 class Forgetful(OneByOne):
     kind: Literal["forgetful"] = "forgetful"
     def initial_state(self, team):
@@ -137,6 +142,7 @@ FEW = ["--scenes", "1", "--frames", "6", "--only", "halving", "--setting", "nois
             "own:Silent, frame 0: TypeError: silent: converse must",
         ),
         (["compare", *FEW, "--defense", "own:Forgetful"], 1, "Error: forgetful: initial_state must return a dict"),
+        (["compare", *FEW, "--defense", "own:Another"], 2, "own:Another: there is another defence of kind 'halving'"),
         (["evaluate", "--detector", "own:unprepared"], 2, "prepare must return a frame to detect in, got a NoneType"),
     ],
 )

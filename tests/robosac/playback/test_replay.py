@@ -92,7 +92,7 @@ def test_a_defence_that_is_not_known_is_named(session, detector):
 def test_the_layout_of_messages_is_compared_before_the_defence(session):
     tensors = {"map": TensorSpec("float32", (2, 3))}
     info = DetectorInfo("other", {"ego": tensors, "teammate": tensors}, (0, 0, 1, 1), 1.0, "", 0.1)
-    with pytest.raises(RecordingError, match=r"other takes map of float32 \[2, 3\]; the recorded messages hold feat"):
+    with pytest.raises(RecordingError, match=r"other takes a message with map of float32 \[2, 3\], got feat"):
         next(replay(session, SimpleNamespace(info=info)))
 
 

@@ -76,9 +76,7 @@ def test_without_truth_it_is_said_what_is_missing(detector, tmp_path):
 
 def test_messages_of_another_layout_are_refused(detector):
     view = View(np.eye(4), np.zeros((0, 3)), message=Message(np.eye(4), {"features": np.zeros((8, 4, 4), np.float16)}))
-    with pytest.raises(
-        SceneError, match=r"takes features .*; the recorded messages hold features of float16 \[8, 4, 4\]"
-    ):
+    with pytest.raises(SceneError, match=r"takes a message with features .*, got features of float16 \[8, 4, 4\]"):
         encoded(view, detector)
 
 
