@@ -11,7 +11,10 @@ from tests.recorded import moments
 
 GOLDEN = Path(__file__).parent / "golden"
 
-LONGEST = ("test_own", "test_training", "test_experiments", "test_words", "test_worlds", "test_remembering")
+LONGEST = (
+    *("test_own", "test_docs", "test_site", "test_training", "test_experiments"),
+    *("test_benchmarks", "test_words", "test_worlds", "test_remembering"),
+)
 """Files that take long come first, or one process would be left with the last of them while the other has none."""
 
 torch.set_num_threads(1)
