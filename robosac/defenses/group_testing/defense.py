@@ -202,18 +202,19 @@ class GroupTesting:
         """
         posterior, memory = self._revive(state)
         suspicion = dict(zip(posterior.members, posterior.marginals().tolist(), strict=True))
+        named = set(named_in(state) or ())
         for name in sorted(suspicion.keys() - set(team)):
-            memory.leave(name, suspicion[name])
+            memory.leave(name, suspicion[name], name in named)
             posterior.remove(name)
-        self._welcome(posterior, memory, team)
-        kept = [[name for name in of if name in set(team)] for of in (trusted_in(state), named_in(state) or ())]
-        return remember(posterior, memory, *kept)
+        named |= self._welcome(posterior, memory, team)
+        trusted = [name for name in trusted_in(state) if name in set(team)]
+        return remember(posterior, memory, trusted, [name for name in posterior.members if name in named])
 
     def converse(self, team: Sequence[str], state: State, rng: np.random.Generator) -> Conversation:
         """Steps 1 to 6, one hypothesis a batch."""
         settings = self.settings
         posterior, memory = self._revive(state)
-        self._welcome(posterior, memory, team)
+        returned = self._welcome(posterior, memory, team)
         first = memory.frame == 0
         if not first:
             told = settings.hijack, settings.recovery, settings.kind_change
@@ -226,7 +227,7 @@ class GroupTesting:
         known = Knowledge(self.model, posterior, memory, period_s)
         evidence = self.evidence(known, compare_frames=settings.compare_frames is not False)
         judged = JudgedFrame(known, evidence, tuple(team), frozenset(trusted_in(state)))
-        named = frozenset(named_in(state) or ())
+        named = returned.union(named_in(state) or ())
         inspection = Inspection(Findings(known, memory.lies, tuple(team), named), settings.keep_contradicted)
         passes, inspections = settings.first_budget if first else settings.budget, settings.inspections
         most = passes + inspections
@@ -269,11 +270,14 @@ class GroupTesting:
             return self._prior([name for block in known["blocks"] for name in block["members"]]), memory
         return Posterior.from_state(known, self.settings.attack_prior, self.settings.attacker_prior), memory
 
-    def _welcome(self, posterior: Posterior, memory: Memory, team: Sequence[str]) -> None:
-        """Let those join who are new in the team."""
+    def _welcome(self, posterior: Posterior, memory: Memory, team: Sequence[str]) -> frozenset[str]:
+        """Let those join who are new in the team. Given are those of them who were named when they left."""
+        prior, named = self.settings.attack_prior * self.settings.attacker_prior, list[str]()
         for name in sorted(set(team) - set(posterior.members)):
-            prior = self.settings.attack_prior * self.settings.attacker_prior
-            posterior.add(name, memory.welcome(name, prior))
+            suspicion, was_named = memory.welcome(name, prior)
+            posterior.add(name, suspicion)
+            named += [name] if was_named else []
+        return frozenset(named)
 
 
 def _likely(subset: Hypothesis, team: Hypothesis, judged: JudgedFrame, known: Knowledge) -> Iterator[Hypothesis]:

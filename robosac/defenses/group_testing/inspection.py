@@ -122,11 +122,12 @@ class Inspection:
             for name, without in one_out(answer, found.shown).items()
             for index, at, _ in found.reshaped(answer, without, (name,))
         ]
-        return self._kept(judge(shown, list(found.shown.values()), shapes))
+        return self._kept(judge(shown, list(found.shown.values()), shapes, found.of_ego))
 
     def judged_alone(self, answer: Hypothesis, boxes: FloatArray, testimony: Testimony) -> Judged:
         """How each box (n, 6) of an answer stands that was not decoded as a test: by testimony alone."""
-        return self._kept(judge(Shown(answer, boxes, self._found.hear(testimony)), ()))
+        shown = Shown(answer, boxes, self._found.hear(testimony))
+        return self._kept(judge(shown, (), of_ego=self._found.of_ego))
 
     def _kept(self, judged: Judged) -> Judged:
         objects, contradicted = judged

@@ -79,6 +79,29 @@ LATE_FRAMES = 5
 """An ego that was late is late for so many frames: a scanner's delay stays, and not every frame shows it."""
 
 
+@dataclass(frozen=True)
+class Left:
+    """What was known of a teammate when it left."""
+
+    suspicion: float
+    frame: int
+    named: bool
+    levels: Mapping[str, tuple[float, float]]
+    """See `Lies.levels`."""
+
+    def to_state(self) -> list[Any]:
+        """JSON values that `from_state` reads."""
+        return [self.suspicion, self.frame, self.named, {kind: list(pair) for kind, pair in self.levels.items()}]
+
+    @classmethod
+    def from_state(
+        cls, suspicion: float, frame: int, named: bool = False, levels: Mapping[str, Sequence[float]] | None = None
+    ) -> Left:
+        """What `to_state` wrote; older versions wrote only the first two."""
+        known = {kind: (float(level), float(highest)) for kind, (level, highest) in (levels or {}).items()}
+        return cls(float(suspicion), int(frame), named, known)
+
+
 @dataclass
 class Memory:
     """Mutable while a frame is judged."""
@@ -89,8 +112,8 @@ class Memory:
     """By test: when it was made last, as (frame, sign); the sign says whether it spoke for an attacker."""
     evidence: dict[str, list[dict[str, Any]]] = field(default_factory=dict)
     """By teammate: what spoke for or against those under suspicion; JSON values."""
-    left: dict[str, tuple[float, int]] = field(default_factory=dict)
-    """By teammate: of those who left, their suspicion then and the frame."""
+    left: dict[str, Left] = field(default_factory=dict)
+    """By teammate: what was known of those who left."""
     shown: dict[int, FloatArray] = field(default_factory=dict)
     """By the sum of its identities: what each subset decoded in the latest frame showed (n, 4), see
     `geometry.followed`.
@@ -160,24 +183,33 @@ class Memory:
         against = [i for i in self.evidence.get(teammate, ()) if i["log_likelihood_ratio"] > 0]
         return len({tuple(sorted([*i["teammates"], *i.get("joining", ())])) for i in against})
 
-    def leave(self, teammate: str, suspicion: float) -> None:
-        """Remember who left."""
+    def leave(self, teammate: str, suspicion: float, named: bool) -> None:
+        """Remember who left, and whether it was named."""
+        levels = self.lies.levels.get(teammate, {})
         self.evidence.pop(teammate, None)
         self.lies.forget(teammate)
         self.straying.forget(teammate)
         self.placing.forget(teammate)
         self.steadiness.levels.pop(teammate, None)
         self.senders.pop(teammate, None)
-        self.left[teammate] = (suspicion, self.frame)
+        self.left[teammate] = Left(suspicion, self.frame, named, levels)
         while len(self.left) > MAX_LEFT:  # not by their order, which a state that was stored has lost
-            del self.left[min(self.left, key=lambda name: (self.left[name][1], name))]
+            del self.left[min(self.left, key=lambda name: (self.left[name].frame, name))]
 
-    def welcome(self, teammate: str, prior: float) -> float | None:
-        """Suspicion of one that joins: None if it was never here, else what is left of what was known."""
+    def welcome(self, teammate: str, prior: float) -> tuple[float | None, bool]:
+        """Suspicion of one that joins, and whether it was named: None if it was never here, else what is left of what
+        was known. So it is with its lies.
+        """
         if teammate not in self.left:
-            return None
-        suspicion, frame = self.left.pop(teammate)
-        return prior + (suspicion - prior) * math.exp(-(self.frame - frame) / FORGETTING_FRAMES)
+            return None, False
+        left = self.left.pop(teammate)
+        kept = math.exp(-(self.frame - left.frame) / FORGETTING_FRAMES)
+        if left.levels:
+            self.lies.levels[teammate] = {
+                kind: (round(level * kept, 4), round(highest * kept, 4))
+                for kind, (level, highest) in left.levels.items()
+            }
+        return prior + (left.suspicion - prior) * kept, left.named
 
     def to_state(self) -> dict[str, Any]:
         """JSON values that `from_state` reads; tests too long ago are left out."""
@@ -185,7 +217,7 @@ class Memory:
             "frame": self.frame,
             "tests": {f"{k:016x}": [f, s] for k, (f, s) in self.tests.items() if self.frame - f <= REPEAT_MEMORY},
             "evidence": self.evidence,
-            "left": {name: [p, f] for name, (p, f) in self.left.items()},
+            "left": {name: left.to_state() for name, left in self.left.items()},
             "shown": {f"{key:016x}": decimals.as_text(boxes.ravel(), 6) for key, boxes in self.shown.items()},
             "shown_in": self.shown_in,
             "senders": {name: list(place) for name, place in self.senders.items()},
@@ -206,7 +238,7 @@ class Memory:
             frame=int(state["frame"]),
             tests={int(key, 16): (int(f), int(s)) for key, (f, s) in state["tests"].items()},
             evidence={name: [dict(item) for item in items] for name, items in state["evidence"].items()},
-            left={name: (float(p), int(f)) for name, (p, f) in state["left"].items()},
+            left={name: Left.from_state(*of) for name, of in state["left"].items()},
             # none of them is in the states of older versions
             shown={int(key, 16): _boxes(kept) for key, kept in state.get("shown", {}).items()},
             shown_in=int(state.get("shown_in", 0)),

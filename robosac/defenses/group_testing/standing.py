@@ -25,7 +25,12 @@ Repair = tuple[Shown, int]
 """A box of another fusion."""
 
 
-def judge(answer: Shown, decoded: Sequence[Shown], reshaped: Sequence[tuple[int, Shown, int]] = ()) -> Judged:
+def judge(
+    answer: Shown,
+    decoded: Sequence[Shown],
+    reshaped: Sequence[tuple[int, Shown, int]] = (),
+    of_ego: Shown | None = None,
+) -> Judged:
     """Judge the boxes of an answer.
 
     1. A contradicted box is left out.
@@ -46,6 +51,9 @@ def judge(answer: Shown, decoded: Sequence[Shown], reshaped: Sequence[tuple[int,
     answer : Shown
     decoded : sequence of Shown
         All that was decoded in the frame.
+    of_ego : Shown, optional
+        What the ego shows alone. An answer with one teammate has no other part: what it has lost of this, and shows
+        nothing near, is taken from there if the ego supports it.
     reshaped : sequence of tuple
         Of boxes of the answer that have a false shape: which, a part, and which box of that.
     """
@@ -77,11 +85,22 @@ def judge(answer: Shown, decoded: Sequence[Shown], reshaped: Sequence[tuple[int,
             if kept[index]:
                 kept[index] = False
                 repairs.append((part, at))
+    if of_ego is not None and len(answer.teammates) == 1:
+        repairs += [(of_ego, at) for at in _holes(answer, kept, of_ego)]
     repairs, kept = _each_once(repairs, answer, kept)
     objects = _judged(answer, np.flatnonzero(kept))
     for part, at in repairs:
         objects += _judged(part, np.array([at]), None if (part.teammates, at) in by_one else _repaired(part, at))
     return tuple(objects), tuple(_judged(answer, np.flatnonzero(contradicted), Standing.CONTRADICTED))
+
+
+def _holes(answer: Shown, kept: BoolArray, of_ego: Shown) -> list[int]:
+    """Boxes of what the ego shows alone, by their places there, that an answer with one teammate has lost, and that no
+    box is near which it keeps (n,).
+    """
+    near = answer.boxes[kept & (answer.boxes[:, 5] >= SHOWN_SCORE), :2]
+    lost = gone(answer, of_ego, answer.teammates).tolist()
+    return [at for at in lost if np.hypot(*(near - of_ego.boxes[at, :2]).T).min(initial=np.inf) > SAME_M]
 
 
 def _each_once(repairs: Sequence[Repair], answer: Shown, kept: BoolArray) -> tuple[list[Repair], BoolArray]:

@@ -229,7 +229,7 @@ def test_where_senders_were_is_known_for_some_seconds():
 
 def test_who_leaves_is_nowhere_when_another_of_that_name_joins():
     memory = Memory(senders={"a": (1.0, 2.0, 6, 0.5, 0.1), "b": (1.0, 2.0, 6, 0.5, 0.1)})
-    memory.leave("a", 0.1)
+    memory.leave("a", 0.1, named=False)
     assert set(memory.senders) == {"b"}
 
 

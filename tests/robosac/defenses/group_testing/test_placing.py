@@ -254,7 +254,7 @@ def test_it_is_kept_and_forgotten():
     placing.lose([LIAR], 5)
     memory = Memory.from_state(json.loads(json.dumps(Memory(placing=placing).to_state())))
     assert memory.placing == placing
-    memory.leave(LIAR, 0.5)
+    memory.leave(LIAR, 0.5, named=False)
     assert LIAR not in {*memory.placing.off, *memory.placing.out, *memory.placing.lost}
     assert Memory.from_state({**Memory().to_state(), "placing": {}}).placing == Placing()
 

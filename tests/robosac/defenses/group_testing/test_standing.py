@@ -216,6 +216,33 @@ def test_two_boxes_out_of_place_that_stand_for_one_vehicle_are_repaired_as_one()
     assert [judged.subset for judged in objects if judged.index >= len(SEEN)] == [part.teammates]
 
 
+@pytest.mark.parametrize(
+    ("team", "said", "stands"),
+    [
+        ((LIAR,), {EGO: 6.5, LIAR: NO}, True),
+        ((LIAR,), {EGO: 6.5}, True),
+        ((LIAR,), {EGO: 2.0, LIAR: NO}, False),
+        (("car-2", LIAR), {EGO: 6.5}, False),  # the fusion of either is asked
+    ],
+)
+def test_what_the_ego_sees_alone_the_only_one_that_sends_does_not_take_away(team, said, stands):
+    known = {name: [(*place, YES) for place in SEEN[:, :2]] + [(*PLACE, said.get(name, 0.0))] for name in (EGO, *team)}
+    hearing = Hearing(saying(known), ())
+    answer, of_ego = Shown(team, SEEN, hearing), Shown((), np.vstack([SEEN, CAR]), hearing)
+    objects, contradicted = judge(answer, [answer], of_ego=of_ego)
+    assert contradicted == ()
+    taken = [box for box in objects if box.subset == ()]
+    assert [(box.index, box.support.status) for box in taken] == [(len(SEEN), Standing.REPAIRED)] * stands
+
+
+def test_where_the_only_one_that_sends_shows_something_near_the_ego_alone_adds_nothing():
+    known = {name: [(*place, YES) for place in SEEN[:, :2]] + [(*PLACE, YES)] for name in (EGO, LIAR)}
+    hearing = Hearing(saying(known), ())
+    answer, of_ego = (Shown(team, np.vstack([SEEN, car]), hearing) for team, car in (((LIAR,), CAR), ((), ASIDE)))
+    objects, _ = judge(answer, [answer], of_ego=of_ego)
+    assert {box.subset for box in objects} == {(LIAR,)}
+
+
 def test_where_only_the_ego_is_heard_its_word_is_enough():
     testimony = World({EGO: YES, "car-2": NO}, lambda _: CAR).testimony
     shown = Shown(("car-2",), np.vstack([SEEN, CAR]), Hearing(testimony, TEAM))

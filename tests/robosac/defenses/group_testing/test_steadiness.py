@@ -106,5 +106,5 @@ def test_frames_that_cannot_be_compared_say_nothing():
 
 def test_who_leaves_is_forgotten():
     memory = play(range(4), team={"a": {"boxes": 20, "jumping": 6}})
-    memory.leave("a", 0.9)
+    memory.leave("a", 0.9, named=False)
     assert memory.steadiness.levels == {}

@@ -198,7 +198,7 @@ def test_of_a_large_team_only_those_are_asked_again_against_whom_there_is_someth
 
 def test_who_leaves_is_forgotten():
     memory = Memory(straying=Straying({LIAR: (0.7, 0.7)}))
-    memory.leave(LIAR, 0.1)
+    memory.leave(LIAR, 0.1, named=False)
     assert memory.straying == Straying()
 
 

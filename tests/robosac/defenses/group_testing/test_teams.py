@@ -1,5 +1,6 @@
 import json
 
+import numpy as np
 import pytest
 
 from robosac.answers import Source, Verdict
@@ -8,6 +9,7 @@ from robosac.defenses.group_testing import OPEN, GroupTestingSettings
 from robosac.defenses.group_testing.defense import HIJACKED_OF
 from robosac.defenses.group_testing.lies import RULES
 from robosac.defenses.group_testing.memory import FORGETTING_FRAMES, MAX_LEFT, Memory
+from tests.robosac.defenses.group_testing import one_place
 from tests.robosac.defenses.group_testing.conversing import SEEN, TEAM, make_model, outcome, run_frame
 from tests.robosac.defenses.group_testing.sessions import DEFENSE, named, run, with_settings
 
@@ -59,21 +61,58 @@ def test_a_team_that_changes(rng):
     back = DEFENSE.change_team(json.loads(json.dumps(without)), TEAM)
     assert back["suspicion"]["car-3"] == pytest.approx(known.suspicion["car-3"], abs=1e-4)
     assert "car-3" not in back["trusted"]
+    assert back["named"] == known.state["named"] == ["car-3"]
     long_ago = {**without, "memory": {**without["memory"], "frame": int(20 * FORGETTING_FRAMES)}}
     stranger = DEFENSE.change_team(without, [*without["suspicion"], "new"])["suspicion"]["new"]
     assert DEFENSE.change_team(long_ago, TEAM)["suspicion"]["car-3"] == pytest.approx(
         stranger, abs=5e-3
     )  # who knows of an attack
     assert 0.05 < stranger < 0.25
+    decision, _ = run(DEFENSE, [], 1, rng, long_ago)
+    assert named(decision) == set()
+
+
+def test_whoever_returns_is_held_to_what_it_did():
+    """It had left in the hope to be as one that never lied."""
+    known = one_place.ERASED.play(5, quiet=4)[-1][0].state
+    assert known["named"] == [one_place.LIAR]
+    without = one_place.DEFENSE.change_team(known, [name for name in TEAM if name != one_place.LIAR])
+    away, rng = without, np.random.default_rng(0)
+    for _ in range(3):
+        decision, _ = run_frame(
+            one_place.DEFENSE,
+            away,
+            tuple(n for n in TEAM if n != one_place.LIAR),
+            [],
+            rng,
+            judge=one_place.HONEST.judge,
+        )
+        away = json.loads(json.dumps(decision.state))
+    back = one_place.DEFENSE.change_team(away, TEAM)
+    assert back["named"] == [one_place.LIAR]
+    levels, before = (state["memory"]["lies"]["levels"][one_place.LIAR] for state in (back, known))
+    assert levels == {kind: pytest.approx(pair, rel=0.01) for kind, pair in before.items()}
+    decision, _ = run_frame(one_place.DEFENSE, back, TEAM, [], rng, judge=one_place.HONEST.judge)
+    assert decision.named == (one_place.LIAR,)
+    assert one_place.LIAR not in decision.accepted
+
+
+def test_what_an_older_version_remembered_of_who_left_is_taken_over():
+    known = one_place.ERASED.play(5, quiet=4)[-1][0].state
+    without = one_place.DEFENSE.change_team(known, [name for name in TEAM if name != one_place.LIAR])
+    without["memory"]["left"] = {name: of[:2] for name, of in without["memory"]["left"].items()}
+    back = one_place.DEFENSE.change_team(without, TEAM)
+    assert back["suspicion"][one_place.LIAR] > 0.9
+    assert back["named"] == []
 
 
 def test_the_latest_who_left_are_remembered_in_whatever_order_they_are_kept():
     memory = Memory()
     for number in range(MAX_LEFT):
         memory.frame = number
-        memory.leave(f"car-{MAX_LEFT - number:04d}", 0.5)
+        memory.leave(f"car-{MAX_LEFT - number:04d}", 0.5, named=False)
     memory = Memory.from_state(json.loads(json.dumps(memory.to_state(), sort_keys=True)))
-    memory.leave("one more", 0.5)
+    memory.leave("one more", 0.5, named=False)
     assert set(memory.left) == {"one more", *(f"car-{MAX_LEFT - number:04d}" for number in range(1, MAX_LEFT))}
 
 
