@@ -113,7 +113,7 @@ def test_what_cannot_be_is_said_before_the_work(own):
     small = robosac("calibrate", "--detector", "my_detector:build", "--data", "my_data:Road", *few)
     assert small.exit_code == 2
     assert "for --scenes: 2 are too few" in said(small)
-    assert "take 6" in said(small)
+    assert "try 6" in said(small)
     quick = ["--quick", "--scenes", 1, "--frames", 6, "--only", "one_by_one", "--only", "group_testing"]
     asked = robosac("compare", "--detector", "my_detector:build", "--out", "out", *quick)
     assert asked.exit_code == 2
