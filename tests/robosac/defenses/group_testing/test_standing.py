@@ -8,7 +8,7 @@ from robosac.defenses import EGO
 from robosac.defenses.group_testing import GroupTesting, GroupTestingSettings
 from robosac.defenses.group_testing.hearing import Hearing
 from robosac.defenses.group_testing.objects import Shown
-from robosac.defenses.group_testing.standing import judge
+from robosac.defenses.group_testing.standing import _holes, judge
 from tests.robosac.defenses.group_testing.conversing import TEAM
 from tests.robosac.defenses.group_testing.one_place import (
     ASIDE,
@@ -235,12 +235,24 @@ def test_what_the_ego_sees_alone_the_only_one_that_sends_does_not_take_away(team
     assert [(box.index, box.support.status) for box in taken] == [(len(SEEN), Standing.REPAIRED)] * stands
 
 
-def test_where_the_only_one_that_sends_shows_something_near_the_ego_alone_adds_nothing():
-    known = {name: [(*place, YES) for place in SEEN[:, :2]] + [(*PLACE, YES)] for name in (EGO, LIAR)}
+def test_a_session_answers_what_the_ego_sees_alone_too():
+    world = World({EGO: 6.5, LIAR: NO}, nothing, team=(LIAR,))
+    world.alone = np.vstack([SEEN, CAR])
+    ((decision, _),) = world.play(1)
+    assert decision.accepted == (LIAR,)
+    (taken,) = [judged for judged in decision.objects if judged.subset == ()]
+    assert (taken.index, taken.support.status) == (len(SEEN), Standing.REPAIRED)
+
+
+@pytest.mark.parametrize("kept", [True, False])
+def test_where_the_only_one_that_sends_shows_something_near_the_ego_alone_adds_nothing(kept):
+    """Unless that is left out itself."""
+    known = {name: [(*place, YES) for place in SEEN[:, :2]] + [(*PLACE, 6.5)] for name in (EGO, LIAR)}
     hearing = Hearing(saying(known), ())
-    answer, of_ego = (Shown(team, np.vstack([SEEN, car]), hearing) for team, car in (((LIAR,), CAR), ((), ASIDE)))
-    objects, _ = judge(answer, [answer], of_ego=of_ego)
-    assert {box.subset for box in objects} == {(LIAR,)}
+    faint = ASIDE + [0, 0, 0, 0, 0, 0.4 - ASIDE[0, 5]]
+    answer, of_ego = (Shown(team, np.vstack([SEEN, car]), hearing) for team, car in (((LIAR,), faint), ((), CAR)))
+    stays = np.array([True] * len(SEEN) + [kept])
+    assert _holes(answer, stays, of_ego) == [len(SEEN)] * (not kept)
 
 
 def test_where_only_the_ego_is_heard_its_word_is_enough():

@@ -97,6 +97,17 @@ def test_whoever_returns_is_held_to_what_it_did():
     assert one_place.LIAR not in decision.accepted
 
 
+def test_whoever_returns_with_a_frame_is_held_to_it_too():
+    """The library has no team but that of each frame."""
+    known = one_place.ERASED.play(5, quiet=4)[-1][0].state
+    without = one_place.DEFENSE.change_team(known, [name for name in TEAM if name != one_place.LIAR])
+    without["memory"]["lies"]["levels"] = {}
+    without["memory"]["left"][one_place.LIAR][3] = {}
+    rng = np.random.default_rng(0)
+    decision, _ = run_frame(one_place.DEFENSE, without, TEAM, [], rng, judge=one_place.HONEST.judge)
+    assert decision.named == (one_place.LIAR,)
+
+
 def test_what_an_older_version_remembered_of_who_left_is_taken_over():
     known = one_place.ERASED.play(5, quiet=4)[-1][0].state
     without = one_place.DEFENSE.change_team(known, [name for name in TEAM if name != one_place.LIAR])
