@@ -7,7 +7,7 @@ from typing import Any
 
 from robosac.attacks.adaptive import Erase, Invent, InventSteady, Shift
 from robosac.attacks.base import Attack, IterativeAttack
-from robosac.attacks.campaign import BEHAVIOURS, HONEST, SEPARATOR, Campaign, lacking
+from robosac.attacks.campaign import BEHAVIOURS, HONEST, SEPARATOR, Campaign
 from robosac.attacks.carlini_wagner import CarliniWagner
 from robosac.attacks.denial import Deny
 from robosac.attacks.geometric import NoGeometry
@@ -17,6 +17,7 @@ from robosac.attacks.hearing import Hearing, NoWitness
 from robosac.attacks.noise import GaussianNoise
 from robosac.attacks.objects import OnObjects
 from robosac.attacks.replays import Copy, Elsewhere, Frozen, Replay, Stale
+from robosac.attacks.requirements import lacking
 from robosac.attacks.returned import AttackError
 from robosac.attacks.situation import Foreign, Lie, Past, Situation
 from robosac.attacks.still import EraseStill, InventStill, ShiftStill
