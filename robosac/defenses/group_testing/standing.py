@@ -51,11 +51,11 @@ def judge(
     answer : Shown
     decoded : sequence of Shown
         All that was decoded in the frame.
+    reshaped : sequence of tuple
+        Of boxes of the answer that have a false shape: which, a part, and which box of that.
     of_ego : Shown, optional
         What the ego shows alone. An answer with one teammate has no other part: what it has lost of this, and shows
         nothing near, is taken from there if the ego supports it.
-    reshaped : sequence of tuple
-        Of boxes of the answer that have a false shape: which, a part, and which box of that.
     """
     parts = [shown for shown in decoded if shown.teammates and set(shown.teammates) < set(answer.teammates)]
     away, contradicted, displaced = answer.away(), answer.contradicted, answer.displaced
