@@ -1,8 +1,9 @@
 """A spinning LiDAR by ray casting against upright boxes and the ground.
 
-Rays are cast in two stages. Seen from above, a ray is a half-line, and most boxes are missed by most azimuths; only for
-the (azimuth, box) pairs that meet is the height of each beam compared with the box. That keeps a scan of 25,200 rays
-among 70 boxes near a millisecond without any compiled code.
+Rays are cast in stages. Seen from above, a ray is a half-line, and most boxes are missed by most azimuths: only rays
+towards a circle around a box are tried against the box, and only for the (azimuth, box) pairs that meet is the height
+of each beam compared with it. That keeps a scan of 25,200 rays among 70 boxes at some milliseconds without any compiled
+code.
 """
 
 from __future__ import annotations
@@ -14,6 +15,8 @@ import numpy as np
 from robosac.boxes import FloatArray, IntArray
 
 _PARALLEL = 1e-12
+_SLACK_M = 1e-3
+"""Added to the circles around boxes, as ranges are rounded."""
 
 Float32Array = np.ndarray[tuple[int, ...], np.dtype[np.float32]]
 
@@ -64,7 +67,8 @@ class Lidar:
         nearest = np.broadcast_to(ground, (self.azimuths, self.beams)).copy()
         owner = np.full((self.azimuths, self.beams), -1, dtype=np.int64)
 
-        ray, box, enter, leave = _crossings(obstacles, x, y, azimuth + yaw)
+        ray, box = _towards(obstacles, x, y, yaw, self.azimuths, self.range_m)
+        ray, box, enter, leave = _crossings(obstacles, x, y, azimuth + yaw, ray, box)
         if len(ray):
             distance = _beam_ranges(enter, leave, obstacles[box, 5].astype(np.float32), z, slope)
             first = np.flatnonzero(np.r_[True, ray[1:] != ray[:-1]])
@@ -86,26 +90,43 @@ class Lidar:
         return points, np.bincount(owners[owners >= 0], minlength=len(obstacles))
 
 
+def _towards(
+    obstacles: FloatArray, x: float, y: float, yaw: float, azimuths: int, range_m: float
+) -> tuple[IntArray, IntArray]:
+    """Pairs of ray and box, sorted, of which the ray goes towards a circle around the box that is within reach."""
+    dx, dy = obstacles[:, 0] - x, obstacles[:, 1] - y
+    away, radius = np.hypot(dx, dy), np.hypot(obstacles[:, 2], obstacles[:, 3]) / 2 + _SLACK_M
+    near = np.flatnonzero(away - radius <= range_m)
+    away, radius, bearing = away[near], radius[near], np.arctan2(dy[near], dx[near]) - yaw
+    inside = away <= radius
+    half = np.where(inside, np.pi, np.arcsin(np.minimum(1.0, radius / np.maximum(away, radius))))
+    step = 2 * np.pi / azimuths
+    first = np.floor((bearing - half) / step).astype(np.int64)
+    count = np.minimum(np.ceil((bearing + half) / step).astype(np.int64) - first + 1, azimuths)
+    number = np.arange(count.sum()) - np.repeat(np.cumsum(count) - count, count)
+    ray, box = (np.repeat(first, count) + number) % azimuths, np.repeat(near, count)
+    order = np.argsort(ray, kind="stable")
+    return ray[order], box[order]
+
+
 def _crossings(
-    obstacles: FloatArray, x: float, y: float, azimuth: FloatArray
+    obstacles: FloatArray, x: float, y: float, azimuth: FloatArray, ray: IntArray, box: IntArray
 ) -> tuple[IntArray, IntArray, Float32Array, Float32Array]:
-    """Pairs of ray and box that meet seen from above, sorted by ray, with the ranges of entry and exit (slab
-    method).
-    """
+    """Those pairs of ray and box that meet seen from above, with the ranges of entry and exit (slab method)."""
     cos, sin = np.cos(obstacles[:, 4]), np.sin(obstacles[:, 4])
     dx, dy = x - obstacles[:, 0], y - obstacles[:, 1]
-    start_u = (cos * dx + sin * dy).astype(np.float32)
-    start_v = (-sin * dx + cos * dy).astype(np.float32)
-    turn = azimuth[:, None] - obstacles[None, :, 4]
-    half_u = (obstacles[:, 2] / 2).astype(np.float32)
-    half_v = (obstacles[:, 3] / 2).astype(np.float32)
+    start_u = (cos * dx + sin * dy).astype(np.float32)[box]
+    start_v = (-sin * dx + cos * dy).astype(np.float32)[box]
+    turn = azimuth[ray] - obstacles[box, 4]
+    half_u = (obstacles[:, 2] / 2).astype(np.float32)[box]
+    half_v = (obstacles[:, 3] / 2).astype(np.float32)[box]
     inv_u, inv_v = 1 / _not_zero(np.cos(turn)), 1 / _not_zero(np.sin(turn))
     mid_u, mid_v = -start_u * inv_u, -start_v * inv_v
     reach_u, reach_v = half_u * np.abs(inv_u), half_v * np.abs(inv_v)
     enter = np.maximum(mid_u - reach_u, mid_v - reach_v)
     leave = np.minimum(mid_u + reach_u, mid_v + reach_v)
-    ray, box = np.nonzero((enter < leave) & (enter > 0))
-    return ray, box, enter[ray, box], leave[ray, box]
+    meet = (enter < leave) & (enter > 0)
+    return ray[meet], box[meet], enter[meet], leave[meet]
 
 
 def _not_zero(direction: FloatArray) -> Float32Array:

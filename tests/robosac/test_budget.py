@@ -44,7 +44,7 @@ def test_formulas_give_table_1(eta, s, n, success, mean, n_exact, _, __):
 
 @pytest.mark.parametrize(("eta", "s", "n", "_", "mean", "__", "mean_distinct", "most_distinct"), TABLE_1)
 def test_algorithm_1_with_a_perfect_oracle_reproduces_table_1(eta, s, n, _, mean, __, mean_distinct, most_distinct):
-    attackers, runs = attackers_in_team(5, eta), 4000
+    attackers, runs = attackers_in_team(5, eta), 1000
     q = clean_probability(5, attackers, s)
 
     independent = SampleConsensus.independent(attacker_ratio=eta, sampling_budget=10_000, collaborators=s)

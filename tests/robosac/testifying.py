@@ -1,6 +1,7 @@
 """Hand-made testimony: who says what of which place."""
 
 import numpy as np
+from scipy.spatial.distance import cdist
 
 from robosac.boxes import pose_matrix
 from robosac.detectors.witness import as_testimony
@@ -38,12 +39,13 @@ def saying(said, poses=None, seen=None) -> Testimony:
         places = np.reshape(np.asarray(said[name], dtype=np.float64), (-1, 3))
         for place in places:
             px, py = from_ego[index, :2, :2] @ place[:2] + from_ego[index, :2, 2]
-            far = np.hypot(x - px, y - py)
+            near = tuple(slice(*np.searchsorted(centres, (at - SPREAD_M, at + SPREAD_M))) for at in (py, px))
+            far = np.hypot(x[near] - px, y[near] - py)
             firmly = place[2] - SLOPE * np.sign(place[2]) * far
-            maps[index, LIKELIHOOD] = np.where(far <= SPREAD_M, firmly, maps[index, LIKELIHOOD])
+            maps[index, LIKELIHOOD][near] = np.where(far <= SPREAD_M, firmly, maps[index, LIKELIHOOD][near])
         known = np.reshape((seen or {}).get(name, places[places[:, 2] > 0, :2]), (-1, 2))
         if len(known):
             known = known @ from_ego[index, :2, :2].T + from_ego[index, :2, 2]
-            nearest = np.hypot(x[..., None] - known[:, 0], y[..., None] - known[:, 1]).argmin(axis=-1)
+            nearest = cdist(known, np.column_stack([x.ravel(), y.ravel()])).argmin(axis=0).reshape(x.shape)
             maps[index, X], maps[index, Y] = known[nearest, 0] - x, known[nearest, 1] - y
     return as_testimony(agents, maps, from_ego, HALF_EXTENT_M)

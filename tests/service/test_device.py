@@ -15,8 +15,7 @@ from tests.service.conftest import serve
 SETTINGS = [{"kind": "group_testing"}, {"kind": "sample_consensus", "collaborators": 3}]
 
 
-@pytest.mark.parametrize("settings", SETTINGS, ids=lambda s: s["kind"])
-@pytest.mark.parametrize("begun", [True, False])
+@pytest.mark.parametrize(("settings", "begun"), [*zip(SETTINGS, (True, False), strict=True)], ids=["begun", "whole"])
 async def test_frames_are_decided_there_as_here(settings, begun, detector, ego_message, attacked):
     team = list(attacked)
     here = Session(detector, team, defense_for(settings, detector.info))

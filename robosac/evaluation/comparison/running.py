@@ -83,8 +83,10 @@ def _rows(plan: Plan, scenes: Sequence[PlayedScene]) -> list[Row]:
 def _in_processes(
     plans: Sequence[Plan], scenes: Sequence[int], jobs: int, tick: Callable[[], None]
 ) -> list[list[PlayedScene]]:
-    # spawned, as a process with threads (of the progress bar, of torch) must not be forked
-    context = get_context("spawn")
+    # forked from one that has imported all and done nothing: a process with threads (of the progress bar, of torch)
+    # must not be forked, and one that is spawned imports torch for itself
+    context = get_context("forkserver")
+    context.set_forkserver_preload([__name__])
     done: Synchronized[int] = context.Value("L", 0)
     told = 0
     with ProcessPoolExecutor(min(jobs, sum(scenes)), context, _begin, (plans, done)) as pool:

@@ -30,7 +30,7 @@ def estimate(attackers, rng, defense=A2CP(), team=TEAM):
 @pytest.mark.parametrize(("attackers", "steps", "ratio"), PAPER)
 def test_reproduces_the_papers_estimation_of_the_attacker_ratio(attackers, steps, ratio):
     rng = np.random.default_rng(attackers)
-    runs = [estimate(attackers, rng) for _ in range(2000)]
+    runs = [estimate(attackers, rng) for _ in range(500)]
     total = np.mean([run[0] for run in runs])
     assert total == pytest.approx(steps, rel=0.15)
     if attackers in (0, 5):

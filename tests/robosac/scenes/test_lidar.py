@@ -1,7 +1,7 @@
 import numpy as np
 import pytest
 
-from robosac.scenes import Lidar
+from robosac.scenes import Lidar, lidar
 
 EXACT = Lidar(noise_m=0.0, dropout=0.0)
 SENSOR = (0.0, 0.0, 1.7, 0.0)
@@ -84,3 +84,21 @@ def test_dropout_and_noise_are_as_stated():
     blurred, _ = cast(Lidar(noise_m=0.05, dropout=0.0), wall)
     spread = np.hypot(blurred[:, 0], blurred[:, 1]) - np.hypot(exact[:, 0], exact[:, 1])
     assert spread.std() == pytest.approx(0.05, rel=0.05)
+
+
+def test_rays_that_are_not_tried_would_have_met_nothing(rng, monkeypatch):
+    """Also of a sensor close to boxes, or between them, and of boxes out of reach."""
+    boxes = np.column_stack([rng.uniform(-70, 70, (60, 2)), rng.uniform(0.5, 12, (60, 2)), rng.uniform(-4, 4, 60)])
+    boxes = np.column_stack([boxes, rng.uniform(0.5, 9, 60)])
+    origins = [(*rng.uniform(-60, 60, 2), 1.7, rng.uniform(-7, 7)) for _ in range(10)]
+    origins += [(*(box[:2] + rng.normal(0, 3, 2)), 1.7, rng.uniform(-7, 7)) for box in boxes[:10]]
+    found = [cast(Lidar(), boxes, origin) for origin in origins]
+
+    def all_of_them(obstacles, x, y, yaw, azimuths, range_m):
+        return np.divmod(np.arange(azimuths * len(obstacles)), len(obstacles))
+
+    monkeypatch.setattr(lidar, "_towards", all_of_them)
+    for (points, hits), origin in zip(found, origins, strict=True):
+        right, right_hits = cast(Lidar(), boxes, origin)
+        np.testing.assert_array_equal(points, right)
+        np.testing.assert_array_equal(hits, right_hits)

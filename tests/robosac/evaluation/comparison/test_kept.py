@@ -11,6 +11,7 @@ from typer.testing import CliRunner
 
 from robosac.cli import app
 from robosac.evaluation.comparison import DEFENSES, Extent, Plan, Setting, built, compare_defenses, kept, running
+from tests.few import Few
 
 NAMES = ("no defence", "group_testing, expecting .2 m")
 
@@ -22,9 +23,9 @@ class Stop(Exception):
 @pytest.fixture(scope="module")
 def whole(detector, tmp_path_factory):
     """A plan without a folder to keep its sequences in, and its rows."""
-    extent = Extent((Setting("ghost", 1), Setting("noise@turns", 2)), scenes=2, frames=6)
+    extent = Extent((Setting("noise", 1), Setting("noise@turns", 2)), scenes=2, frames=6)
     defenses, _ = built({name: DEFENSES[name] for name in NAMES}, detector)
-    plan = Plan(detector, defenses, extent, recordings=tmp_path_factory.mktemp("recordings"))
+    plan = Plan(detector, defenses, extent, data=Few(), recordings=tmp_path_factory.mktemp("recordings"))
     return plan, compare_defenses(plan)
 
 
@@ -71,7 +72,7 @@ def test_what_is_played_is_not_played_again_and_counts_the_same(whole, jobs, tmp
     [
         ({"seed": 1}, "seed"),
         ({"pose_error_m": 0.2, "live": True}, "pose error, live"),
-        ({"extent": Extent((Setting("ghost", 1),), scenes=2, frames=7)}, "settings, frames"),
+        ({"extent": Extent((Setting("noise", 1),), scenes=2, frames=7)}, "settings, frames"),
         ({"defenses": {}}, "defenses"),
     ],
 )
@@ -131,7 +132,7 @@ def compare(*arguments):
     return CliRunner().invoke(app, ["compare", *SHORT, *map(str, arguments)], env={"COLUMNS": "300"})
 
 
-SHORT = ["--only", "no defence", "--scenes", "2", "--frames", "6"]
+SHORT = ["--data", "tests.few:Few", "--only", "no defence", "--scenes", "2", "--frames", "6"]
 
 
 def test_ones_own_code_counts_with_what_it_imports(own, tmp_path, monkeypatch):

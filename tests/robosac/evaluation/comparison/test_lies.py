@@ -8,6 +8,7 @@ from robosac.evaluation.comparison import Extent, Plan, Setting, compare_defense
 from robosac.evaluation.comparison.playing import Played
 from robosac.evaluation.comparison.rows import ObjectFigures, _objects
 from robosac.evaluation.objects import Judged, ObjectHistory
+from tests.few import Few
 
 GHOST, FROZEN = Setting("ghost", 1), Setting("frozen", 1)
 
@@ -16,7 +17,7 @@ GHOST, FROZEN = Setting("ghost", 1), Setting("frozen", 1)
 def compared(detector, tmp_path_factory):
     extent = Extent((GHOST, FROZEN), scenes=2, frames=6)
     defenses = {"no defence": Undefended(), "one_by_one": OneByOne()}
-    plan = Plan(detector, defenses, extent, recordings=tmp_path_factory.mktemp("recordings"))
+    plan = Plan(detector, defenses, extent, data=Few(), recordings=tmp_path_factory.mktemp("recordings"))
     return plan, compare_defenses(plan)
 
 

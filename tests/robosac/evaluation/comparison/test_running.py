@@ -11,6 +11,7 @@ from robosac.detectors.embedded import SHIPPED_WEIGHTS
 from robosac.evaluation.comparison import Extent, Plan, Setting, compare_defenses
 from robosac.evaluation.comparison.playing import play_scene
 from robosac.evaluation.playing import FaultyDefense
+from tests.few import Few
 from tests.robosac.evaluation.comparison.test_comparison import Broken
 
 DEFENSES = {"sampling": SampleConsensus(), "one_by_one": OneByOne()}
@@ -19,7 +20,7 @@ DEFENSES = {"sampling": SampleConsensus(), "one_by_one": OneByOne()}
 @pytest.fixture(scope="module")
 def plan(detector, tmp_path_factory):
     extent = Extent((Setting("noise", 1), Setting("noise@turns", 2)), scenes=2, frames=6)
-    return Plan(detector, DEFENSES, extent, recordings=tmp_path_factory.mktemp("recordings"))
+    return Plan(detector, DEFENSES, extent, data=Few(), recordings=tmp_path_factory.mktemp("recordings"))
 
 
 def test_the_number_of_jobs_changes_nothing(plan):

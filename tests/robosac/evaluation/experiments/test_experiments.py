@@ -9,7 +9,7 @@ from robosac.evaluation.experiments import EXPERIMENTS, Context, Scale, theory
 from robosac.evaluation.report import write_report
 from robosac.scenes.intersection import Synthetic
 
-TINY = Scale(scenes=2, frames_per_scene=1, sequences=1, sequence_frames=7, repeats=2, oracle_runs=200)
+TINY = Scale(scenes=2, frames_per_scene=1, sequences=1, sequence_frames=6, repeats=2, oracle_runs=100)
 
 
 def make_context(out):
