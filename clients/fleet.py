@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import asyncio
 import contextlib
+import re
 import time
 from collections import Counter
 from collections.abc import Awaitable, Callable
@@ -31,7 +32,7 @@ from robosac.detectors import DEFAULT_DETECTOR, Detector
 from robosac.evaluation.frames import another_scene
 from robosac.recording.truth import Truth
 from robosac.scenes import DATA_HELP, DEFAULT_DATA, SceneError, SceneSource, first_scenes, load_source
-from robosac.wire import Packing
+from robosac.wire import ID_PATTERN, Packing
 
 PATIENCE = 5
 """How often a message is sent to a gateway that cannot serve now."""
@@ -140,7 +141,7 @@ async def run_fleet(options: FleetOptions, console: Console) -> FleetSummary:
         If there is no such attack, detector or data, or the gateway's detector has other weights.
     """
     detector, attack = detectors.load(options.detector), attacks.load_campaign(options.attack)
-    if fault := attacks.lacking(attack, detector):
+    if options.attackers and (fault := attacks.lacking(attack, detector)):
         raise ValueError(fault)
     count = options.first_scene + options.scenes
     source = load_source(options.data)
@@ -152,8 +153,10 @@ async def run_fleet(options: FleetOptions, console: Console) -> FleetSummary:
             other = another_scene(source, "test", scene)
             fleet = Fleet(scene, detector, options.egos, options.attackers, attack, options.seed, other)
             await _run_scene(options, fleet, summary, screen)
-    if not summary.frames:
+    if summary.lost and not summary.frames:
         raise GatewayUnreachable("the database took longer than a frame has over every one, so no answer came")
+    if not summary.frames:
+        raise ValueError(f"{source.name}: the egos are in none of the frames")
     return summary
 
 
@@ -256,7 +259,8 @@ def main(  # the options of a command line
     with blaming("--attack", ValueError):
         campaign = attacks.load_campaign(attack)
     own = load_detector(detector)
-    check_attack(campaign, own)
+    if attackers:
+        check_attack(campaign, own)
     _check_dtype(dtype, own)
     _check_scenes(load_data(data), first_scene, scenes, frames, egos, attackers)
     chosen = {"attacker_ratio": attacker_ratio, "sampling_budget": sampling_budget, "collaborators": collaborators}
@@ -284,7 +288,7 @@ def main(  # the options of a command line
 
 
 def _check_scenes(source: SceneSource, first: int, scenes: int, frames: int, egos: int, attackers: int) -> None:
-    """Refuse what the scenes do not have: so many of them, so many frames, egos or attackers."""
+    """Refuse ids that no gateway takes, and what scenes do not have: so many of them, or frames, egos, attackers."""
     with blaming("--data", SceneError):
         there = source.scenes("test")
         if len(there) < first + scenes:
@@ -292,6 +296,9 @@ def _check_scenes(source: SceneSource, first: int, scenes: int, frames: int, ego
             told = f"{source.name} has {len(there)} test scenes; {first + scenes} are wanted"
             raise typer.BadParameter(told, param_hint=option)
         for scene in there[first : first + scenes]:
+            if odd := [name for name in scene.agents if not re.fullmatch(ID_PATTERN, name)]:
+                told = f"{source.name}, scene {scene.number}: a gateway takes no vehicle {odd[0]!r:.200}"
+                raise SceneError(f"{told}; an id must match {ID_PATTERN}")
             if scene.length is not None and scene.length < frames:
                 told = f"scene {scene.number} has {scene.length} frames; {frames} are wanted"
                 raise typer.BadParameter(told, param_hint="--frames")

@@ -25,11 +25,11 @@ from robosac.cli.blame import blaming, failing
 from robosac.cli.named import load_named
 from robosac.cli.options import progress
 from robosac.cli.outputs import Force, check_file, make_folder, tell
-from robosac.cli.printing import printable
 from robosac.defenses import Defense, build
 from robosac.defenses.registry import Kinds
 from robosac.detectors import Detector
 from robosac.extras import need
+from robosac.faults import printable
 from robosac.figures import check_film, need_figures
 from robosac.files import is_special
 from robosac.recording.reading import RecordedSession, RecordingError, sessions

@@ -24,8 +24,8 @@ from clients.client import API_KEY_VARIABLE, GatewayClient
 from clients.errors import AccessDenied, GatewayError
 from clients.local_gateway import cancelled_by_sigterm, local_gateway
 from robosac.cli import outputs
-from robosac.cli.printing import printable
 from robosac.extras import MissingExtra
+from robosac.faults import printable
 from robosac.figures import need_figures
 from robosac.files import write_text
 

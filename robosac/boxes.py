@@ -27,6 +27,9 @@ _LAST_ROW, _LAST_ONE = 1e-9, 1e-5
 _UNIT_CORNERS = np.array([[0.5, 0.5], [-0.5, 0.5], [-0.5, -0.5], [0.5, -0.5]])
 _CLOSED = _UNIT_CORNERS[[0, 1, 2, 3, 0]]
 _NMS_BLOCK = 64
+_AT_A_TIME = 2**16
+MOST_BOXES = 2**13
+"""Of a detector in a frame: several times what those that ship can give."""
 
 
 def as_boxes(boxes: Any, name: str = "boxes", columns: int = 5) -> FloatArray:
@@ -167,8 +170,9 @@ def pairwise_iou(a: FloatArray, b: FloatArray) -> FloatArray:
     radius_a, radius_b = np.hypot(a[:, 2], a[:, 3]) / 2, np.hypot(b[:, 2], b[:, 3]) / 2
     distance2 = (a[:, 0, None] - b[None, :, 0]) ** 2 + (a[:, 1, None] - b[None, :, 1]) ** 2
     i, j = np.nonzero(distance2 < (radius_a[:, None] + radius_b[None, :]) ** 2)
-    if len(i):
-        iou[i, j] = _paired_iou(a[i], b[j])
+    for first in range(0, len(i), _AT_A_TIME):  # of boxes that all overlap, every pair needs room for its outline
+        some = slice(first, first + _AT_A_TIME)
+        iou[i[some], j[some]] = _paired_iou(a[i[some]], b[j[some]])
     return iou
 
 

@@ -1,4 +1,4 @@
-"""Exceptions in words that may be kept: short, and without what belongs in no log."""
+"""Words of others, and of exceptions, that may be kept or shown: short, and without what belongs in no log."""
 
 from __future__ import annotations
 
@@ -21,6 +21,13 @@ _UNKEPT = (
 )
 _PLAIN = {"missing": "is missing", "extra_forbidden": "there is no such field"}
 _PART_OF_A_WORD = re.compile(r"[\w.~+/=-]*+$")
+
+
+def printable(text: str, *, lines: bool = False) -> str:
+    """A text of others that no terminal or page obeys: with escapes in the place of what is not printable. The ends of
+    its ``lines`` may stay.
+    """
+    return "".join(c if c.isprintable() or (lines and c == "\n") else repr(c)[1:-1] for c in text)
 
 
 def in_short(text: str) -> str:

@@ -18,7 +18,7 @@ from typing import Any
 import numpy as np
 
 from robosac.answers import Standing, Support
-from robosac.boxes import FloatArray, from_units, in_units
+from robosac.boxes import MOST_BOXES, FloatArray, from_units, in_units
 
 MOST_BYTES = 2**23
 """Of one packed field, unpacked: several times the largest state of 1024 teammates. As Python's values it may take
@@ -26,8 +26,6 @@ sixty times as much.
 """
 MOST_VEHICLES = 1025
 """Of a frame: a session has at most 1024 teammates."""
-MOST_BOXES = 2**13
-"""Of a frame: several times what a detector that ships can give."""
 MOST_NAMES = 2**20
 """In all hypotheses of a frame, or beside all its boxes: more than a frame has time for."""
 _BOX_BYTES = 24

@@ -13,6 +13,7 @@ from robosac.calibration.fit import TooFewVerdicts, fit
 from robosac.calibration.reliability import ReliabilityBin, check
 from robosac.calibration.verdicts import STRETCH, STRETCH_STRIDE, Stretch, Trial, collect, validation_stretches
 from robosac.defenses.group_testing import Calibration, EvidenceModel, GroupTesting
+from robosac.defenses.group_testing.geometry import MIN_WITNESSES, WITNESS_SCORE
 from robosac.detectors import Detector
 from robosac.scenes import DEFAULT_DATA, Scene, first_scenes, load_source
 
@@ -98,7 +99,11 @@ def calibrate(
             model = fit(verdicts, recipe.attacks, error)
         except TooFewVerdicts as few:
             # had it happened in one scene of as many, three times as many would have shown it with 95 %
-            raise TooFewVerdicts(f"{recipe.scenes} are too few ({few}): try {3 * recipe.scenes}") from few
+            told = f"{recipe.scenes} are too few ({few}): try {3 * recipe.scenes}"
+            if "attackers among the joined" in str(few):
+                told += f". A fusion is judged by its boxes of score {WITNESS_SCORE}: where an attack leaves fewer than"
+                told += f" {MIN_WITNESSES} of them, no number of scenes will do"
+            raise TooFewVerdicts(told) from few
         levels.append(model)
         reliability[error] = check(GroupTesting(model), stretches(scenes[recipe.scenes :], number, _CHECK))
     made_by = {

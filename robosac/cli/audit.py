@@ -23,7 +23,7 @@ from robosac.audit.receipts import by_id
 from robosac.cli.blame import blaming
 from robosac.cli.named import load_named
 from robosac.cli.outputs import Force, check_file
-from robosac.cli.printing import printable
+from robosac.faults import printable
 from robosac.files import write_text
 
 app = typer.Typer(no_args_is_help=True, add_completion=False, help=__doc__)

@@ -8,8 +8,7 @@ from contextlib import contextmanager
 
 import typer
 
-from robosac.cli.printing import printable
-from robosac.faults import told
+from robosac.faults import printable, told
 
 
 @contextmanager

@@ -170,7 +170,7 @@ def _check_teams(sources: Mapping[str, SceneSource], extent: Extent, option: str
     for source in sources.values():
         with blaming(option, SceneError):
             scenes = source.scenes("test")[: extent.scenes]
-        team = min((len(scene.agents) - 1 for scene in scenes), default=most.attackers)
+            team = min((len(scene.agents) - 1 for scene in scenes), default=most.attackers)
         if most.attackers > team:
             why = f"{most.campaign}:{most.attackers}: a scene of {source.name} has {team} teammates"
             raise typer.BadParameter(why, param_hint="--setting")

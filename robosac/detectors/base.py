@@ -14,7 +14,7 @@ from typing import TYPE_CHECKING, Any, Literal, Protocol, Self, cast, get_args, 
 
 import numpy as np
 
-from robosac.boxes import FloatArray
+from robosac.boxes import MOST_BOXES, FloatArray
 
 if TYPE_CHECKING:
     import torch
@@ -53,12 +53,14 @@ def check_boxes(boxes: object) -> FloatArray:
     Raises
     ------
     DetectorError
-        If they are no (n, 6) ndarray of finite numbers, or a length or width is negative.
+        If they are no (n, 6) ndarray of finite numbers, more than `MOST_BOXES`, or a length or width is negative.
     """
     if not isinstance(boxes, np.ndarray):
         raise DetectorError(f"detect must return an array of boxes (n, 6), got a {type(boxes).__name__}")
     if boxes.ndim != 2 or boxes.shape[1] != 6:
         raise DetectorError(f"detect must return boxes (n, 6), got {boxes.shape}")
+    if len(boxes) > MOST_BOXES:
+        raise DetectorError(f"detect must return at most {MOST_BOXES} boxes, got {len(boxes)}: are they suppressed?")
     if boxes.dtype.kind not in "fiu" or not np.isfinite(boxes).all():
         raise DetectorError("detect must return finite numbers")
     if (boxes[:, 2:4] < 0).any():

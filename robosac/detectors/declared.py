@@ -3,13 +3,16 @@
 from __future__ import annotations
 
 from collections.abc import Iterator, Mapping
+from pathlib import Path
 from typing import Any, get_args
 
 import numpy as np
 
-from robosac.detectors.base import DetectorError, DetectorInfo, Role, TensorSpec
+from robosac.detectors.base import DetectorError, DetectorInfo, Precision, Role, TensorSpec
+from robosac.detectors.narrow import BYTES
 
 _DIGEST_CHARS = 64
+_NAME_CHARS = 128
 
 
 def check_info(info: object, who: str) -> None:
@@ -50,6 +53,23 @@ def _of_tensors(tensors: object) -> Iterator[str]:
                 yield f"of the {role}: {name!r} must have a numpy dtype by its name, got {spec.dtype!r:.100}"
             elif not isinstance(spec.shape, tuple) or not all(type(n) is int and n > 0 for n in spec.shape):
                 yield f"of the {role}: {name!r} must have a shape of positive integers, got {spec.shape!r:.100}"
+            elif not isinstance(spec.narrower, tuple) or not all(map(_is_narrower, spec.narrower)):
+                narrower = f"{spec.narrower!r:.100}"
+                yield f"of the {role}: {name!r} must have a tuple of int8 and floats as narrower, got {narrower}"
+            elif not _is_name(name):
+                yield f"of the {role} must have names of at most {_NAME_CHARS} printable characters, got {name!r:.100}"
+
+
+def _is_name(value: object) -> bool:
+    return isinstance(value, str) and 0 < len(value) <= _NAME_CHARS and value.isprintable()
+
+
+def _is_narrower(name: object) -> bool:
+    return name == BYTES or (_is_dtype(name) and np.dtype(str(name)).kind == "f")
+
+
+def _is_path(value: object) -> bool:
+    return value is None or isinstance(value, Path)
 
 
 def _is_dtype(name: object) -> bool:
@@ -74,9 +94,14 @@ def _is_digest(value: object) -> bool:
 
 
 _FIELDS = (
-    ("name", "a text", lambda value: isinstance(value, str) and bool(value)),
+    ("name", f"a text of at most {_NAME_CHARS} printable characters", _is_name),
     ("area_m", "xmin, ymin, xmax, ymax in metres, each least below its most", _is_area),
     ("cell_m", "a positive number of metres", lambda value: _finite(value) and value > 0),
     ("weights_digest", "a SHA-256, 64 hexadecimal digits in lower case", _is_digest),
     ("consensus_score", "a score from 0 to 1", lambda value: _finite(value) and 0 <= value <= 1),
+    ("calibration", "a Path or None", _is_path),
+    ("witness", "a Path or None", _is_path),
+    ("mirrored", "True or False", lambda value: isinstance(value, bool)),
+    ("precision", f"one of {', '.join(get_args(Precision))}", lambda value: value in get_args(Precision)),
+    ("device", "a text", lambda value: isinstance(value, str)),
 )

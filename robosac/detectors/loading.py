@@ -81,8 +81,8 @@ def warm_up(detector: Preparer) -> None:
     DetectorError
         If what it detects are no boxes, or it is the user's own and fails.
     """
-    ego, teammate = blank(detector.info, "ego"), blank(detector.info, "teammate")
     try:
+        ego, teammate = blank(detector.info, "ego"), blank(detector.info, "teammate")
         for _ in range(2):
             prepared = detector.prepare(ego, {"a": teammate, "b": teammate})
             if not callable(getattr(prepared, "detect", None)):

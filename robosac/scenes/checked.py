@@ -116,7 +116,7 @@ class CheckedScene(SceneAround):
             If it is no number of frames.
         """
         length = self.scene.length
-        if length is not None and (not isinstance(length, Integral) or length < 0):
+        if length is not None and (not isinstance(length, Integral) or isinstance(length, bool) or length < 0):
             raise SceneError(f"{self._where}: length must be a number of frames or None, got {length!r}")
         return length
 
@@ -139,8 +139,11 @@ class CheckedScene(SceneAround):
         return f"{self.source}, scene {self.number}"
 
     def _ids(self, part: str, ids: Sequence[str]) -> Sequence[str]:
-        if isinstance(ids, str) or not ids or not all(isinstance(each, str) for each in ids):
-            raise SceneError(f"{self._where}: {part} must be one or more ids, got {ids!r}")
+        is_some = isinstance(ids, Sequence) and not isinstance(ids, str) and len(ids) > 0
+        if not is_some or not all(isinstance(each, str) for each in ids):
+            raise SceneError(f"{self._where}: {part} must be a sequence of one or more ids, got {ids!r:.200}")
+        if len(set(ids)) < len(ids):
+            raise SceneError(f"{self._where}: {part} must be distinct, got {ids!r:.200}")
         return ids
 
     def frame(self, index: int) -> Frame:
@@ -154,6 +157,14 @@ class CheckedScene(SceneAround):
         where = f"{self._where}, frame {index}"
         with _said(where):
             frame = self.scene.frame(index)
+            if frame.index != index:
+                raise SceneError(f"index must be the one that is asked for, got {frame.index!r:.100}")
+            agents = set(self.scene.agents)
+            if strangers := frame.views.keys() - agents:
+                raise SceneError(f"{min(strangers, key=str)!r} has a view, and is no agent of the scene")
+            hostile = getattr(frame, "attackers", ())
+            if isinstance(hostile, str) or not agents.issuperset(hostile):
+                raise SceneError(f"attackers must be some of the agents, got {hostile!r:.200}")
             for name, view in frame.views.items():
                 fault = view_fault(view) if hasattr(view, "pose") else f"must be a View, got a {type(view).__name__}"
                 if fault is not None:
@@ -172,8 +183,17 @@ class CheckedSource:
 
     @property
     def name(self) -> str:
-        """That of the original."""
-        return self.original.name
+        """That of the original.
+
+        Raises
+        ------
+        SceneError
+            If it is no text.
+        """
+        name: object = self.original.name
+        if not isinstance(name, str) or not name:
+            raise SceneError(f"the name of a scene source must be a text, got {name!r:.100}")
+        return name
 
     def scenes(self, split: Split) -> Sequence[Scene]:
         """Those of the original, in its order."""

@@ -25,6 +25,8 @@ PIPELINED = 4
 """Requests that are taken on a connection beside the one that is being answered."""
 PIECES, PIECE_BYTES = 128, 64
 """From so many pieces on, those of a body have so many bytes on average."""
+AROUND_BYTES = 64 * 1024
+"""What may come between the pieces of a body, as their lengths do: so much, or as much as the body has."""
 
 
 MADE_S, BYTE_S = 3e-4, 1e-9
@@ -57,7 +59,7 @@ class BoundedHTTP(HttpToolsProtocol):
     _head_ended = False
     _head_bytes = 0
     _pieces = 0
-    _body_bytes = 0
+    _body_bytes = _around_bytes = 0
     _refused: _TooMuch | None = None
     _unread: TimerHandle | None = None
     _kept = b""
@@ -126,8 +128,13 @@ class BoundedHTTP(HttpToolsProtocol):
 
     def _take(self, data: bytes) -> None:
         begins_in_head = self._in_head or self.cycle is None  # and not with the end of a body
+        begins_in_body, before = self._in_body, self._body_bytes
         self._head_ended = False
         super().data_received(data)
+        if begins_in_body and self._in_body and not self._head_ended:
+            self._around_bytes += max(0, len(data) - (self._body_bytes - before))
+            if self._around_bytes > max(AROUND_BYTES, self._body_bytes):
+                self._hang_up("400 Bad Request", "What is between the pieces of a body must be shorter than they are.")
         if begins_in_head and not self._head_ended:
             self._head_bytes += len(data)
         if self._answering():
@@ -153,7 +160,7 @@ class BoundedHTTP(HttpToolsProtocol):
 
     def on_headers_complete(self) -> None:
         self._in_head, self._in_body, self._head_ended, self._head_bytes = False, True, True, 0
-        self._pieces = self._body_bytes = 0
+        self._pieces = self._body_bytes = self._around_bytes = 0
         super().on_headers_complete()
         self._unanswered = [cycle for cycle in (*self._unanswered, self.cycle) if not cycle.response_complete]
         if self._pacing is not None:

@@ -18,6 +18,7 @@ import structlog
 from robosac.answers import FrameAnswer
 from robosac.audit.sentences import sentence
 from robosac.boxes import FloatArray
+from robosac.faults import printable
 from robosac.fusion import FusionResult
 from service.errors import Kind, Refused, SessionOver
 from service.keeping.record import SessionRecord
@@ -237,7 +238,9 @@ class Feed:
 def _told(lines: Sequence[str]) -> list[dict[str, Any]]:
     """Lines of a log in words, but those of frames."""
     others = [(line, json.loads(line)) for line in lines if _OF_A_FRAME not in line]
-    return [{"seq": record["seq"], "time": record["time"], "text": sentence(line)} for line, record in others]
+    return [
+        {"seq": record["seq"], "time": record["time"], "text": printable(sentence(line))} for line, record in others
+    ]
 
 
 def _about(record: SessionRecord, least_score: float) -> dict[str, Any]:

@@ -12,6 +12,7 @@ import numpy as np
 
 from robosac.answers import FrameAnswer, Verdict
 from robosac.boxes import FloatArray, from_world, pairwise_iou
+from robosac.faults import printable
 from robosac.fusion import FusionResult
 from service.viewing import words
 
@@ -85,7 +86,7 @@ class Seen:
             "named": list(answer.named),
             "rejected": [
                 {
-                    "vehicle_id": name,
+                    "vehicle_id": printable(name),
                     "reason": entry.reason.value,
                     "distrust": entry.distrust,
                     "why": words.of_rejection(entry),
@@ -125,6 +126,6 @@ def _placed(poses: Mapping[str, FloatArray], ego_pose: FloatArray) -> list[dict[
     there = np.array([[x, y, 0.0, 0.0, yaw] for x, y, yaw in map(_in_plane, poses.values())])
     here: Sequence[Sequence[float]] = np.round(from_world(there, ego_pose), DECIMALS).tolist()
     return [
-        {"vehicle_id": name, "x": x, "y": y, "yaw": yaw, "range_m": round(float(np.hypot(x, y)), 2)}
+        {"vehicle_id": printable(name), "x": x, "y": y, "yaw": yaw, "range_m": round(float(np.hypot(x, y)), 2)}
         for name, (x, y, _, _, yaw) in zip(poses, here, strict=True)
     ]

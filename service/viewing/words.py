@@ -8,6 +8,7 @@ from typing import Any
 
 from robosac.answers import FrameAnswer, Reason, RejectedTeammate, Source
 from robosac.audit.sentences import DISTRUSTS, listed
+from robosac.faults import printable
 
 REASONS: Mapping[Reason, str] = {
     Reason.DISSENSUS: "the ego's own perception contradicts its fusion",
@@ -44,7 +45,7 @@ def of_frame(answer: FrameAnswer) -> str:
         Source.EGO_ONLY: "that the ego sees alone",
     }[answer.source]
     said = f"Frame {answer.frame} was answered with {_count(len(answer.boxes), 'box', 'boxes')} {whose}"
-    out = ", ".join(f"{name} ({_short(entry)})" for name, entry in answer.rejected.items())
+    out = ", ".join(f"{printable(name)} ({_short(entry)})" for name, entry in answer.rejected.items())
     cut = {None: "", "deadline": "; there was no time for more tests", "fault": "; something failed inside"}
     return said + (f"; left out: {out}" if out else "") + cut[answer.degraded_by] + "."
 
@@ -64,9 +65,9 @@ def of_rejection(entry: RejectedTeammate) -> str:
     if more.get("ego_astray") is True:
         parts.append("the ego itself is not where it says")
     if detail := more.get("detail"):
-        parts.append(str(detail))
+        parts.append(printable(str(detail)))
     if (other := more.get("of")) is not None:
-        parts.append(f"from {other}")
+        parts.append(f"from {printable(str(other))}")
     return "; ".join(parts)
 
 

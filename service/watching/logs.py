@@ -151,8 +151,12 @@ class _Bounded:
 
 
 def _message_in_short(_: object, __: str, event: structlog.types.EventDict) -> structlog.types.EventDict:
-    """What the runtime says of a failure holds the failure's own message."""
-    return {**event, "event": in_short(event["event"])}
+    """What the runtime says of a failure holds the failure's own message; of a traceback that stands last."""
+    text = event["event"]
+    if isinstance(text, str) and text.startswith("Traceback "):
+        *calls, said = text.strip().splitlines()
+        text = "\n".join([said, *calls[-CALLS:]])
+    return {**event, "event": in_short(text)}
 
 
 def _traceback(exc_info: tuple[type[BaseException], BaseException, TracebackType | None]) -> str:

@@ -31,6 +31,7 @@ from robosac.defenses.halving import Halving
 from robosac.detectors.embedded import ADVERSARIAL_WEIGHTS
 from robosac.fusion import fuse
 from robosac.scenes import IntersectionScene
+from tests.few import Few
 
 
 def options(url, **changes):
@@ -88,6 +89,39 @@ def test_a_fleet_follows_a_campaign(detector):
 def test_impossible_fleets_are_refused(detector, egos, attackers):
     with pytest.raises(ValueError, match="must be between"):
         Fleet(IntersectionScene(3), detector, egos, attackers, PGD(), 0)
+
+
+@pytest.mark.parametrize(("lost", "told"), [(0, "few: the egos are in none of the frames"), (3, "the database took")])
+async def test_a_run_without_an_answer_says_why(lost, told, monkeypatch):
+    async def run_scene(options, fleet, summary, screen):
+        summary.lost += lost
+
+    monkeypatch.setattr("clients.fleet._run_scene", run_scene)
+    with pytest.raises((ValueError, GatewayUnreachable), match=told):
+        await run_fleet(options("http://127.0.0.1:9", data="tests.few:Few", attackers=0), Console(file=io.StringIO()))
+
+
+def test_an_attack_that_nobody_makes_needs_nothing(detector, monkeypatch):
+    bare = SimpleNamespace(info=detector.info, encode=detector.encode, prepare=detector.prepare)
+    monkeypatch.setattr("clients.fleet.load_detector", lambda name: bare)
+    words = ["--data", "tests.few:Few", "--url", "http://127.0.0.1:9"]
+    attacked, honest = (CliRunner().invoke(command(main), [*words, "--attackers", number]) for number in "10")
+    assert attacked.exit_code == 2
+    assert "attack_surface" in attacked.output
+    assert honest.exit_code == 1, honest.output
+    assert "The fleet stopped" in honest.output
+
+
+class Odd(Few):
+    def scenes(self, split):
+        return [SimpleNamespace(number=0, length=None, agents=("car-1", "-1"), egos=("car-1",))]
+
+
+def test_a_vehicle_that_no_gateway_takes_is_told_by_its_name():
+    asked = CliRunner().invoke(command(main), ["--data", f"{__name__}:Odd", "--scenes", "1"], env={"COLUMNS": "200"})
+    assert asked.exit_code == 2
+    said = " ".join(asked.output.replace("│", " ").split())
+    assert "few, scene 0: a gateway takes no vehicle '-1'; an id must match" in said
 
 
 def command(function):

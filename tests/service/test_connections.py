@@ -10,7 +10,7 @@ import uvicorn
 
 from clients.hostile import Attack, Target, run_attack
 from service.arriving.arrival import Arrival, arrival_of
-from service.arriving.connections import HEAD_BYTES, HEADERS, PIECES, PIPELINED, BoundedHTTP
+from service.arriving.connections import AROUND_BYTES, HEAD_BYTES, HEADERS, PIECES, PIPELINED, BoundedHTTP
 from service.watching.stalls import LoopWatch
 
 GET = b"GET / HTTP/1.1\r\nHost: x\r\n\r\n"
@@ -181,6 +181,16 @@ async def test_a_body_may_come_in_pieces(port, sent):
     async with connected(port) as (reader, writer):
         writer.write(sent + b"0\r\n\r\n")
         assert b"200" in await reader.readuntil(b"\r\n\r\n")
+
+
+async def test_nothing_long_may_come_between_the_pieces_of_a_body(port):
+    """As extensions of a piece's length do (RFC 9112, 7.1.1), which the parser passes over."""
+    async with connected(port) as (reader, writer):
+        for sent in (CHUNKED, *[b"1;" + b"a" * (AROUND_BYTES // 8) + b"\r\nx\r\n"] * 8):
+            writer.write(sent)
+            await asyncio.sleep(0.02)
+        async with asyncio.timeout(10):
+            assert (await reader.read()).startswith(b"HTTP/1.1 400 ")
 
 
 async def test_what_follows_a_body_is_not_of_the_head(port):

@@ -108,6 +108,19 @@ def test_a_message_out_of_place_and_an_ego_astray_are_told(evidence, said):
     assert said in of_rejection(RejectedTeammate(vehicle_id="car-2", reason=Reason.NOT_SAMPLED, **evidence))
 
 
+async def test_names_of_strangers_turn_no_words_round(served, ego_message, benign):
+    session = await served.open()
+    stranger = "\u202e.enif si lla\x1b[2J\r\n\0"
+    await served.ego(session).post_frame(0, ego_message, {**benign, stranger: benign["rsu"]})
+    (_, _), (_, told), _ = await watched(served, session.session_id, after=-1)
+    (frame,) = told["frames"]
+    (entry,) = [entry for entry in frame["rejected"] if entry["reason"] == "unauthenticated"]
+    assert entry["vehicle_id"] == "\\u202e.enif si lla\\x1b[2J\\r\\n\\x00"
+    for words in (frame["sentence"], *(line["text"] for line in told["audit"])):
+        assert words.isprintable()
+    assert entry["vehicle_id"] in frame["sentence"]
+
+
 async def test_a_rejected_fusion_shows_what_was_not_answered(served, ego_message, attacked):
     session = await served.open(defense={"kind": "sample_consensus", "sampling_budget": 12, "collaborators": 1})
     for frame in range(40):

@@ -10,6 +10,7 @@ import sqlite3
 import subprocess
 import sys
 import time
+import traceback
 from pathlib import Path
 
 import httpx
@@ -21,7 +22,7 @@ from opentelemetry.sdk.trace.export.in_memory_span_exporter import InMemorySpanE
 
 from robosac import wire
 from service.settings import Settings
-from service.watching.logs import LINES
+from service.watching.logs import LINES, logging_to_stderr
 from service.watching.tracing import provider_from_environment
 from tests.service.conftest import EGO, HOOKED, problem, serve
 from tests.service.test_identity import bearer
@@ -59,6 +60,17 @@ async def test_faults_are_logged_with_their_trace_and_for_the_eye_if_wanted(caps
     assert "RuntimeError" in text
     assert "from the library" in text
     assert "not at this level" not in text
+
+
+def test_what_a_start_failed_for_is_told_first(capsys):
+    """A server says it as a text that ends with it."""
+    with logging_to_stderr(Settings()):
+        try:
+            [].stat()
+        except AttributeError:
+            logging.getLogger("uvicorn.error").error(traceback.format_exc())
+    (line,) = capsys.readouterr().err.splitlines()
+    assert json.loads(line)["event"].startswith("AttributeError: 'list' object has no attribute 'stat'\n")
 
 
 async def test_what_was_lost_is_told_in_the_form_of_the_log(capsys, monkeypatch):

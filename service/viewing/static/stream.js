@@ -10,6 +10,7 @@ export class Refused extends Error {
 
 /** Fetch with a viewer's token; throws Refused. */
 export async function ask(path, token, signal) {
+  if (/[^\x20-\x7e]/.test(token)) throw new Refused(401, {}); // no header takes it, and no gateway knows it
   const headers = token ? { Authorization: `Bearer ${token}` } : {};
   const response = await fetch(path, { headers, signal, cache: 'no-store', credentials: 'omit' });
   if (!response.ok) throw new Refused(response.status, await response.json().catch(() => ({})));

@@ -33,7 +33,14 @@ def test_a_face_that_can_be_is_taken(monkeypatch):
 @pytest.mark.parametrize(
     ("fields", "words"),
     [
-        ({"name": ""}, "info.name must be a text, got ''"),
+        ({"name": ""}, "info.name must be a text of at most 128 printable characters, got ''"),
+        ({"name": "a\udc80"}, r"info.name must be .*, got 'a\udc80'"),
+        ({"name": "a\n"}, r"info.name must be .*, got 'a\n'"),
+        ({"calibration": "x.json"}, "info.calibration must be a Path or None, got 'x.json'"),
+        ({"witness": "x"}, "info.witness must be a Path or None, got 'x'"),
+        ({"mirrored": "yes"}, "info.mirrored must be True or False, got 'yes'"),
+        ({"precision": "float8"}, "info.precision must be one of float32, bfloat16, float16, got 'float8'"),
+        ({"device": 7}, "info.device must be a text, got 7"),
         ({"area_m": (0, 0, 0, 8)}, "info.area_m must be xmin, ymin, xmax, ymax in metres, .*, got (0, 0, 0, 8)"),
         ({"area_m": (0, 0, 8)}, "info.area_m must be .*, got (0, 0, 8)"),
         ({"cell_m": 0}, "info.cell_m must be a positive number of metres, got 0"),
@@ -53,6 +60,17 @@ def test_a_face_that_can_be_is_taken(monkeypatch):
         (
             {"tensors": {"ego": MAP, "teammate": {"map": TensorSpec("float32", (0, 2))}}},
             "info.tensors of the teammate: 'map' must have a shape of positive integers, got (0, 2)",
+        ),
+        *(
+            (
+                {"tensors": {"ego": MAP, "teammate": {"map": TensorSpec("float32", (1, 2), narrower)}}},
+                "info.tensors of the teammate: 'map' must have a tuple of int8 and floats as narrower, got .*",
+            )
+            for narrower in ("int8", ("int4",), ("int16",), ["int8"])
+        ),
+        (
+            {"tensors": {"ego": {5: MAP["map"]}, "teammate": MAP}},
+            "info.tensors of the ego must have names of at most 128 printable characters, got 5",
         ),
     ],
 )
@@ -77,6 +95,17 @@ def test_a_detector_that_answers_no_frame_of_zeros_is_told_with_the_place():
 
     with pytest.raises(DetectorError, match=r"^mine cannot answer a frame of zeros: ZeroDivision.*test_declared"):
         warm_up(detector(detect=detect))
+
+
+def test_boxes_that_nobody_suppressed_are_too_many():
+    with pytest.raises(DetectorError, match=r"^mine: detect must return at most 8192 boxes, got 8193: are they supp"):
+        warm_up(detector(detect=lambda subset=(): np.ones((8193, 6))))
+
+
+def test_a_message_that_no_memory_holds_is_told_with_the_detector():
+    huge = {"map": TensorSpec("float32", (2**40,))}
+    with pytest.raises(DetectorError, match=r"^mine cannot answer a frame of zeros: .*MemoryError"):
+        warm_up(detector(replace(INFO, tensors={"ego": MAP, "teammate": huge})))
 
 
 def test_what_is_prepared_has_to_detect():

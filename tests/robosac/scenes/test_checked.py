@@ -31,6 +31,14 @@ class Frame:
 
 
 @dataclass(frozen=True)
+class Late(Frame):
+    """A frame that is the next one."""
+
+    def __post_init__(self):
+        object.__setattr__(self, "index", self.index + 1)
+
+
+@dataclass(frozen=True)
 class Scene:
     shown: object = field(default_factory=Frame)
     number = 7
@@ -129,6 +137,20 @@ def test_views_of_a_wrong_form_are_refused(shown, why):
 
 
 @pytest.mark.parametrize(
+    ("shown", "why"),
+    [
+        (Frame(views={"van-0": SOUND, "van-1": SOUND}), "'van-1' has a view, and is no agent of the scene"),
+        (Frame(attackers="van-0"), "attackers must be some of the agents, got 'van-0'"),
+        (Frame(attackers=("van-1",)), r"attackers must be some of the agents, got \('van-1',\)"),
+        (Late(), "index must be the one that is asked for, got 4"),
+    ],
+)
+def test_frames_that_do_not_belong_to_the_scene_are_refused(shown, why):
+    with pytest.raises(SceneError, match=f"^t7, scene 7, frame 3: {why}$"):
+        frame(shown)
+
+
+@pytest.mark.parametrize(
     ("boxes", "why"),
     [
         (np.zeros((6, 7)), " must be (G, 5), got (6, 7)"),
@@ -180,10 +202,13 @@ def test_what_ships_is_not_checked_and_what_does_not_is(tmp_path, monkeypatch):
 @pytest.mark.parametrize(
     ("part", "value", "words"),
     [
-        ("agents", (), r"agents must be one or more ids, got \(\)"),
-        ("agents", "van-0", "agents must be one or more ids, got 'van-0'"),
-        ("agents", (0, 1), r"agents must be one or more ids, got \(0, 1\)"),
-        ("egos", (), r"egos must be one or more ids, got \(\)"),
+        ("agents", (), r"agents must be a sequence of one or more ids, got \(\)"),
+        ("agents", "van-0", "agents must be a sequence of one or more ids, got 'van-0'"),
+        ("agents", (0, 1), r"agents must be a sequence of one or more ids, got \(0, 1\)"),
+        ("egos", (), r"egos must be a sequence of one or more ids, got \(\)"),
+        ("agents", {"van-0"}, "agents must be a sequence of one or more ids, got {'van-0'}"),
+        ("agents", ("van-0", "van-0"), r"agents must be distinct, got \('van-0', 'van-0'\)"),
+        ("length", True, "length must be a number of frames or None, got True"),
         ("egos", ("van-9",), r"egos must be some of the agents, got \('van-9',\)"),
         ("length", "50", "length must be a number of frames or None, got '50'"),
         ("length", -1, "length must be a number of frames or None, got -1"),
