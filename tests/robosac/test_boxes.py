@@ -4,7 +4,7 @@ import shapely
 from hypothesis import example, given
 from hypothesis import strategies as st
 
-from robosac import boxes
+from robosac import boxes as geometry
 from robosac.boxes import corners, from_world, in_units, laid_iou, nms, pairwise_iou, pose_fault, pose_matrix, to_world
 from tests.robosac.rectangles import from_corners
 
@@ -167,6 +167,6 @@ def test_a_pose_may_be_off_by_as_little_as_rounding_makes_it(place, most, over):
 
 def test_how_many_pairs_are_looked_at_at_a_time_makes_no_difference(rng, monkeypatch):
     some = np.column_stack([rng.uniform(-3, 3, (7, 2)), rng.uniform(1, 5, (7, 2)), rng.uniform(-3, 3, 7)])
-    whole = boxes.pairwise_iou(some, some)
-    monkeypatch.setattr(boxes, "_AT_A_TIME", 4)
-    np.testing.assert_array_equal(boxes.pairwise_iou(some, some), whole)
+    whole = geometry.pairwise_iou(some, some)
+    monkeypatch.setattr(geometry, "_AT_A_TIME", 4)
+    np.testing.assert_array_equal(geometry.pairwise_iou(some, some), whole)
