@@ -138,7 +138,7 @@ async def run_fleet(options: FleetOptions, console: Console) -> FleetSummary:
     clients.errors.GatewayError
         If any message or frame is not accepted as it should be; that a teammate's message comes too late is no error.
     ValueError
-        If there is no such attack, detector or data, or the gateway's detector has other weights.
+        If there is no such attack, detector or data, the gateway's detector has other weights, or no ego is in any frame.
     """
     detector, attack = detectors.load(options.detector), attacks.load_campaign(options.attack)
     if options.attackers and (fault := attacks.lacking(attack, detector)):
