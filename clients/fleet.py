@@ -138,7 +138,8 @@ async def run_fleet(options: FleetOptions, console: Console) -> FleetSummary:
     clients.errors.GatewayError
         If any message or frame is not accepted as it should be; that a teammate's message comes too late is no error.
     ValueError
-        If there is no such attack, detector or data, the gateway's detector has other weights, or no ego is in any frame.
+        If there is no such attack, detector or data, the gateway's detector has other weights, or the egos are in no
+        frame.
     """
     detector, attack = detectors.load(options.detector), attacks.load_campaign(options.attack)
     if options.attackers and (fault := attacks.lacking(attack, detector)):
