@@ -37,3 +37,20 @@ def test_a_team_is_shown_whatever_its_vehicles_are_called():
     done = subprocess.run(command, check=False, capture_output=True, text=True, timeout=60)
     assert done.returncode == 0, done.stderr
     assert json.loads(done.stdout) == [["not known"] * 2, ["12.0 m", "0.250"], ["not known"] * 2]
+
+
+ASKING = """
+globalThis.fetch = () => { throw new TypeError('it was asked'); };
+const { ask, Refused } = await import(process.argv[1]);
+const told = [];
+for (const token of ['\\u201c0123456789abcdef\\u201d', 'a\\nb', 'a-good-token-0123'])
+  await ask('v1/live', token).catch((error) => told.push(error instanceof Refused ? error.status : error.message));
+console.log(JSON.stringify(told));
+"""
+
+
+def test_a_token_that_no_header_takes_is_known_to_nobody():
+    command = [NODE, "--input-type=module", "--eval", ASKING, (STATIC / "stream.js").as_uri()]
+    done = subprocess.run(command, check=False, capture_output=True, text=True, timeout=60)
+    assert done.returncode == 0, done.stderr
+    assert json.loads(done.stdout) == [401, 401, "it was asked"]

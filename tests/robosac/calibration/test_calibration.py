@@ -9,7 +9,7 @@ from typer.testing import CliRunner
 from robosac.attacks import GaussianNoise
 from robosac.boxes import pose_matrix
 from robosac.calibrated import calibration_of
-from robosac.calibration import Recipe
+from robosac.calibration import Recipe, TooFewVerdicts, calibrate
 from robosac.calibration.verdicts import Trial, Verdicts, complementary, validation_stretches
 from robosac.cli import app
 from robosac.defenses.group_testing import Calibration, CalibrationError, GroupTestingSettings
@@ -169,6 +169,22 @@ def test_the_command_writes_a_calibration(tmp_path):
     assert "--attack noise" in calibration.recipe["command"]
     assert calibration.recipe["reliability"]["0"]
     assert set(json.loads(out.read_text())["messages"]) == {"features"}
+
+
+@pytest.mark.parametrize(
+    ("missing", "in_vain"), [("attackers among the joined", True), ("attackers among the joining", False)]
+)
+def test_where_more_scenes_may_not_help_it_is_said(missing, in_vain, detector, monkeypatch):
+    def fit(*_):
+        raise TooFewVerdicts(f"never observed: noise: 1 joining 1, {missing}")
+
+    monkeypatch.setattr("robosac.calibration.making.fit", fit)
+    monkeypatch.setattr("robosac.calibration.making.collect", list)
+    with pytest.raises(TooFewVerdicts) as refused:
+        calibrate(detector, Recipe(attacks=("noise",), scenes=2, check_scenes=0), "the command")
+    told = f"2 are too few (never observed: noise: 1 joining 1, {missing}): try 6"
+    more = ". A fusion is judged by its boxes of score 0.5: where an attack leaves fewer than 2 of them, no number of"
+    assert str(refused.value) == told + f"{more} scenes will do" * in_vain
 
 
 def test_the_command_names_an_unknown_attack(tmp_path):

@@ -283,6 +283,10 @@ def test_the_command_with_all_its_options(tmp_path):
         (["--setting", "erase:6"], "erase:6: a scene of synthetic has 5 teammates"),
         (["--scenes", "1001"], "synthetic has 1000 test scenes; 1001 are wanted"),
         (["--data", "nonesuch"], "no scene source 'nonesuch'"),
+        (
+            ["--data", "tests.few:Numbered", "--scenes", "1"],
+            "few, scene 0: agents must be a sequence of one or more ids",
+        ),
         (["--frames", "5"], "Invalid value for '--frames'"),
         (["--live", "--recordings", "x"], "nothing is recorded live"),
     ],
