@@ -284,7 +284,7 @@ def test_the_command_with_all_its_options(tmp_path):
         (["--scenes", "1001"], "synthetic has 1000 test scenes; 1001 are wanted"),
         (["--data", "nonesuch"], "no scene source 'nonesuch'"),
         (
-            ["--data", "tests.few:Numbered", "--scenes", "1"],
+            ["--data", "tests.few:Numbered", "--scenes", "1", "--setting", "noise:1"],
             "few, scene 0: agents must be a sequence of one or more ids",
         ),
         (["--frames", "5"], "Invalid value for '--frames'"),
