@@ -12,6 +12,7 @@ from clients.client import FrameAnswer, OpenedSession
 from clients.crash_test import sqlite
 from clients.crash_test.__main__ import main
 from clients.crash_test.driven import Driven
+from clients.crash_test.rounds import possible
 from robosac.audit import commitment, digest, seal
 from robosac.audit.packing import state_digest
 
@@ -127,6 +128,8 @@ def test_only_a_sqlite_file_is_backed_up(tmp_path):
     assert sqlite.path_of("sqlite:////data/robosac.db?timeout=3") == Path("/data/robosac.db")
     url = "postgresql://nobody@/x"
     assert sqlite.path_of(url) is None
+    assert [*possible("sqlite:////data/robosac.db")] == ["kill", "backup", "pair"]
+    assert [*possible(url)] == ["kill", "pair"]
     app = typer.Typer()
     app.command()(main)
     result = CliRunner().invoke(app, ["--incident", "backup", "--database-url", url])

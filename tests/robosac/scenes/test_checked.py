@@ -169,6 +169,14 @@ def test_boxes_of_a_wrong_form_are_refused(boxes, why):
     assert str(refused.value) == f"t7, scene 7, frame 0: truth('van-0'){why}"
 
 
+@pytest.mark.parametrize("name", [7, ""])
+def test_a_source_has_a_text_for_a_name(name):
+    source = Source()
+    source.name = name
+    with pytest.raises(SceneError, match=f"^the name of a scene source must be a text, got {name!r}$"):
+        CheckedSource(source).scenes("test")
+
+
 class Kept(Source):
     def training_scenes(self):
         return [Scene(FileNotFoundError("gone"))]
