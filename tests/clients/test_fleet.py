@@ -104,12 +104,14 @@ async def test_a_run_without_an_answer_says_why(lost, told, monkeypatch):
 def test_an_attack_that_nobody_makes_needs_nothing(detector, monkeypatch):
     bare = SimpleNamespace(info=detector.info, encode=detector.encode, prepare=detector.prepare)
     monkeypatch.setattr("clients.fleet.load_detector", lambda name: bare)
+    monkeypatch.setattr("clients.fleet.detectors.load", lambda name: bare)
     words = ["--data", "tests.few:Few", "--url", "http://127.0.0.1:9"]
     attacked, honest = (CliRunner().invoke(command(main), [*words, "--attackers", number]) for number in "10")
     assert attacked.exit_code == 2
     assert "attack_surface" in attacked.output
     assert honest.exit_code == 1, honest.output
     assert "The fleet stopped" in honest.output
+    assert "attack_surface" not in honest.output
 
 
 class Odd(Few):

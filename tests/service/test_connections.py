@@ -176,7 +176,7 @@ async def test_what_takes_long_to_look_at_is_not_looked_at_to_its_end(port, sent
         assert b"200" in await reader.readuntil(b"\r\n\r\n")
 
 
-@pytest.mark.parametrize("sent", [CHUNKED + b"80\r\n%b\r\n" % bytes(128) * 3000, CHUNKED + b"1\r\nx\r\n" * PIECES])
+@pytest.mark.parametrize("sent", [CHUNKED + b"80\r\n%b\r\n" % bytes(128) * 16_000, CHUNKED + b"1\r\nx\r\n" * PIECES])
 async def test_a_body_may_come_in_pieces(port, sent):
     async with connected(port) as (reader, writer):
         writer.write(sent + b"0\r\n\r\n")
@@ -191,6 +191,18 @@ async def test_nothing_long_may_come_between_the_pieces_of_a_body(port):
             await asyncio.sleep(0.02)
         async with asyncio.timeout(10):
             assert (await reader.read()).startswith(b"HTTP/1.1 400 ")
+
+
+async def test_a_body_may_come_with_the_end_of_the_one_before_it(port):
+    post = b"POST / HTTP/1.1\r\nHost: x\r\nContent-Length: %d\r\n\r\n"
+    async with connected(port) as (reader, writer):
+        first, second = post % (3 * AROUND_BYTES) + bytes(3 * AROUND_BYTES), post % 10 + bytes(10)
+        for sent in (first[:-5], first[-5:] + second[:-5], second[-5:]):
+            writer.write(sent)
+            await asyncio.sleep(0.05)
+        async with asyncio.timeout(10):
+            for _ in range(2):
+                assert b"200" in await reader.readuntil(b"\r\n\r\n")
 
 
 async def test_what_follows_a_body_is_not_of_the_head(port):

@@ -169,6 +169,12 @@ def test_boxes_of_a_wrong_form_are_refused(boxes, why):
     assert str(refused.value) == f"t7, scene 7, frame 0: truth('van-0'){why}"
 
 
+def test_a_text_names_no_attackers_though_its_letters_are_agents():
+    scene = CheckedScene(type("Short", (Scene,), {"agents": ("a", "b")})(Frame(views={}, attackers="ab")), "t7")
+    with pytest.raises(SceneError, match="attackers must be some of the agents, got 'ab'"):
+        scene.frame(0)
+
+
 @pytest.mark.parametrize("name", [7, ""])
 def test_a_source_has_a_text_for_a_name(name):
     source = Source()
