@@ -1,3 +1,4 @@
+import asyncio
 import gc
 import time
 from collections.abc import AsyncIterator, Callable, Iterable
@@ -151,6 +152,14 @@ async def hooked() -> AsyncIterator[Served]:
 def good_frame(ego_message, benign) -> Callable[[int], bytes]:
     """The body of a good frame with a given number."""
     return lambda index: wire.pack_frame(index, ego_message, benign)
+
+
+async def until(condition: Callable[[], Any], within_s: float = 20.0) -> None:
+    """Wait for what is to become true soon, however slow the machine is."""
+    end = time.monotonic() + within_s
+    while not condition():
+        assert time.monotonic() < end
+        await asyncio.sleep(0.001)
 
 
 def problem(response: httpx.Response, status: int, slug: str) -> dict[str, Any]:

@@ -13,7 +13,7 @@ from robosac.detectors import Message
 from robosac.fusion import fuse
 from service.sessions.gathering import Gathering, Received
 from service.sessions.room import Room
-from tests.service.conftest import EGO, TEAM, problem, serve
+from tests.service.conftest import EGO, TEAM, problem, serve, until
 
 ACCEPT_JSON = {"Accept": "application/json"}
 
@@ -195,7 +195,7 @@ async def test_a_session_that_ends_under_a_waiting_ego_says_so(served, messages)
     session = await served.open(gather_ms=300)
     ego = served.ego(session)
     asking = asyncio.create_task(ego.ask(0, messages[EGO]))
-    await asyncio.sleep(0.05)
+    await until(served.gateway.sessions._live[session.session_id].lock.locked)
     await ego.close()
     assert (await asking).source == "ego_only"
 

@@ -10,7 +10,7 @@ from clients.standby import Standby
 from robosac import wire
 from service.sessions.gathering import MOVED
 from service.sessions.moving import LOOK_FOR_S, news
-from tests.service.conftest import EGO, HOOKED, TEAM, problem, serve
+from tests.service.conftest import EGO, HOOKED, TEAM, problem, serve, until
 
 
 @pytest.fixture
@@ -23,13 +23,6 @@ async def two(tmp_path):
 async def caller(served, session, name):
     token = session.ego_token if name == EGO else session.teammate_tokens[name]
     return await served.gateway.sessions.authenticate(session.session_id, token)
-
-
-async def until(condition):
-    end = time.monotonic() + 10
-    while not condition():
-        assert time.monotonic() < end
-        await asyncio.sleep(0.005)
 
 
 async def test_what_waited_elsewhere_is_missing_and_the_answer_says_why(two, messages):

@@ -13,7 +13,7 @@ from service.keeping.store import PAGE
 from service.keeping.tables import audit_lines
 from service.sessions.idle import Idle
 from service.sessions.pages import FIRST_PAGE, PAGE_BYTES
-from tests.service.conftest import EGO, TEAM, problem, serve
+from tests.service.conftest import EGO, TEAM, problem, serve, until
 
 
 async def test_the_detectors_say_what_to_send(served, detector):
@@ -249,10 +249,10 @@ async def test_a_session_does_not_expire_under_a_waiting_ego(messages):
 
 
 async def test_idle_sessions_expire():
-    async with serve(session_idle_s=0.3) as served:
+    async with serve(session_idle_s=1.0) as served:
         idle, busy = await served.open(), await served.open()
-        for _ in range(20):
-            await asyncio.sleep(0.05)
+        for _ in range(15):
+            await asyncio.sleep(0.1)
             await served.ego(busy).state()
         with pytest.raises(SessionNotFound):
             await served.ego(idle).state()
@@ -362,7 +362,7 @@ async def test_a_session_that_could_not_be_ended_goes_on_with_the_messages_that_
 async def test_a_frame_bears_that_its_session_is_forgotten_meanwhile(served, messages):
     session = await served.open(gather_ms=200)
     asking = asyncio.create_task(served.ego(session).ask(0, messages[EGO]))
-    await asyncio.sleep(0.05)
+    await until(served.gateway.sessions._live[session.session_id].lock.locked)
     served.gateway.sessions._forget(session.session_id)
     assert {why.reason for why in (await asking).rejected.values()} == {"missing"}
 

@@ -12,7 +12,7 @@ from clients.errors import AccessDenied, InvalidRequest, SessionNotFound
 from service.errors import StoreUnavailable
 from service.sessions import identity, teams
 from service.sessions.identity import AUDIENCE, CLAIMS, ISSUER
-from tests.service.conftest import EGO, problem, serve
+from tests.service.conftest import EGO, problem, serve, until
 from tests.service.credentials import OTHER_SECRET, SECRET, bearer, claims_of, forged, segment
 
 
@@ -202,13 +202,18 @@ async def test_a_key_of_a_renewal_that_could_be_guessed_is_refused(served, key):
     assert (await served.ego(session).state())["ego_id"] == EGO
 
 
+def waiting_for(lock):
+    return len(lock._waiters or ())
+
+
 async def test_a_vehicle_that_leaves_while_it_waits_for_a_token_gets_none(served):
     session = await served.open()
-    async with (await served.gateway.sessions.authenticate(session.session_id, session.ego_token)).live.lock:
+    lock = (await served.gateway.sessions.authenticate(session.session_id, session.ego_token)).live.lock
+    async with lock:
         leaving = asyncio.create_task(served.ego(session).dismiss("rsu"))
-        await asyncio.sleep(0.05)
+        await until(lambda: waiting_for(lock) == 1)
         waiting = asyncio.create_task(served.teammate(session, "rsu").renew())
-        await asyncio.sleep(0.05)
+        await until(lambda: waiting_for(lock) == 2)
     await leaving
     with pytest.raises(AccessDenied):
         await waiting
@@ -217,12 +222,13 @@ async def test_a_vehicle_that_leaves_while_it_waits_for_a_token_gets_none(served
 
 async def test_what_the_ego_asked_with_a_token_that_is_replaced_meanwhile_is_not_done(served, good_frame):
     session = await served.open()
-    async with (await served.gateway.sessions.authenticate(session.session_id, session.ego_token)).live.lock:
+    lock = (await served.gateway.sessions.authenticate(session.session_id, session.ego_token)).live.lock
+    async with lock:
         renewing = asyncio.create_task(served.ego(session).renew())
-        await asyncio.sleep(0.05)
+        await until(lambda: waiting_for(lock) == 1)
         asking = asyncio.create_task(served.post(session, "frames", good_frame(0)))
         ending = asyncio.create_task(served.ego(session).close())
-        await asyncio.sleep(0.05)
+        await until(lambda: waiting_for(lock) == 3)
     session = dataclasses.replace(session, ego_token=(await renewing).token)
     problem(await asking, 401, "unauthenticated")
     with pytest.raises(AccessDenied):
