@@ -16,6 +16,7 @@ from typing import Any, TypedDict, Unpack
 
 import httpx
 from cryptography.hazmat.primitives.asymmetric.ed25519 import Ed25519PrivateKey
+from pydantic import TypeAdapter
 
 from clients.errors import NO_TYPE, GatewayError, GatewayUnreachable, ProtocolError, RequestRefused, refusal
 from clients.receipts import ReceiptBook
@@ -93,6 +94,9 @@ class _Keys:
 @dataclass(frozen=True)
 class _Detectors:
     detectors: list[Mapping[str, Any]]
+
+
+_DETECTORS, _KEYS, _OPENED = TypeAdapter(_Detectors), TypeAdapter(_Keys), TypeAdapter(OpenedSession)
 
 
 def _trusted(base_url: str) -> ssl.SSLContext:
@@ -178,11 +182,11 @@ class GatewayClient:
 
     async def detectors(self) -> list[Mapping[str, Any]]:
         """The gateway's detectors and their message layouts."""
-        return told(await self._request("GET", "/v1/detectors"), _Detectors).detectors
+        return told(await self._request("GET", "/v1/detectors"), _DETECTORS).detectors
 
     async def public_keys(self) -> list[str]:
         """The gateway's public keys, base64, the one that signs now first."""
-        keys = told(await self._request("GET", "/v1/keys"), _Keys).keys
+        keys = told(await self._request("GET", "/v1/keys"), _KEYS).keys
         return [key["public_key"] for key in keys]
 
     async def open_session(
@@ -193,7 +197,7 @@ class GatewayClient:
             raise TypeError(f"teammates must be a sequence of ids, got {teammates!r}")
         asked = {name: value for name, value in options.items() if value is not None}
         body = {"ego_id": ego_id, "teammates": list(teammates), **asked}
-        opened = told(await self._request("POST", "/v1/sessions", json=body, headers=self._opener), OpenedSession)
+        opened = told(await self._request("POST", "/v1/sessions", json=body, headers=self._opener), _OPENED)
         await self.receipts.take(opened.receipt, opened.session_id)
         return opened
 

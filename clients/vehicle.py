@@ -31,7 +31,6 @@ RECEIPT_HEADER, HEAD_HEADER = "Audit-Receipt", "Audit-Head"
 AUDIT_PAGE = 1000
 """Audit records that are asked for at a time."""
 T = TypeVar("T")
-_STATE_RECEIPT = TypeAdapter[LogReceipt | None](LogReceipt | None)
 
 
 class _Accepted(Typed):
@@ -52,6 +51,11 @@ class RenewedToken:
     token: str
     expires_at: str
     receipt: LogReceipt | None = None
+
+
+_CHANGED, _RENEWED = TypeAdapter(_ChangedTeam), TypeAdapter(RenewedToken)
+_STATE = TypeAdapter(dict[str, Any])
+_STATE_RECEIPT = TypeAdapter[LogReceipt | None](LogReceipt | None)
 
 
 class _Proving(httpx.Auth):
@@ -110,7 +114,7 @@ class VehicleClient:
         before, asked = self._promised, self._proven
         asked["headers"][RENEWAL_KEY_HEADER] = secrets.token_urlsafe(16)  # so that it can be asked again
         response = await self._request("POST", f"{self._path}/token", **asked)
-        renewed = told(response, RenewedToken)
+        renewed = told(response, _RENEWED)
         self.token = renewed.token
         await self._keep(renewed.receipt, before)
         return renewed
@@ -193,7 +197,7 @@ class VehicleClient:
 
     async def state(self) -> Mapping[str, Any]:
         """As the ego: the session's state."""
-        state = told(await self._request("GET", self._path, headers=self.bearer), dict[str, Any])
+        state = told(await self._request("GET", self._path, headers=self.bearer), _STATE)
         try:
             receipt = _STATE_RECEIPT.validate_python(state.get("receipt"))
         except ValidationError as error:
@@ -240,7 +244,7 @@ class VehicleClient:
         """As the ego: let teammates join; their tokens."""
         body, before = {"teammates": list(teammates), "public_keys": dict(public_keys or {})}, self._promised
         response = await self._request("POST", f"{self._path}/teammates", json=body, **self._proven)
-        changed = told(response, _ChangedTeam)
+        changed = told(response, _CHANGED)
         await self._keep(changed.receipt, before)
         return changed.teammate_tokens
 
@@ -302,10 +306,10 @@ def _answer(response: httpx.Response) -> FrameAnswer:
         raise ProtocolError(f"not a frame result: {error}") from error
 
 
-def told(response: httpx.Response, kind: type[T]) -> T:
+def told(response: httpx.Response, kind: TypeAdapter[T]) -> T:
     """Read a response's JSON as a type; a `ProtocolError` if it is something else."""
     try:
-        return TypeAdapter(kind).validate_json(response.content)
+        return kind.validate_json(response.content)
     except ValidationError as error:
         first = error.errors(include_url=False, include_input=False)[0]
         where = ".".join(map(str, first["loc"]))

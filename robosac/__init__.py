@@ -51,7 +51,7 @@ else:
             return _find(name)
         from importlib import metadata  # noqa: PLC0415 (it takes longer than all of this)
 
-        return metadata.version(__name__)
+        return globals().setdefault(name, metadata.version(__name__))  # reading it takes milliseconds
 
 
 __all__ = ["PGD", "FusionResult", "IntersectionScene", "Message", "SampleConsensus", "Session", "fuse", "load_detector"]

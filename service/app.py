@@ -11,12 +11,12 @@ import contextlib  # noqa: E402
 import sys  # noqa: E402
 import time  # noqa: E402
 from collections.abc import AsyncIterator, Callable  # noqa: E402
-from importlib.metadata import version  # noqa: E402
 from typing import TYPE_CHECKING, Any  # noqa: E402
 
 import structlog  # noqa: E402
 from fastapi import FastAPI  # noqa: E402
 
+from robosac import __version__  # noqa: E402
 from service import problems  # noqa: E402
 from service.alone import check_alone  # noqa: E402
 from service.arriving.arrival import Arrival  # noqa: E402
@@ -104,7 +104,7 @@ def create_app(
     app = _App(
         title="Defense gateway for collaborative perception",
         summary="Fuses teammates' feature maps that the ego's own perception does not contradict.",
-        version=version("robosac"),
+        version=__version__,
         lifespan=lifespan,
         routes=[*v1.routes, *operations.routes, *pages.routes],  # included, each request would look for its route twice
         redirect_slashes=False,
@@ -210,7 +210,7 @@ async def _running(gateway: Gateway, settings: Settings, tokens: Tokens, tracing
         sweeper = asyncio.create_task(gateway.sessions.expire_idle())
         logger.info(
             "gateway ready",
-            version=version("robosac"),
+            version=__version__,
             detectors=list(engine.detectors),
             device=settings.device,
             gateway=gateway.sessions.moving.name,

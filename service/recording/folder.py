@@ -7,9 +7,9 @@ import time
 from collections import defaultdict
 from collections.abc import Iterator
 from dataclasses import dataclass, field
-from importlib.metadata import version
 from pathlib import Path
 
+from robosac import __version__
 from robosac.files import make_folder
 from robosac.interfaces.ros2 import Ros2
 from robosac.recording.content import Moment, Opening
@@ -196,7 +196,7 @@ class Folder:
         of_key = f"-{record.key_id[:KEY_LETTERS]}" if record.key_id else ""
         path = self.root / f"{began}-{record.session_id}-{part:04d}{of_key}.mcap"
         kept = {name: value for name, value in vars(record).items() if name in Opening.model_fields}
-        more = {"version": version("robosac"), "least_score": moment.least_score, "bodies": self.bodies, "part": part}
+        more = {"version": __version__, "least_score": moment.least_score, "bodies": self.bodies, "part": part}
         opening = Opening(**kept, **more)
         return _Open(RecordingFile(path, opening, moment.time_ns, self._ros2), time.monotonic(), part)
 

@@ -5,10 +5,10 @@ from __future__ import annotations
 import asyncio
 import secrets
 from dataclasses import dataclass, field
-from importlib.metadata import version
 
 import structlog
 
+from robosac import __version__
 from robosac.audit import commitment
 from robosac.audit.events import SessionOpened, now
 from robosac.budget import DomainError
@@ -165,7 +165,7 @@ def _first_record(record: SessionRecord, info: DetectorInfo) -> SessionOpened:
     return SessionOpened(
         **kept,
         time=record.created_at,
-        version=version("robosac"),
+        version=__version__,
         screening={name: bounds.as_json() for name, bounds in screening_for(info).bounds.items()},
         next_seed_commitment=commitment(record.seed),
     )

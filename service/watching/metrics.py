@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 from collections.abc import Mapping
-from importlib.metadata import version
 
 from prometheus_client import (
     CollectorRegistry,
@@ -15,6 +14,7 @@ from prometheus_client import (
     generate_latest,
 )
 
+from robosac import __version__
 from robosac.answers import FrameAnswer
 
 _SECONDS = (0.001, 0.0025, 0.005, 0.01, 0.025, 0.05, 0.1, 0.2, 0.5, 1.0, 2.5)
@@ -26,7 +26,7 @@ class Metrics:
     def __init__(self) -> None:
         self.registry = CollectorRegistry()
         ProcessCollector(registry=self.registry)
-        Info("robosac_gateway", "The gateway", registry=self.registry).info({"version": version("robosac")})
+        Info("robosac_gateway", "The gateway", registry=self.registry).info({"version": __version__})
         self.sessions = Gauge("robosac_sessions", "Open sessions", registry=self.registry)
         self._frames = Counter("robosac_frames_total", "Answered frames", ["source"], registry=self.registry)
         self._degraded = Counter("robosac_degraded_frames_total", "Frames cut short", ["by"], registry=self.registry)

@@ -7,13 +7,13 @@ import json
 import shutil
 from collections.abc import Mapping, Sequence
 from dataclasses import asdict
-from importlib.metadata import version
 from pathlib import Path
 from typing import Any
 
 import msgpack
 import numpy as np
 
+from robosac import __version__
 from robosac.calibrated import digest_beside
 from robosac.defenses.registry import DEFENSES
 from robosac.evaluation.average_precision import Matched
@@ -91,7 +91,7 @@ def _described(plan: Plan) -> dict[str, Any]:
     """What sequences must have been played with to stand in one report. Their number may differ."""
     info, extent = plan.detector.info, plan.extent
     return {
-        "version": version("robosac"),
+        "version": __version__,
         "code": _code(plan),
         "data": plan.data.name,
         "detector": [info.name, info.weights_digest, digest_beside(info)],

@@ -3,9 +3,9 @@
 from __future__ import annotations
 
 from collections.abc import Sequence
-from importlib.metadata import version
 from pathlib import Path
 
+from robosac import __version__
 from robosac.calibrated import calibration_digest, without_witness
 from robosac.evaluation.comparison.pictures import draw_passes, draw_precision
 from robosac.evaluation.comparison.playing import Plan
@@ -71,7 +71,7 @@ def made_by(plan: Plan) -> str:
     """What made the figures besides the command, for whoever cites them."""
     info, calibration = plan.detector.info, calibration_digest(plan.detector.info)
     digests = f"weights {info.weights_digest:.12}" + (f" and calibration {calibration:.12}" if calibration else "")
-    made = f"Made by robosac {version('robosac')} with seed {plan.seed}; {info.name}: {digests}."
+    made = f"Made by robosac {__version__} with seed {plan.seed}; {info.name}: {digests}."
     return f"{made} {without_witness(info.name)}." if lacks_witness(plan.defenses) else made
 
 
