@@ -120,6 +120,10 @@ class Commands(TyperGroup):
             _print_nowhere()
             typer.echo(f"Error: {error.strerror}", err=True)
             sys.exit(2)
+        except SystemExit as ended:
+            if isinstance(ended.__context__, BrokenPipeError):  # of which rich makes a 1, in --help
+                sys.exit(READ_NO_MORE)
+            raise
 
     def invoke(self, ctx: Any) -> Any:
         words = [*ctx._protected_args, *ctx.args]

@@ -172,10 +172,12 @@ def test_the_name_of_a_file_is_told_as_it_is_and_whole():
         assert console.file.getvalue().endswith(f"Written: {path}\n")
 
 
-def test_what_nobody_reads_is_no_outcome_of_a_check(tmp_path):
+@pytest.mark.parametrize("words", [["--help"], ["audit", "show", "--help"], ["audit", "verify", "LOG"]])
+def test_what_nobody_reads_is_no_outcome_of_a_check(words, tmp_path):
     log = tmp_path / "log.jsonl"
     log.write_text("{}\n")
-    program = [sys.executable, "-c", "from robosac.cli import app; app()", "audit", "verify", str(log)]
+    words = [str(log) if word == "LOG" else word for word in words]
+    program = [sys.executable, "-c", "from robosac.cli import app; app()", *words]
     running = subprocess.Popen(program, stdout=subprocess.PIPE, stderr=subprocess.PIPE, text=True)
     running.stdout.close()
     with running.stderr as said:
