@@ -16,7 +16,7 @@ import threading
 import time
 from collections.abc import Callable, Iterator
 from concurrent.futures import ThreadPoolExecutor
-from contextlib import contextmanager, suppress
+from contextlib import closing, contextmanager, suppress
 from functools import partial
 from pathlib import Path
 from typing import Any, Protocol, TypeVar
@@ -267,15 +267,33 @@ class _SqliteThreads:
 
     async def close(self) -> None:
         """Close the connections and end the threads."""
-        await asyncio.get_running_loop().run_in_executor(self._threads, self.engine.dispose)
+        await asyncio.get_running_loop().run_in_executor(self._threads, self._dispose)
         self._threads.shutdown()
+
+    def _dispose(self) -> None:
+        self._save_a_removed_journal()
+        self.engine.dispose()
 
     def _run(self, work: Work[T], first: Callable[[], object]) -> T:
         first()
-        self._place.check()
+        try:
+            self._place.check()
+        except FileNotFoundError:
+            self._save_a_removed_journal()
+            raise
         with self.engine.begin() as connection:
             self._place.remember()
             return work(connection)
+
+    def _save_a_removed_journal(self) -> None:
+        """Write what a journal holds that was removed to the file, before somebody opens that without it. SQLite itself
+        does so only once all processes have closed the file.
+        """
+        pool = self.engine.pool
+        if not self._place.lacks_its_journal or not isinstance(pool, QueuePool) or not pool.checkedin():
+            return  # a new connection would make a new journal
+        with closing(self.engine.raw_connection()) as connection, suppress(sqlite3.Error):
+            connection.cursor().execute("PRAGMA wal_checkpoint(TRUNCATE)").close()
 
 
 def _prepare(connection: Any, _: object) -> None:

@@ -52,6 +52,14 @@ class Place:
             if file != _found(path):
                 raise FileNotFoundError(f"{path.name} was moved, and another one put in its place")
 
+    @property
+    def lacks_its_journal(self) -> bool:
+        """Whether some of what was beside the file was removed, and nothing was put or made in its place."""
+        if not self._journal or any(not path.exists() or _found(path) != file for path, file in self._file.items()):
+            return False
+        there = {path: file for path, file in self._journal.items() if path.exists()}
+        return len(there) < len(self._journal) and all(_found(path) == file for path, file in there.items())
+
     def of_everybody(self) -> Path | None:
         """The file, if everybody may read it or write to it; its group is for whoever runs the gateway to choose."""
         if self._path is None or not self._path.stat().st_mode & stat.S_IRWXO:

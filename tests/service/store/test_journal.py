@@ -34,6 +34,38 @@ async def test_where_the_journal_was_removed_nothing_more_is_acknowledged_and_no
         await decided(store, sid, 2)
 
 
+@pytest.mark.parametrize("removed", [("-wal", "-shm"), ("-wal",), ("-shm",)])
+@pytest.mark.parametrize("noticed", [True, False])
+async def test_what_a_removed_journal_held_is_there_for_who_starts_while_another_still_runs(noticed, removed, tmp_path):
+    """Processes are restarted one after the other; SQLite would write it to the file with the last of them only."""
+    path = tmp_path / "robosac.db"
+    url = f"sqlite:///{path}"
+    async with opened(url) as running:
+        sid = await added(running)
+        async with opened(url) as restarted:
+            await decided(restarted, sid, 1)
+            await running.get(sid)
+            for end in removed:
+                path.with_name(path.name + end).unlink()
+            if noticed:
+                with pytest.raises(StoreUnavailable):
+                    await decided(restarted, sid, 2)
+        with pytest.raises(StoreUnavailable):
+            await running.get(sid)
+        path.with_name("robosac.db-wal").unlink(missing_ok=True)
+        path.with_name("robosac.db-shm").unlink(missing_ok=True)
+        async with opened(url) as restarted:
+            await decided(restarted, sid, 2)
+            with pytest.raises(StoreUnavailable):
+                await decided(running, sid, 3)
+            await decided(restarted, sid, 3)
+            assert len(await check_chain(restarted, sid)) == 4
+    async with opened(url) as store:
+        assert len(await check_chain(store, sid)) == 4
+        with closing(sqlite3.connect(path)) as live:
+            assert live.execute("PRAGMA integrity_check").fetchall() == [("ok",)]
+
+
 async def test_a_backup_that_is_put_into_the_open_file_forks_no_log(tmp_path):
     """SQLite's own way back keeps the files where they are."""
     path, copy = tmp_path / "robosac.db", tmp_path / "copy.db"
