@@ -6,7 +6,7 @@ from collections.abc import Callable, Mapping
 from dataclasses import replace
 from typing import Any
 
-from sqlalchemy import Connection, insert
+from sqlalchemy import Connection, insert, select
 
 from robosac.audit import Unsealed, digest
 from service.errors import SessionChanged, SessionInUse, SessionOver, TokenReplaced
@@ -66,6 +66,13 @@ def append(  # a transaction's work, and what was made ready for it
 def line_row(session_id: str, seq: int, line: str) -> Mapping[str, Any]:
     """A line of a log as it is kept."""
     return {"session_id": session_id, "seq": seq, "line": line}
+
+
+def head_of(connection: Connection, session_id: str, seq: int) -> str | None:
+    """The digest of a line of a log, by its number; None if it is not there."""
+    query = select(audit_lines.c.line).where(audit_lines.c.session_id == session_id, audit_lines.c.seq == seq)
+    line: str | None = connection.execute(query).scalar()
+    return None if line is None else digest(line)
 
 
 def check_revision(now: SessionRecord, worked_out_from: SessionRecord) -> None:

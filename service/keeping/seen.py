@@ -4,12 +4,15 @@ from __future__ import annotations
 
 import logging
 from collections import OrderedDict
+from collections.abc import Callable
 from dataclasses import replace
 
 from service.errors import SessionLost
 from service.keeping.record import SessionRecord
 
 logger = logging.getLogger(__name__)
+HeadOf = Callable[[int], str | None]
+"""The digest of a record of a session's log, by its number; None if it is not there."""
 
 
 class Seen:
@@ -33,7 +36,7 @@ class Seen:
         """Know nothing of a session any more."""
         self._sessions.pop(session_id, None)
 
-    def check(self, now: SessionRecord) -> None:
+    def check(self, now: SessionRecord, head_of: HeadOf) -> None:
         """Refuse to add to a session that the database, which has it so, has lost records of. Others in their place
         would contradict what was promised, and be drawn by seeds that were told before.
 
@@ -42,7 +45,7 @@ class Seen:
         SessionLost
         """
         before = self._sessions.get(now.session_id)
-        if before is not None and has_lost(now, before):
+        if before is not None and has_lost(now, before, head_of):
             logger.error(
                 "the database went back: the log of session %s ends with record %d, and record %d was kept before, or "
                 "another one of its number; was a backup put in its place?",
@@ -64,8 +67,10 @@ class Seen:
         return newest
 
 
-def has_lost(now: SessionRecord, before: SessionRecord) -> bool:
-    """Whether a session that is so now has lost records that it had before."""
+def has_lost(now: SessionRecord, before: SessionRecord, head_of: HeadOf) -> bool:
+    """Whether a session that is so now has lost records that it had before. Another process may have added others in
+    their place.
+    """
     if now.audit_seq == before.audit_seq:
         return now.audit_head != before.audit_head
-    return now.audit_seq < before.audit_seq
+    return now.audit_seq < before.audit_seq or head_of(before.audit_seq) != before.audit_head

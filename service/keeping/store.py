@@ -3,13 +3,14 @@
 from __future__ import annotations
 
 import asyncio
+import logging
 from collections import Counter
 from collections.abc import Callable, Collection, Mapping, Sequence
 from dataclasses import replace
 from functools import partial
 from typing import Any
 
-from sqlalchemy import Connection, Delete, Row, Select, Update, insert, select, update
+from sqlalchemy import Connection, Delete, Select, Update, insert, select, update
 
 from robosac.audit import FULL_EVERY, digest
 from robosac.audit.events import DetectorChanged, Event, FrameAnswered, SessionEnded, TeamChanged, TokenRenewed
@@ -23,7 +24,16 @@ from service.errors import (
     TokenReplaced,
 )
 from service.keeping import clock, migrations, once, partitions, purging, usage
-from service.keeping.appending import ADD_LINE, Change, append, check_revision, check_unused, line_row, renewal
+from service.keeping.appending import (
+    ADD_LINE,
+    Change,
+    append,
+    check_revision,
+    check_unused,
+    head_of,
+    line_row,
+    renewal,
+)
 from service.keeping.database import connect
 from service.keeping.limits import Limits
 from service.keeping.patience import Patience
@@ -33,6 +43,8 @@ from service.keeping.sealing import Draft, Ready, Sealing, drafted, sealed
 from service.keeping.seen import Seen, has_lost
 from service.keeping.shares import Shares
 from service.keeping.tables import audit_lines, kept_messages, sessions
+
+logger = logging.getLogger(__name__)
 
 PAGE, REMEMBERED = 128, 4096
 """Audit lines that are read at a time, and sessions that `Store.seen` knows."""
@@ -112,20 +124,26 @@ class Store:
             return None
         asked, before = {"this": session_id}, self._seen.get(session_id)
 
-        def look(connection: Connection) -> Row[Any] | None:
+        def look(connection: Connection) -> tuple[SessionRecord | None, bool]:
             if before is not None and before.ended_at is None:
                 row = connection.execute(GET_BUT_KNOWN, asked).first()
-                if row is None or (row.revision, row.audit_head) == (before.revision, before.audit_head):
-                    return row
-            return connection.execute(GET, asked).first()
+                if row is not None and (row.revision, row.audit_head) == (before.revision, before.audit_head):
+                    return read_row(row, before), False
+            row = connection.execute(GET, asked).first()
+            if row is None:
+                return None, before is not None and before.ended_at is None
+            record = read_row(row)
+            return record, before is not None and has_lost(record, before, partial(head_of, connection, session_id))
 
-        row = await self._database.read(look)
-        if row is None:
+        record, lost = await self._database.read(look)
+        if lost:  # what was promised is not forgotten
+            if record is None:
+                gone = "session %s is gone: it ended elsewhere and was purged, or the database went back"
+                logger.warning(gone, session_id)
+            return record
+        if record is None:
             self._seen.forget(session_id)
             return None
-        record = read_row(row, before)
-        if before is not None and has_lost(record, before):  # what was promised is not forgotten
-            return record
         if self._seen.get(session_id) is before:  # nothing was written meanwhile: the database is right
             self._seen.forget(session_id)
         newest = self._seen.remember(record)
@@ -385,11 +403,11 @@ class Store:
         if draft is None:
             await asyncio.to_thread(ready.write)
 
-        def checked(now: SessionRecord) -> Mapping[str, Any]:
-            self._seen.check(now)
-            return change(now)
-
         def work(connection: Connection) -> SessionRecord:
+            def checked(now: SessionRecord) -> Mapping[str, Any]:
+                self._seen.check(now, partial(head_of, connection, session_id))
+                return change(now)
+
             first(connection)
             after = append(connection, session_id, ready.made.said, checked, self.check_room, ready.made.state)
             keep(connection)
@@ -400,7 +418,6 @@ class Store:
         except SessionLost:
             raise
         except (SessionChanged, SessionOver, TokenReplaced):
-            self._seen.forget(session_id)
             await self.get(session_id)
             raise
         self._seen.remember(after)

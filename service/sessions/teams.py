@@ -49,6 +49,7 @@ class Teams:
             for name in newcomers:
                 if name == record.ego_id or name in record.teammates:
                     raise Refused(Kind.ALREADY_ENROLLED, f"{name} is in the session already", "teammates")
+            check_size((*record.teammates, *newcomers), self.settings.max_teammates)
             tokens = await self.tokens.issue_all(record.session_id, newcomers, record.ego_id)
             token_ids = {**record.token_ids, **{name: token.token_id for name, token in tokens.items()}}
             keys = {**record.public_keys, **public_keys}
@@ -137,7 +138,6 @@ class Teams:
         keys: Mapping[str, str],
     ) -> SessionRecord:
         """Keep a new team of the session ``record``; the session with it. The session's lock is held."""
-        check_size(team, self.settings.max_teammates)
         if caller.live.team_changes >= MAX_CHANGES:
             detail = f"a team may change {MAX_CHANGES} times between two frames; several may join at once"
             raise Refused(Kind.TOO_MANY_CHANGES, detail)

@@ -249,9 +249,9 @@ async def test_a_session_does_not_expire_under_a_waiting_ego(messages):
 
 
 async def test_idle_sessions_expire():
-    async with serve(session_idle_s=1.0) as served:
+    async with serve(session_idle_s=0.6) as served:
         idle, busy = await served.open(), await served.open()
-        for _ in range(15):
+        for _ in range(20):
             await asyncio.sleep(0.1)
             await served.ego(busy).state()
         with pytest.raises(SessionNotFound):

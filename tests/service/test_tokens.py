@@ -202,6 +202,18 @@ async def test_a_key_of_a_renewal_that_could_be_guessed_is_refused(served, key):
     assert (await served.ego(session).state())["ego_id"] == EGO
 
 
+async def test_of_a_team_that_is_larger_than_it_may_be_now_somebody_can_be_dismissed(tmp_path):
+    database = {"database_url": f"sqlite:///{tmp_path}/robosac.db"}
+    async with serve(**database) as served:
+        session = await served.open()
+    async with serve(**database, max_teammates=3) as served:
+        ego = served.ego(session)
+        await ego.dismiss("rsu")
+        with pytest.raises(InvalidRequest, match="ROBOSAC_MAX_TEAMMATES allows at most 3 teammates, got 5"):
+            await ego.enrol(["bus"])
+        assert "rsu" not in (await ego.state())["teammates"]
+
+
 def waiting_for(lock):
     return len(lock._waiters or ())
 

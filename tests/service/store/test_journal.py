@@ -6,7 +6,7 @@ from contextlib import closing
 import pytest
 
 from service.errors import SessionLost, StoreUnavailable
-from tests.service.store.conftest import added, check_chain, decided, opened
+from tests.service.store.conftest import A_TOKEN, added, check_chain, decided, opened
 
 
 @pytest.mark.parametrize("put_in_its_place", [None, b"", b"something else"])
@@ -82,3 +82,37 @@ async def test_a_backup_that_is_put_into_the_open_file_forks_no_log(tmp_path):
                 await decided(store, sid, 3)
         assert len(await check_chain(store, sid)) == 2
         await decided(store, await added(store, 1), 1)
+
+
+async def test_a_session_goes_on_nowhere_that_knows_of_what_was_lost(tmp_path, caplog):
+    """Another process that does not may have added other records in the meantime."""
+    path, url = tmp_path / "robosac.db", f"sqlite:///{tmp_path}/robosac.db"
+    empty, copy = tmp_path / "empty.db", tmp_path / "copy.db"
+
+    def copied(source, target):
+        with closing(sqlite3.connect(source)) as one, closing(sqlite3.connect(target)) as other:
+            one.backup(other)
+
+    async with opened(url) as store:
+        copied(path, empty)
+        sid = await added(store)
+        await decided(store, sid, 1)
+        copied(path, copy)
+        await decided(store, sid, 2)
+        copied(empty, path)
+        for _ in range(2):
+            assert await store.get(sid) is None
+        assert f"session {sid} is gone" in caplog.text
+        copied(copy, path)
+        with pytest.raises(SessionLost):
+            await decided(store, sid, 3)
+        async with opened(url) as other:
+            for frame in (2, 3, 4):
+                await decided(other, sid, frame)
+        for _ in range(2):
+            assert (await store.get(sid)).last_frame == 4
+            with pytest.raises(SessionLost):
+                await decided(store, sid, 5)
+            with pytest.raises(SessionLost):
+                await store.log(sid, A_TOKEN)
+        assert len(await check_chain(store, sid)) == 5
