@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import re
 import secrets
 from collections.abc import Mapping
 from dataclasses import dataclass, field
@@ -63,6 +64,9 @@ class SessionRecord:
     def purging(self) -> bool:
         """Whether its log is being purged, and is not whole any more."""
         return not self.token_ids
+
+
+SEED = re.compile("[0-9a-f]{64}")
 
 
 def new_seed() -> str:

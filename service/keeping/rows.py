@@ -17,12 +17,14 @@ from sqlalchemy.sql.functions import FunctionElement
 from robosac.faults import describe
 from service.errors import StoreUnavailable
 from service.keeping import clock
-from service.keeping.record import SessionRecord
+from service.keeping.record import SEED, SessionRecord
 from service.keeping.tables import kept_messages, sessions
 
 logger = logging.getLogger(__name__)
 
 _JSON = ("teammates", "defense", "token_ids", "public_keys", "state")
+_NAMES = ("teammates", "token_ids", "public_keys")
+"""Of these, what is in them is text."""
 ROW_BYTES = 1024
 """What a session's row takes besides those, with its places in indexes."""
 FIELDS = tuple(field.name for field in fields(SessionRecord))
@@ -94,7 +96,7 @@ def read_row(row: Row[Any], known: SessionRecord | None = None) -> SessionRecord
     """
     try:
         values = {name: json.loads(value) if name in _JSON else value for name, value in row._mapping.items()}
-        if wrong := [name for name, value in values.items() if not isinstance(value, _READ_AS[name])]:
+        if wrong := [name for name, value in values.items() if not _is_whole(name, value)]:
             raise TypeError(f"{', '.join(wrong)} of another kind")
     except (ValueError, TypeError, RecursionError) as error:
         logger.error("the database failed: the row of session %s is damaged: %s", row.session_id, describe(error))
@@ -102,6 +104,18 @@ def read_row(row: Row[Any], known: SessionRecord | None = None) -> SessionRecord
     if known is not None and "defense" not in values:
         values |= {"defense": known.defense, "state": known.state}
     return SessionRecord(**{**values, "teammates": tuple(values["teammates"])})
+
+
+def _is_whole(name: str, value: Any) -> bool:
+    """Whether a field can have such a value."""
+    if name == "seed":
+        return isinstance(value, str) and SEED.fullmatch(value) is not None
+    if name == "defense":
+        return isinstance(value, dict) and isinstance(value.get("kind", ""), str)
+    if name in _NAMES:
+        texts = value if name == "teammates" else getattr(value, "values", list)()
+        return isinstance(value, _READ_AS[name]) and all(isinstance(text, str) for text in texts)
+    return isinstance(value, _READ_AS[name])
 
 
 def columns(record: SessionRecord, *names: str, state: str | None = None) -> dict[str, Any]:

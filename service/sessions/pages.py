@@ -2,12 +2,15 @@
 
 from __future__ import annotations
 
+import logging
 from bisect import bisect_right
 from collections.abc import AsyncIterator
 from itertools import accumulate
 
-from service.errors import SessionOver
+from service.errors import SessionOver, StoreUnavailable
 from service.keeping.store import PAGE, Store
+
+logger = logging.getLogger(__name__)
 
 FIRST_PAGE = 4
 """Lines of a log that are read first; then at most twice as many as were sent before."""
@@ -22,13 +25,19 @@ async def pages(store: Store, session_id: str, after: int, last: int) -> AsyncIt
     ------
     SessionOver
         If the log is purged meanwhile.
+    StoreUnavailable
+        If lines of it are missing.
     """
     page = FIRST_PAGE
     while after < last:
         page = min(page, last - after)
         lines = await store.audit(session_id, after, page)
-        if len(lines) < page:  # it is being purged, from its beginning on: what was sent must not look whole
-            raise SessionOver("the log was purged")
+        if len(lines) < page:  # what was sent must not look whole
+            record = await store.get(session_id)
+            if record is None or record.purging:  # from its beginning on
+                raise SessionOver("the log was purged")
+            logger.error("the database failed: the log of session %s is damaged after record %d", session_id, after)
+            raise StoreUnavailable
         fitting = max(1, bisect_right(list(accumulate(map(len, lines))), PAGE_BYTES))
         after, page = after + fitting, min(PAGE, 2 * fitting)
         yield "\n".join(lines[:fitting]) + "\n"

@@ -258,8 +258,9 @@ class Sessions:
             raise Refused(Kind.DETECTOR_UNAVAILABLE, detail)
         if not self.settings.allow_other_weights and has_changed(record, detector.info):
             raise Refused(Kind.DETECTOR_UNAVAILABLE, f"{OTHER_WEIGHTS} {record.detector}")
-        if record.defense["kind"] not in self.defenses:
-            detail = f"the session's defence {record.defense['kind']} is not served now"
+        kind = record.defense.get("kind")
+        if kind not in self.defenses:
+            detail = f"the session's defence {kind} is not served now"
             raise Refused(Kind.DEFENSE_UNAVAILABLE, detail)
         try:
             kept = opened or read_settings(record.defense, self.defenses).at_period(record.frame_period_ms)

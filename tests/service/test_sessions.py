@@ -1,16 +1,17 @@
 import asyncio
+import contextlib
 import json
 import sqlite3
 
 import pytest
-from sqlalchemy import delete, text
+from sqlalchemy import delete, text, update
 
 from clients.errors import AccessDenied, SessionNotFound
 from robosac.audit import verify
 from robosac.audit.events import TokenRenewed
 from service.errors import SessionOver, StoreUnavailable
 from service.keeping.store import PAGE
-from service.keeping.tables import audit_lines
+from service.keeping.tables import audit_lines, sessions
 from service.sessions.idle import Idle
 from service.sessions.pages import FIRST_PAGE, PAGE_BYTES
 from tests.service.conftest import EGO, TEAM, problem, serve, until
@@ -44,19 +45,20 @@ async def test_a_log_that_is_purged_while_it_is_read_never_looks_whole(served):
     pages = await served.gateway.sessions.audit_log(session.session_id, session.ego_token, 0, 10**6)
     assert (await anext(pages)).count("\n") == FIRST_PAGE
     beginning = delete(audit_lines).where(audit_lines.c.seq <= FIRST_PAGE + 9)
-    await store._database.write(lambda connection: connection.execute(beginning))
+    nobody_may = update(sessions).values(token_ids="{}")
+    await store._database.write(lambda connection: [connection.execute(step) for step in (nobody_may, beginning)])
     with pytest.raises(SessionOver, match="purged"):
         await anext(pages)
 
 
-async def test_a_log_that_is_purged_while_it_is_sent_breaks_off_without_a_traceback(served, monkeypatch, caplog):
+async def test_a_log_of_which_lines_are_gone_while_it_is_sent_breaks_off_without_a_traceback(served, monkeypatch, caplog):
     session, sent = await served.open(), []
     for _ in range(2 * FIRST_PAGE):
         note = TokenRenewed(vehicle_id=EGO, expires_at="2026-01-01T00:00:00Z")
         await served.gateway.store.log(session.session_id, note)
     read = served.gateway.store.audit
 
-    async def purged(sid, after, limit):
+    async def gone(sid, after, limit):
         return [] if after else await read(sid, after, limit)
 
     async def receive():
@@ -65,7 +67,7 @@ async def test_a_log_that_is_purged_while_it_is_sent_breaks_off_without_a_traceb
     async def send(message):
         sent.append(message)
 
-    monkeypatch.setattr(served.gateway.store, "audit", purged)
+    monkeypatch.setattr(served.gateway.store, "audit", gone)
     path = f"/v1/sessions/{session.session_id}/audit"
     headers = [(b"host", b"gateway"), (b"authorization", f"Bearer {session.ego_token}".encode())]
     asgi = {"type": "http", "asgi": {"version": "3.0", "spec_version": "2.4"}, "http_version": "1.1"}
@@ -314,9 +316,15 @@ async def test_a_session_whose_records_the_database_lost_is_not_said_to_be_close
         ("last_frame", "the first"),
         ("audit_seq", 1.5),
         ("seed", b"\0"),
+        ("seed", "0" * 20),
+        ("seed", "0" * 30 + " " + "0" * 33),
+        ("teammates", "[1]"),
+        ("token_ids", '{"car-1": 1}'),
     ],
 )
-async def test_a_damaged_session_is_unavailable_and_no_fault_of_the_gateway(column, value, tmp_path, good_frame):
+async def test_a_damaged_session_is_unavailable_and_no_fault_of_the_gateway(
+    column, value, tmp_path, good_frame, caplog
+):
     path = tmp_path / "robosac.db"
     async with serve(database_url=f"sqlite:///{path}") as served:
         damaged, whole = await served.open(), await served.open()
@@ -328,7 +336,34 @@ async def test_a_damaged_session_is_unavailable_and_no_fault_of_the_gateway(colu
         bearer = {"Authorization": f"Bearer {damaged.ego_token}"}
         answer = await served.http.get(f"/v1/sessions/{damaged.session_id}", headers=bearer)
         problem(answer, 503, "store-unavailable")
+        assert "is damaged" in caplog.text
+        assert "0" * 20 not in caplog.text
         await served.ego(whole).post_frame_body(good_frame(0))
+
+
+@pytest.mark.parametrize("missing", [1, 2])
+async def test_a_log_of_which_lines_are_missing_is_damaged_and_not_purged(missing, served, good_frame, caplog):
+    session, store = await served.open(), served.gateway.store
+    await served.post(session, "frames", good_frame(0))
+    gone = delete(audit_lines).where(audit_lines.c.seq == missing)
+    await store._database.write(lambda connection: connection.execute(gone))
+    bearer = {"Authorization": f"Bearer {session.ego_token}"}
+    answer = await served.http.get(f"/v1/sessions/{session.session_id}/audit", headers=bearer)
+    problem(answer, 503, "store-unavailable")
+    assert f"the log of session {session.session_id} is damaged after record 0" in caplog.text
+
+
+@pytest.mark.parametrize("value", ["{}", '{"a": 1}', '{"kind": []}', '{"kind": "none", "a": 1}'])
+async def test_a_session_whose_defence_is_damaged_is_not_served(value, tmp_path):
+    database = {"database_url": f"sqlite:///{tmp_path}/robosac.db"}
+    async with serve(**database) as served:
+        damaged = await served.open()
+        with contextlib.closing(sqlite3.connect(tmp_path / "robosac.db")) as rows, rows:
+            rows.execute("UPDATE sessions SET defense = ?", [value])
+    async with serve(**database) as served:
+        bearer = {"Authorization": f"Bearer {damaged.ego_token}"}
+        answer = await served.http.get(f"/v1/sessions/{damaged.session_id}", headers=bearer)
+        assert answer.status_code in {409, 503}, answer.text
 
 
 async def test_a_log_whose_first_page_cannot_be_read_is_a_problem_and_no_empty_log(served, monkeypatch):
