@@ -51,7 +51,7 @@ async def test_a_log_that_is_purged_while_it_is_read_never_looks_whole(served):
         await anext(pages)
 
 
-async def test_a_log_of_which_lines_are_gone_while_it_is_sent_breaks_off_without_a_traceback(served, monkeypatch, caplog):
+async def test_a_log_of_which_lines_are_gone_meanwhile_breaks_off_without_a_traceback(served, monkeypatch, caplog):
     session, sent = await served.open(), []
     for _ in range(2 * FIRST_PAGE):
         note = TokenRenewed(vehicle_id=EGO, expires_at="2026-01-01T00:00:00Z")
