@@ -299,9 +299,13 @@ async def test_a_session_whose_records_the_database_lost_takes_no_others(store, 
     await store.renew_token(sid, "t1", "t9", A_TOKEN)
     promised = store.seen(sid)
     undone = text("UPDATE sessions SET revision = 0, audit_seq = :seq, audit_head = :head WHERE session_id = :sid")
-    for head, seq in ((row.audit_head, 1), ("f" * 64, 2)):
+    other_line = text("UPDATE audit_lines SET line = 'another' WHERE session_id = :sid AND seq > :seq - 2")
+    for head, seq in ((row.audit_head, 1), ("f" * 64, 2), ("e" * 64, 3)):
         changed = {"sid": sid, "seq": seq, "head": head}
         await store._database.write(lambda connection, changed=changed: connection.execute(undone, changed))
+        if seq == 3:  # another process went on, with another second record
+            at = {"sid": sid, "seq": seq}
+            await store._database.write(lambda connection, at=at: connection.execute(other_line, at))
         assert (await store.get(sid)).audit_head == head
         assert store.seen(sid) == promised
         for _ in range(2):
