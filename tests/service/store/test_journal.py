@@ -34,8 +34,22 @@ async def test_where_the_journal_was_removed_nothing_more_is_acknowledged_and_no
         await decided(store, sid, 2)
 
 
+async def test_where_another_journal_is_in_its_place_the_file_is_left_alone(tmp_path):
+    """Whoever made it writes to the file."""
+    path = tmp_path / "robosac.db"
+    async with opened(f"sqlite:///{path}") as store:
+        sid = await added(store)
+        (tmp_path / "robosac.db-shm").unlink()
+        (tmp_path / "robosac.db-wal").unlink()
+        (tmp_path / "robosac.db-wal").write_bytes(b"")
+        before = path.stat().st_mtime_ns
+        with pytest.raises(StoreUnavailable):
+            await store.log(sid, A_TOKEN)
+        assert path.stat().st_mtime_ns == before
+
+
 @pytest.mark.parametrize("removed", [("-wal", "-shm"), ("-wal",), ("-shm",)])
-@pytest.mark.parametrize("noticed", [True, False])
+@pytest.mark.parametrize("noticed", ["by both", "by the other", "by nobody"])
 async def test_what_a_removed_journal_held_is_there_for_who_starts_while_another_still_runs(noticed, removed, tmp_path):
     """Processes are restarted one after the other; SQLite would write it to the file with the last of them only."""
     path = tmp_path / "robosac.db"
@@ -47,11 +61,12 @@ async def test_what_a_removed_journal_held_is_there_for_who_starts_while_another
             await running.get(sid)
             for end in removed:
                 path.with_name(path.name + end).unlink()
-            if noticed:
+            if noticed == "by both":
                 with pytest.raises(StoreUnavailable):
                     await decided(restarted, sid, 2)
-        with pytest.raises(StoreUnavailable):
-            await running.get(sid)
+        if noticed != "by nobody":
+            with pytest.raises(StoreUnavailable):
+                await running.get(sid)
         path.with_name("robosac.db-wal").unlink(missing_ok=True)
         path.with_name("robosac.db-shm").unlink(missing_ok=True)
         async with opened(url) as restarted:
