@@ -27,6 +27,7 @@ from service.arriving.hanging_up import HangingUp  # noqa: E402
 from service.arriving.limits import BodyLimit, Unfinished  # noqa: E402
 from service.arriving.pacing import Metered, Pacing  # noqa: E402
 from service.arriving.parties import Parties  # noqa: E402
+from service.arriving.reading import Reading  # noqa: E402
 from service.deciding.admission import KEY_FRAMES, Admission  # noqa: E402
 from service.deciding.answering import Deciding  # noqa: E402
 from service.deciding.keeping import Keeping  # noqa: E402
@@ -128,7 +129,7 @@ def create_app(
         app.add_middleware(Door, check=check_local)
     app.add_middleware(Traced, tracing=tracing)
     app.add_middleware(Door, check=check_head)
-    app.add_middleware(Metered, pacing=gateway.frames.pacing)
+    app.add_middleware(Metered, pacing=gateway.frames.reading.pacing)
     app.add_middleware(Arrival, watch=gateway.watch)
     app.add_middleware(Starting)
     api_pages(app)
@@ -177,7 +178,7 @@ def _built(
         teams=Teams(settings, sessions, store, tokens),
         possession=Possession(store, sessions.journal, tokens.clock, settings.public_url),
         parties=parties,
-        frames=Frames(sessions, deciding, metrics, admission, settings.max_frame_jump, pacing),
+        frames=Frames(sessions, deciding, metrics, admission, settings.max_frame_jump, Reading(engine, pacing)),
         bodies=Room(settings.max_inflight_bytes, of_key, "ROBOSAC_MAX_INFLIGHT_BYTES"),
         unfinished=Unfinished(),
         api_keys=api_keys,

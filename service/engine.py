@@ -7,7 +7,7 @@ import contextlib
 import math
 import threading
 import time
-from collections.abc import Callable, Iterable, Mapping, Sequence
+from collections.abc import Callable, Iterable, Iterator, Mapping, Sequence
 from concurrent.futures import ThreadPoolExecutor
 from copy import copy
 from functools import partial
@@ -182,6 +182,32 @@ class Engine:
         """As `service.turns.Turns.lead`."""
         with self._lock:
             return self._turns.lead(work, other)
+
+    @contextlib.contextmanager
+    def elsewhere(self, work: Work) -> Iterator[None]:
+        """Let work that is done on other threads for the length of a block have its part in the shares."""
+        with self._lock:
+            self._turns.join(work)
+        try:
+            yield
+        finally:
+            with self._lock:
+                self._turns.leave(work)
+
+    def put_down(self, work: Work, seconds: float) -> None:
+        """As `service.turns.Turns.put_down`."""
+        with self._lock:
+            self._turns.put_down(work, seconds)
+
+    def first(self, works: Iterable[Work]) -> Work:
+        """As `service.turns.Turns.first`."""
+        with self._lock:
+            return self._turns.first(works)
+
+    def puts_off(self, work: Work) -> bool:
+        """As `service.turns.Turns.puts_off`."""
+        with self._lock:
+            return self._turns.puts_off(work)
 
     def begin(self, session: Session, ego: Message) -> Begun:
         """Work out what can be of a session's frame while its teammates are waited for."""

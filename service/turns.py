@@ -94,8 +94,8 @@ class _Shares:
         return max(self._had_s.get(party, self._floor_s), self._floor_s - CREDIT_S)
 
     def charge(self, party: str, seconds: float) -> None:
-        """A party had its turn."""
-        self._had_s[party] += seconds
+        """A party had so much more; it may have left meanwhile."""
+        self._had_s[party] = self._had_s.get(party, self._floor_s) + seconds
 
     def _raise_floor(self) -> None:
         self._floor_s = max(self._floor_s, min((self._had_s[party] for party in self._present), default=0.0))
@@ -113,6 +113,8 @@ class Turns:
     Time that nobody else wanted is not held against anybody for longer than others have to catch up. Of time that
     somebody did not want, no more than `CREDIT_S` is saved up: so who wants little goes first among those who always
     want more. No lock is needed where one thread has the turns; `service.engine` holds one.
+
+    Work that is done elsewhere, on other threads, has its part in the same shares (`join`, `put_down`, `leave`).
     """
 
     def __init__(self) -> None:
@@ -128,6 +130,10 @@ class Turns:
     def add(self, work: Work) -> None:
         """Let work take turns from now on."""
         self._works.append(work)
+        self.join(work)
+
+    def join(self, work: Work) -> None:
+        """Let work that is done elsewhere have its part in the shares."""
         self._keys.join(work.key)
         self._sessions.setdefault(work.key, _Shares()).join(work.session_id)
         self._sessions.move_to_end(work.key)
@@ -181,12 +187,21 @@ class Turns:
         """Work had its turn, which took so long."""
         work.charge(seconds)
         self.charged_s += seconds
+        self.put_down(work, seconds)
+
+    def put_down(self, work: Work, seconds: float) -> None:
+        """Work that is done elsewhere took so long; it may have left meanwhile."""
         self._keys.charge(work.key, seconds)
-        self._sessions[work.key].charge(work.session_id, seconds)
+        if work.key in self._sessions:
+            self._sessions[work.key].charge(work.session_id, seconds)
 
     def remove(self, work: Work) -> None:
         """Work is done, or wanted no more."""
         self._works.remove(work)
+        self.leave(work)
+
+    def leave(self, work: Work) -> None:
+        """Work that is done elsewhere is done, or wanted no more."""
         self._keys.leave(work.key)
         self._sessions[work.key].leave(work.session_id)
         self._forget()
@@ -198,8 +213,20 @@ class Turns:
         """
         if work.key != other.key:
             return self._keys.had(other.key) - self._keys.had(work.key)
-        sessions = self._sessions.setdefault(work.key, _Shares())
-        return sessions.had(other.session_id) - sessions.had(work.session_id)
+        return self._had_of_key(other) - self._had_of_key(work)
+
+    def first(self, works: Iterable[Work]) -> Work:
+        """Of work that is done elsewhere, that of the key that had least; of a key's, that of the session that had."""
+        return min(works, key=lambda work: (self._keys.had(work.key), self._had_of_key(work)))
+
+    def puts_off(self, work: Work) -> bool:
+        """Whether work that has turns here goes before some that is done elsewhere: it will still have had less than
+        that once it is over.
+        """
+        return any(self.lead(here, work) > here.left_s for here in self._works)
+
+    def _had_of_key(self, work: Work) -> float:
+        return self._sessions.setdefault(work.key, _Shares()).had(work.session_id)
 
     def _by_key(self, works: Iterable[Work]) -> dict[str, list[tuple[float, Work]]]:
         """Work of each key, and what its session will have had once it is over, by which it is sorted."""

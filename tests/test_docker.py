@@ -25,6 +25,14 @@ def test_the_image_is_built_in_stages_and_runs_without_root():
     assert "HEALTHCHECK" in names
 
 
+def test_every_stage_begins_with_one_image_that_a_digest_names():
+    (image,) = [
+        value.removeprefix("PYTHON_IMAGE=") for name, value in INSTRUCTIONS if value.startswith("PYTHON_IMAGE=")
+    ]
+    assert re.fullmatch(r"python:3\.11-slim@sha256:[0-9a-f]{64}", image)
+    assert {value.split()[0] for name, value in INSTRUCTIONS if name == "FROM"} == {"${PYTHON_IMAGE}"}
+
+
 def test_what_is_copied_is_there_and_not_ignored():
     kept = [line[1:] for line in (ROOT / ".dockerignore").read_text().splitlines() if line.startswith("!")]
     defaults = dict(value.split("=") for name, value in INSTRUCTIONS if name == "ARG" and "=" in value)

@@ -5,23 +5,18 @@ from __future__ import annotations
 import asyncio
 import contextlib
 import math
-import os
-import sys
 import time
 from collections.abc import AsyncIterator, Awaitable, Callable
 from contextlib import AbstractContextManager
-from dataclasses import dataclass, field
-from functools import partial
+from dataclasses import dataclass
 from typing import TypeVar
 
 from robosac import wire
 from robosac.answers import Reason
-from robosac.steps import Steps, done_within, finished
+from robosac.steps import Steps, finished
 from service.arriving.bodies import SMALL_BYTES
 from service.arriving.checking import InFrame, read_frame, read_message, reason_of
-from service.arriving.giving_way import Line, Turn
-from service.arriving.pacing import Pacing
-from service.arriving.parties import Parties
+from service.arriving.reading import Reading
 from service.deciding.admission import Admission
 from service.deciding.answering import Deciding
 from service.deciding.asked import Answered, Asked
@@ -42,17 +37,8 @@ HungUp = Callable[[], Awaitable[None]]
 
 SLACK_BYTES = 64 * 1024
 """What a message may have besides its tensors."""
-_CORES = len(os.sched_getaffinity(0)) if sys.platform == "linux" else os.cpu_count() or 1
-READ_AT_A_TIME = min(_CORES, 2)
-"""Bodies, so that reading does not press fusion out of a single core."""
-READ_S = 0.005
-"""For how long about a body is read before others have their turns: one of many messages may take ten times as long."""
-READING_MOST_S = 5.0
-"""After which a turn to read holds up no other: none takes so long."""
 LONG_S = 0.5
 """Of a wait for teammates' messages, which ends early if the ego hangs up: its next frame would wait behind it."""
-READING_SHARE = 0.5
-"""Of its budget, for which a body may wait until it is read: later there is hardly time to answer it."""
 _COMPRESSED = wire.ZSTD.encode()
 """In a body of which much may come, however small it is."""
 
@@ -67,11 +53,7 @@ class Frames:
     admission: Admission
     max_jump: int
     """By how much a frame's number may exceed the latest answered one."""
-    pacing: Pacing
-    reading: Line = field(default_factory=lambda: Line(lambda: False, READ_AT_A_TIME, READING_MOST_S))
-    """Bodies that take long to read, by turns of keys, of a key's sessions and of a session's vehicles: else whoever
-    sends many at once is read before all others.
-    """
+    reading: Reading
 
     async def post_message(
         self, caller: Caller, body: bytes, arrived: float, room: Share, hung_up: HungUp
@@ -132,38 +114,10 @@ class Frames:
         try:
             if len(body) <= SMALL_BYTES and _COMPRESSED not in body:
                 return finished(steps)
-            return await self._read_by_turns(caller, steps)
+            return await self.reading.read(caller, steps)
         except InFrame as error:
             await self.refuse(caller, error.what, error.frame)
             raise error.what from error.what.__cause__
-
-    async def _read_by_turns(self, caller: Caller, steps: Steps[T]) -> T:
-        """Read some of a body, and more once others had their turns, and more of the time besides."""
-        party, left_s = Parties.of_token(caller.record, caller.vehicle_id), READING_SHARE * caller.live.budget_s
-        while True:
-            began, took_s = time.perf_counter(), list[float]()
-            turn = await self._turn(caller, party, left_s)
-            left_s -= time.perf_counter() - began
-            some = asyncio.create_task(asyncio.to_thread(_timed, steps, took_s))
-            some.add_done_callback(partial(self._read_some, turn, party, took_s))
-            if (read := await asyncio.shield(some)) is not None:  # a thread works on though nobody waits for it
-                return read[0]
-
-    def _read_some(self, turn: Turn, party: tuple[str, str], took_s: list[float], some: asyncio.Task[object]) -> None:
-        turn.end()
-        self.pacing.charge(party, sum(took_s) / _CORES)
-        if not some.cancelled():
-            some.exception()  # it is told to whoever still waits
-
-    async def _turn(self, caller: Caller, party: tuple[str, str], within_s: float) -> Turn:
-        """A turn to read a body, if it comes in time. For how long the body itself was on its way does not count."""
-        try:
-            async with asyncio.timeout(within_s):
-                await self.pacing.turn(party)
-                return await self.reading.turn((caller.live.key, caller.record.session_id, caller.vehicle_id))
-        except TimeoutError:
-            detail = "bodies of other requests took the time that this one had"
-            raise Refused(Kind.OVERLOADED, detail, retry_after_s=1) from None
 
     async def _answer(self, asked: Asked, hung_up: HungUp | None = None) -> Answered:
         """The answer to a frame; one that came as the ego's message alone, whose sender may hang up, is gathered."""
@@ -243,15 +197,6 @@ class Frames:
             raise
         self.sessions.moving.message_waits(caller)
         return record
-
-
-def _timed(steps: Steps[T], took_s: list[float]) -> tuple[T] | None:
-    """Some of the steps; and the processor time that they took is appended, whatever comes of them."""
-    began = time.thread_time()
-    try:
-        return done_within(steps, READ_S)
-    finally:
-        took_s.append(time.thread_time() - began)
 
 
 def _expanded_by(asked: Asked, body: bytes) -> int:

@@ -53,26 +53,28 @@ class Turn:
 
 
 @dataclass
-class _Waiting:
+class Waiting:
     """Those of a party that wait: its own, and those of its members by turns."""
 
     own: deque[Turn] = field(default_factory=deque)
-    members: OrderedDict[str, _Waiting] = field(default_factory=OrderedDict)
+    members: OrderedDict[str, Waiting] = field(default_factory=OrderedDict)
 
     def __bool__(self) -> bool:
         return bool(self.own or self.members)
 
     def put(self, turn: Turn, party: Party) -> None:
         if party:
-            self.members.setdefault(party[0], _Waiting()).put(turn, party[1:])
+            self.members.setdefault(party[0], Waiting()).put(turn, party[1:])
         else:
             self.own.append(turn)
 
-    def take(self) -> Turn:
-        if self.own:
+    def take(self, *names: str) -> Turn:
+        """The next one; of the member of this name, of its member of the next, and so on, as far as names are given."""
+        if self.own and not names:
             return self.own.popleft()
-        name, member = self.members.popitem(last=False)
-        turn = member.take()
+        name = names[0] if names else next(iter(self.members))
+        member = self.members.pop(name)
+        turn = member.take(*names[1:])
         if member:
             self.members[name] = member  # behind the others
         return turn
@@ -96,7 +98,7 @@ class Line:
         self.turn_s = turn_s
         self._busy = busy
         self._at_most = at_a_time
-        self._waiting = _Waiting()
+        self._waiting = Waiting()
         self._at_work = 0
         self._latest = -1.0
         self._look: asyncio.TimerHandle | None = None
@@ -122,14 +124,24 @@ class Line:
         while self._waiting and self._at_work < self._at_most:
             now = time.perf_counter()
             if self._busy() and now < self._latest + EVERY_S:
-                if self._look is None:
-                    self._look = asyncio.get_running_loop().call_later(_LOOK_S, self._look_again)
+                self._look_later()
                 return
-            turn = self._waiting.take()
+            turn = self._take(self._waiting)
+            if turn is None:
+                self._look_later()
+                return
             if not turn.began.done():  # it was not given up
                 self._latest = now
                 self._at_work += 1
                 turn.begin()
+
+    def _take(self, waiting: Waiting) -> Turn | None:
+        """Whose turn it is of those that wait; None if nobody's yet."""
+        return waiting.take()
+
+    def _look_later(self) -> None:
+        if self._look is None:
+            self._look = asyncio.get_running_loop().call_later(_LOOK_S, self._look_again)
 
     def _look_again(self) -> None:
         self._look = None

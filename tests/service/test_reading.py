@@ -1,6 +1,7 @@
 """Bodies that take long to read are read elsewhere than on the event loop, by turns of keys."""
 
 import asyncio
+import math
 import os
 import threading
 import time
@@ -10,8 +11,9 @@ import pytest
 from clients.client import GatewayClient
 from robosac import wire
 from service.arriving.checking import InFrame, read_frame
-from service.arriving.frames import READ_AT_A_TIME
 from service.arriving.pacing import OTHERS
+from service.arriving.reading import READ_AT_A_TIME, FairLine
+from service.turns import Turns, Work
 from tests.service.conftest import EGO, TEAM, problem, serve
 from tests.service.credentials import KEY, OTHER_KEY
 
@@ -106,8 +108,9 @@ async def test_the_time_that_reading_takes_is_put_down_to_the_sender(fails, monk
     async with serve() as served:
         session = await served.open()
         monkeypatch.setattr("service.arriving.frames.read_frame", works)
-        pacing = served.gateway.frames.pacing
+        pacing, put_down = served.gateway.frames.reading.pacing, []
         monkeypatch.setattr(pacing, "charge", lambda party, seconds: charged.append((party, seconds)))
+        monkeypatch.setattr(served.gateway.engine, "put_down", lambda work, seconds: put_down.append((work, seconds)))
         answer = await served.post(session, "frames", good_frame(0))
         assert answer.status_code == (400 if fails else 200)
         headers = [(b"authorization", f"Bearer {session.ego_token}".encode())]
@@ -115,12 +118,14 @@ async def test_the_time_that_reading_takes_is_put_down_to_the_sender(fails, monk
     assert {who for who, _ in charged} == {party}
     assert party[0] != OTHERS
     assert sum(seconds for _, seconds in charged) * (os.cpu_count() or 1) >= worked_s
+    assert [seconds for _, seconds in put_down] == [seconds for _, seconds in charged]
+    assert {work.session_id for work, _ in put_down} == {session.session_id}
 
 
 async def test_whoever_had_too_much_of_the_time_waits_to_be_read(monkeypatch, good_frame):
     async with serve() as served:
         session = await served.open(latency_budget_ms=5000.0)
-        pacing, over, asked = served.gateway.frames.pacing, [True] * 3, []
+        pacing, over, asked = served.gateway.frames.reading.pacing, [True] * 3, []
 
         def is_over(party):
             asked.append(party)
@@ -153,7 +158,7 @@ async def test_a_body_that_nobody_waits_for_any_more_keeps_its_turn_while_it_is_
     async with serve() as served:
         session = await served.open(latency_budget_ms=5000.0)
         monkeypatch.setattr("service.arriving.frames.read_frame", works)
-        pacing = served.gateway.frames.pacing
+        pacing = served.gateway.frames.reading.pacing
         monkeypatch.setattr(pacing, "charge", lambda party, seconds: charged.append(seconds))
         posts = []
         for number in range(READ_AT_A_TIME):
@@ -173,6 +178,66 @@ async def test_a_body_that_nobody_waits_for_any_more_keeps_its_turn_while_it_is_
     assert min(charged) * (os.cpu_count() or 1) >= 0.1
 
 
+def shares_of(*had):
+    """Shares of work that is done elsewhere, and what each had."""
+    turns = Turns()
+    for work, _ in had:
+        turns.join(work)
+    for work, seconds in had:
+        turns.put_down(work, seconds)
+    return turns
+
+
+def work_of(key, session_id="s", expected_s=0.0):
+    return Work(key, session_id, math.inf, expected_s)
+
+
+async def test_whoever_had_least_is_read_first():
+    works = [work_of("much", "a"), work_of("little", "more"), work_of("little", "less"), work_of("little", "most")]
+    line = FairLine(shares_of(*zip(works, [0.5, 0.02, 0.01, 0.03], strict=True)), gives_way=False)
+    held = [await line.turn(("any", "s", "v")) for _ in range(READ_AT_A_TIME)]
+    order = []
+
+    async def is_read(work):
+        turn = await line.turn((work.key, work.session_id, "ego"))
+        order.append(work.session_id)
+        turn.end()
+
+    reads = [asyncio.create_task(is_read(work)) for work in works]
+    await asyncio.sleep(0)
+    held[0].end()
+    async with asyncio.timeout(10.0):
+        await asyncio.gather(*reads)
+    assert order == ["less", "more", "most", "a"]
+
+
+@pytest.mark.parametrize(
+    ("had_s", "frame_had_s", "gives_way", "waits"),
+    [(0.2, 0.0, True, True), (0.2, 0.0, False, False), (0.0, 0.0, True, False), (0.2, 0.18, True, False)],
+)
+async def test_on_one_core_bodies_wait_for_frames_of_those_who_will_have_had_less(had_s, frame_had_s, gives_way, waits):
+    body, frame = work_of("body"), work_of("frame", expected_s=0.05)
+    turns = shares_of((body, had_s), (frame, frame_had_s))
+    turns.add(frame)
+    line = FairLine(turns, gives_way=gives_way)
+    read = asyncio.create_task(line.turn((body.key, body.session_id, "ego")))
+    for _ in range(5):
+        await asyncio.sleep(0.005)
+    assert read.done() is not waits
+    turns.remove(frame)
+    async with asyncio.timeout(10.0):
+        (await read).end()
+
+
+@pytest.mark.parametrize(("cores", "status"), [(1, 503), (2, 200)])
+async def test_only_on_one_core_bodies_wait_for_frames(cores, status, monkeypatch, good_frame):
+    monkeypatch.setattr("service.arriving.reading._CORES", cores)
+    async with serve() as served:
+        session = await served.open(latency_budget_ms=400.0, gather_ms=10.0)
+        monkeypatch.setattr(served.gateway.engine, "puts_off", lambda work: True)
+        assert (await served.post(session, "frames", good_frame(0))).status_code == status
+
+
 async def test_all_that_a_body_waits_for_its_turns_counts(monkeypatch, good_frame):
     def in_parts(caller, body):
         for _ in range(20):
@@ -186,7 +251,7 @@ async def test_all_that_a_body_waits_for_its_turns_counts(monkeypatch, good_fram
     async with serve() as served:
         session = await served.open(latency_budget_ms=400.0, gather_ms=10.0)
         monkeypatch.setattr("service.arriving.frames.read_frame", in_parts)
-        monkeypatch.setattr(served.gateway.frames.pacing, "turn", waits)
+        monkeypatch.setattr(served.gateway.frames.reading.pacing, "turn", waits)
         problem(await served.post(session, "frames", good_frame(0)), 503, "overloaded")
 
 

@@ -179,3 +179,63 @@ def test_of_those_who_left_only_so_many_are_remembered():
     assert set(turns.order(asked)) == set(asked)
     with pytest.raises(IndexError):
         turns.next(0.0)
+
+
+def test_work_that_is_done_elsewhere_counts_in_the_shares():
+    here, other = work_of("reads", "a"), work_of("other", "b")
+    turns = waiting(here, other)
+    elsewhere = work_of("reads", "c")
+    turns.join(elsewhere)
+    turns.put_down(elsewhere, 0.5)
+    turns.leave(elsewhere)
+    first = Counter(work.key for work in played(turns, int((0.5 - 2 * SLACK_S) / PASS_S)))
+    assert first["other"] == first.total()
+    assert abs(Counter(work.key for work in played(turns, 200))["reads"] - 100) < 10
+
+
+def test_of_work_elsewhere_that_of_a_key_goes_first_that_had_least_whatever_its_session_had():
+    turns, works = Turns(), [work_of("a", "1"), work_of("b", "2"), work_of("b", "3")]
+    for work in works:
+        turns.join(work)
+    for work, seconds in zip(works, [0.03, 0.01, 0.015], strict=True):
+        turns.put_down(work, seconds)
+    assert turns.first(works) is works[1]
+    turns.put_down(works[1], 0.002)
+    assert turns.first(works) is works[1]
+    turns.put_down(works[2], 0.01)
+    assert turns.first(works) is works[0]
+
+
+def test_work_here_puts_off_that_elsewhere_which_had_more_until_it_will_have_had_as_much():
+    frame, body = work_of("quiet", "f", expected_s=0.05), work_of("greedy", "b")
+    turns = waiting(frame)
+    turns.join(body)
+    assert not turns.puts_off(body)
+    turns.put_down(body, 0.04)
+    assert not turns.puts_off(body)
+    turns.put_down(body, 0.02)
+    assert turns.puts_off(body)
+    turns.remove(frame)
+    assert not turns.puts_off(body)
+
+
+def test_within_a_key_the_shares_of_sessions_put_off():
+    frame, body = work_of("", "quiet", expected_s=0.05), work_of("", "greedy")
+    turns = waiting(frame)
+    turns.join(body)
+    turns.put_down(body, 0.06)
+    assert turns.puts_off(body)
+    assert not turns.puts_off(work_of("", "quiet"))
+
+
+def test_what_is_put_down_to_those_who_are_forgotten_does_no_harm():
+    turns, gone = Turns(), work_of("gone", "s")
+    turns.join(gone)
+    turns.leave(gone)
+    for number in range(2 * KNOWN + 2):
+        other = work_of(f"k{number}", "s")
+        turns.join(other)
+        turns.leave(other)
+    turns.put_down(gone, 0.1)
+    turns.join(gone)
+    assert turns.first([gone]) is gone
