@@ -87,12 +87,12 @@ class Deciding:
         )
 
     async def settled(self, asked: Asked) -> None:
-        """Wait, for so long as the frame may, until it is known what came of the session's decision before."""
+        """Wait, for so long as the frame may, until the store has let go of the session's decision before."""
         settling = asked.caller.live.settling
         if settling is not None and not settling.done():
             await asyncio.wait({settling}, timeout=max(asked.due - time.perf_counter(), 0.0) + GRACE_S)
             if not settling.done():
-                raise StoreTooSlow("is still writing the decision before this one; send the frame again")
+                raise StoreTooSlow("is still busy with the frame before; nothing of this one is kept, send it again")
         asked.caller.live.settling = None
 
     async def _decide(self, asked: Asked, work: Work) -> Answered:

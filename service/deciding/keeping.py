@@ -42,7 +42,7 @@ class Keeping:
         ------
         StoreTooSlow
             If that took until `GRACE_S` after the frame's time. Either nothing is kept and the frame can be asked for
-            again; or the store is past the point of return, and the session's next frame waits for the outcome.
+            again; or the store is past the point of return. The session's next frame waits until the store has let go.
         SessionChanged, FrameDecided, SessionOver, StoreUnavailable
             As `service.keeping.store.Store.decide`. Nothing is remembered then.
         """
@@ -57,10 +57,11 @@ class Keeping:
             task.result()
             return write.kept
         task.add_done_callback(ask_for_the_exception)
+        live.settling = task  # one at a time: each may hold a connection for as long as another holds the session's row
         if write.patience.give_up():
             write.undo()
             raise StoreTooSlow("did not take the decision in time; nothing of it is kept, send the frame again")
-        live.settling, write.is_too_late = task, True
+        write.is_too_late = True
         raise StoreTooSlow("is still writing the decision; if the frame, sent again, is stale-frame, it was kept")
 
     async def close(self) -> None:

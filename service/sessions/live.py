@@ -95,7 +95,7 @@ class LiveSession:
     unread: defaultdict[str, Unread] = field(default_factory=lambda: defaultdict(Unread))
     """Bodies that are not whole yet, by vehicle."""
     settling: asyncio.Task[None] | None = None
-    """A decision that nobody waits for any more, and of which it is not known yet whether it is kept."""
+    """A decision that nobody waits for any more, and of which the store has not let go yet: it may be kept."""
     recorded: bool | None = None
     """Whether it is one of those that asked to be recorded; None until it is looked in the folder."""
     unrecorded: int = 0

@@ -12,6 +12,7 @@ import subprocess
 import time
 from types import SimpleNamespace
 
+import asyncpg
 import pytest
 from sqlalchemy import event, exc, make_url
 
@@ -29,6 +30,9 @@ CLOCK_MS = 20
 """What the ego's clock may see more than the gateway's."""
 LATE_S = 0.5
 """What a busy machine may take longer than promised."""
+WAITING_FOR_LOCKS = """
+SELECT count(*) FROM pg_stat_activity WHERE datname = current_database() AND wait_event_type = 'Lock'
+"""
 
 
 @pytest.fixture(autouse=True)
@@ -100,6 +104,23 @@ async def test_a_server_that_stands_still_or_dies(fault, postgres, good_frame):
                 await asyncio.to_thread(postgres.start)
         await ego.check()
         assert (await served.http.get("/readyz")).status_code == 200
+
+
+async def test_a_session_whose_row_is_held_takes_one_connection(postgres, good_frame):
+    url = await postgres.new_database()
+    async with serve(database_url=url) as served:
+        other = await Ego.of(served, good_frame)
+        held = await served.open(latency_budget_ms=200, gather_ms=0)
+        holding = await asyncpg.connect(url.replace("+asyncpg", ""))
+        async with holding.transaction():
+            await holding.execute("SELECT 1 FROM sessions WHERE session_id = $1 FOR UPDATE", held.session_id)
+            for frame in range(3):
+                problem(await served.post(held, "frames", good_frame(frame)), 503, "store-too-slow")
+            assert await holding.fetchval(WAITING_FOR_LOCKS) == 1
+            assert await other.post_for(0.5) == 0
+        await holding.close()
+        assert (await served.post(held, "frames", good_frame(3))).status_code == 200
+        await other.check()
 
 
 async def test_a_server_that_only_reads_for_a_while(postgres, good_frame):
