@@ -34,8 +34,8 @@ SHARE = 0.5
 
 class Reading:
     """Reads bodies by turns. What it takes counts in the shares of the detector's thread (`service.turns`), and whoever
-    had least of those goes first: so nobody's bodies, however many and whatever they are, hold up the frames of others
-    who want less. Where there is a single core, bodies wait for frames that go before them, too. The vehicles of a
+    had least of those goes first: so who wants less waits for a turn that was begun, and not for all the bodies that
+    others send. Where there is a single core, bodies wait for frames that go before them, too. The vehicles of a
     session have the same number of turns.
 
     Parameters

@@ -74,7 +74,7 @@ async def test_a_locked_database_costs_the_frames_that_it_stalls_their_answers_a
 
 
 async def test_a_session_whose_row_is_held_asks_the_store_for_one_thing_at_a_time(on_disk, good_frame, monkeypatch):
-    session, store = await on_disk.open(latency_budget_ms=50, gather_ms=0), on_disk.gateway.store
+    session, store = await on_disk.open(latency_budget_ms=BUDGET_MS, gather_ms=0), on_disk.gateway.store
     let_go, asked, decide = asyncio.Event(), [], store.decide
 
     async def held(record, event, *others):

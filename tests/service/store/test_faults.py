@@ -108,9 +108,9 @@ async def test_a_server_that_stands_still_or_dies(fault, postgres, good_frame):
 
 async def test_a_session_whose_row_is_held_takes_one_connection(postgres, good_frame):
     url = await postgres.new_database()
-    async with serve(database_url=url) as served:
+    async with serve(database_url=url, database_statement_s=30) as served:
         other = await Ego.of(served, good_frame)
-        held = await served.open(latency_budget_ms=200, gather_ms=0)
+        held = await served.open(latency_budget_ms=400, gather_ms=0)
         holding = await asyncpg.connect(url.replace("+asyncpg", ""))
         async with holding.transaction():
             await holding.execute("SELECT 1 FROM sessions WHERE session_id = $1 FOR UPDATE", held.session_id)
