@@ -7,6 +7,7 @@ import pytest
 
 from robosac import wire
 from service.arriving.doors import capacity_check
+from service.deciding import admission as admission_module
 from service.deciding.admission import (
     COMING_S,
     DOUBT_S,
@@ -20,7 +21,7 @@ from service.engine import Engine
 from service.errors import Kind, Refused
 from service.jobs import Job
 from service.turns import Turns, Work
-from tests.service.conftest import EGO, problem, serve
+from tests.service.conftest import EGO, problem, serve, until
 
 
 def due(left_s):
@@ -119,24 +120,31 @@ async def test_a_frame_that_waited_long_to_be_seen_has_less_time():
                 check(scope | {"robosac.arrived": time.perf_counter() - 0.16})
 
 
-async def test_no_more_frames_are_read_at_a_time_than_can_be_answered(served, good_frame):
+async def test_no_more_frames_are_read_at_a_time_than_can_be_answered(served, good_frame, monkeypatch):
     """All come at once, before any of them is in hand."""
+    monkeypatch.setattr(admission_module, "COMING_S", 60.0)
     sessions = [await served.open(latency_budget_ms=200.0, gather_ms=0) for _ in range(12)]
-    asked_for = 0
+    asked_for = answered = 0
 
     async def reading(body):
         nonlocal asked_for
         asked_for += 1
-        await asyncio.sleep(0.02)
+        await until(lambda: asked_for + answered >= len(sessions))
         yield body
+
+    async def post(session, body):
+        nonlocal answered
+        answer = await served.post(session, "frames", reading(body))
+        answered += 1
+        return answer
 
     for session in sessions:
         assert (await served.post(session, "frames", good_frame(0))).status_code == 200
     for _ in range(200):
         served.gateway.admission.learn("any", 0.03, 0.0, 0.0)
     for frame in (1, 2):  # frames that came before change nothing
-        asked_for, body = 0, good_frame(frame)
-        answers = await asyncio.gather(*(served.post(session, "frames", reading(body)) for session in sessions))
+        asked_for, answered, body = 0, 0, good_frame(frame)
+        answers = await asyncio.gather(*(post(session, body) for session in sessions))
         refused = [answer for answer in answers if answer.status_code == 503]
         assert 1 <= asked_for <= 6
         assert len(refused) >= len(sessions) - asked_for
