@@ -166,7 +166,7 @@ def _built(
     of_key = settings.max_inflight_bytes_per_key if len(api_keys) > 1 else None  # one key has all to itself
     viewer_tokens = ViewerTokens(settings, open_to_all=not api_keys)
     parties = Parties(api_keys, viewer_tokens, store.seen, tokens.signed)
-    pacing = Pacing(parties.of_loop, lambda first: admission.busy_besides(parties.key_of(first)))
+    pacing = Pacing(parties.of_loop, lambda: map(parties.first_of, admission.wanted_by()))
     return Gateway(
         admission=admission,
         keys=keys,

@@ -22,7 +22,7 @@ HEADERS = 128
 HEADER_BYTES = 32 * 1024
 OPEN_PATHS = ("/healthz",)
 _AUTHORITY = re.compile(r"([^:\[\]@/]+|\[[^\[\]]*\])(?::\d*)?")
-_FRAMES_PATH = re.compile(r"/v1/sessions/([^/]+)/frames")
+_FRAMES_PATH = re.compile(r"/v1/sessions/([^/]+)/(frames|messages)")
 
 
 class Door:
@@ -138,7 +138,10 @@ def capacity_check(admission: Admission, in_use: Callable[[str], LiveSession | N
     def check(scope: Scope) -> None:
         found = _FRAMES_PATH.fullmatch(path_of(scope)) if scope["method"] == "POST" else None
         live = in_use(found[1]) if found else None
-        if found and live is not None:
+        if not found or live is None:
+            return
+        admission.expect(live.key)
+        if found[2] == "frames":
             admission.check(live.key, found[1], arrival_of(scope) + live.budget_s)
 
     return check

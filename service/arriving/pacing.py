@@ -14,7 +14,7 @@ import functools
 import math
 import time
 from collections import OrderedDict, deque
-from collections.abc import Awaitable, Callable, Generator
+from collections.abc import Awaitable, Callable, Generator, Iterable
 from typing import Any, Protocol
 
 from starlette.types import ASGIApp, Receive, Scope, Send
@@ -30,12 +30,20 @@ Party = tuple[str, str]
 
 LATELY_S = 0.05
 """What somebody had counts for about so long."""
-LIMIT, LIMIT_BUSY = 0.5, 0.25
-"""Part of the loop's time from which on it is short of time, and the same while others' frames are in hand."""
+LONG_S = 0.5
+"""And for so long where keys are compared, since what a frame needs comes in a burst, and members of a key, of whom
+many may have a little one after the other.
+"""
+LIMIT, LIMIT_BUSY, LIMIT_GREEDY = 0.5, 0.25, 0.1
+"""Part of the loop's time from which on it is short of time. The same while frames are in hand, where there is one key
+only; and for whoever had more than `SLACK` times what a key had whose frames are in hand.
+"""
 SLACK = 2.0
 """How many equal parts somebody may have before it has to wait: those who all want as much are not held up by turns."""
 OF_OTHERS = 0.25
 """Part of the limit that counts as the equal part of all who show no credential."""
+MEMBERS_SLACK = 2.0
+"""How many parts of a party its members may have together, of whom none had more than its own: each may be new."""
 MOST_KEPT_BYTES = 2**25
 """Of what came and waits, of all connections together."""
 _FORGOTTEN_S = 1.0
@@ -76,30 +84,47 @@ class _Pause:
 class _Part:
     """What somebody had of the time lately, as a part of it."""
 
-    def __init__(self) -> None:
+    def __init__(self, lately_s: float) -> None:
+        self._lately_s = lately_s
         self._value, self.at = 0.0, -math.inf
 
     def add(self, seconds: float, now: float) -> None:
-        self._value, self.at = self.value(now) + seconds / LATELY_S, now
+        self._value, self.at = self.value(now) + seconds / self._lately_s, now
 
     def value(self, now: float) -> float:
-        return self._value * math.exp(min(0.0, self.at - now) / LATELY_S)
+        return self._value * math.exp(min(0.0, self.at - now) / self._lately_s)
+
+
+class _Had:
+    """What somebody had of the time just now, and for longer."""
+
+    def __init__(self) -> None:
+        self.now, self.long = _Part(LATELY_S), _Part(LONG_S)
+
+    @property
+    def at(self) -> float:
+        """When it had some."""
+        return self.now.at
+
+    def add(self, seconds: float, now: float) -> None:
+        self.now.add(seconds, now)
+        self.long.add(seconds, now)
 
 
 class Pacing:
     """Knows what everybody had of the event loop's time lately, and whom it is to be kept from.
 
-    That is whoever had more than `SLACK` equal parts of what there is (`LIMIT`, `LIMIT_BUSY`) while all together had as
-    much as that: equal parts for API keys, and of a key's for its vehicles; others have `OF_OTHERS`, and of that each
-    address an equal part. Whoever had least of its part goes on first, its members by turns.
+    That is whoever had more than `SLACK` equal parts of what there is (`LIMIT`, `LIMIT_BUSY`, `LIMIT_GREEDY`) while all
+    together had as much as that: equal parts for API keys, and of a key's for its vehicles; others have `OF_OTHERS`,
+    and of that each address an equal part. The vehicles of a key, or the addresses, all wait once they had
+    `MEMBERS_SLACK` times their part together. Whoever had least of its part goes on first, its members by turns.
 
     Parameters
     ----------
     party_of : callable
         Of a request's scope.
     busy : callable
-        Whether frames are in hand, of others than this key if one is given: its own do not make it wait, unless it is
-        the only one.
+        The first parts of the parties whose frames are in hand, or are being read; any of them more than once.
     clock : callable
         Seconds.
     """
@@ -107,15 +132,15 @@ class Pacing:
     def __init__(
         self,
         party_of: Callable[[Scope], Party],
-        busy: Callable[[str | None], bool],
+        busy: Callable[[], Iterable[str]],
         clock: Callable[[], float] = time.perf_counter,
     ) -> None:
         self.party_of = party_of
         self._busy = busy
         self._clock = clock
-        self._all = _Part()
-        self._first: OrderedDict[str, _Part] = OrderedDict()
-        self._members: dict[str, OrderedDict[str, _Part]] = {}
+        self._all = _Part(LATELY_S)
+        self._first: OrderedDict[str, _Had] = OrderedDict()
+        self._members: dict[str, OrderedDict[str, _Had]] = {}
         self._waiting: dict[str, OrderedDict[str, deque[tuple[Paced, int]]]] = {}
         self._kept = 0
         self._look: asyncio.TimerHandle | None = None
@@ -126,7 +151,7 @@ class Pacing:
         self._all.add(seconds, now)
         members = self._members.setdefault(first, OrderedDict())
         for parts, name in ((self._first, first), (members, member)):
-            parts.setdefault(name, _Part()).add(seconds, now)
+            parts.setdefault(name, _Had()).add(seconds, now)
             parts.move_to_end(name)
         _forget(members, now)
         for gone in _forget(self._first, now):
@@ -135,17 +160,32 @@ class Pacing:
     def is_over(self, party: Party) -> bool:
         """Whether the loop is short of time, and a party had more than its part of it."""
         now, (first, member) = self._clock(), party
+        if first not in self._first:
+            return False
         keys = len(self._first) - (OTHERS in self._first)
-        limit = LIMIT_BUSY if self._busy(first if keys > 1 else None) else LIMIT
-        if self._all.value(now) < limit or first not in self._first:
+        limit = self._limit(first, keys, now)
+        if self._all.value(now) < limit:
             return False
         part = SLACK * (limit * OF_OTHERS if first == OTHERS else limit / keys)
-        members = self._members[first]
-        return (
-            self._first[first].value(now) > part
-            and member in members
-            and members[member].value(now) > part / len(members)
-        )
+        members, of_all = self._members[first], self._first[first].now.value(now)
+        if of_all > MEMBERS_SLACK * part:
+            return True
+        if of_all <= part or member not in members:
+            return False
+        had = members[member]
+        return max(had.now.value(now), had.long.value(now)) > part / len(members)
+
+    def _limit(self, first: str, keys: int, now: float) -> float:
+        """From what part of the time on a party may have to wait."""
+        if keys == 1 and first != OTHERS:
+            return LIMIT_BUSY if any(self._busy()) else LIMIT
+        is_greedy = any(other != first and self._had_much_more(first, other, now) for other in self._busy())
+        return LIMIT_GREEDY if is_greedy else LIMIT
+
+    def _had_much_more(self, first: str, other: str, now: float) -> bool:
+        if first == OTHERS or other not in self._first:
+            return True
+        return self._first[first].long.value(now) > SLACK * self._first[other].long.value(now)
 
     async def turn(self, party: Party) -> None:
         """Until a party may have more of the time."""
@@ -211,10 +251,10 @@ class Pacing:
         if first not in self._first:
             return 0.0
         keys = max(len(self._first) - (OTHERS in self._first), 1)
-        return self._first[first].value(self._clock()) / (OF_OTHERS if first == OTHERS else 1 / keys)
+        return self._first[first].now.value(self._clock()) / (OF_OTHERS if first == OTHERS else 1 / keys)
 
 
-def _forget(parts: OrderedDict[str, _Part], now: float) -> list[str]:
+def _forget(parts: OrderedDict[str, _Had], now: float) -> list[str]:
     """Drop those who had nothing for long; they come first."""
     gone = []
     while parts:

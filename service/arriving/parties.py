@@ -55,12 +55,12 @@ class Parties:
     @staticmethod
     def of_token(record: SessionRecord, vehicle_id: str) -> tuple[str, str]:
         """As `of_loop`, of whoever shows a vehicle's token, the present one or one before it."""
-        return f"{_KEY}{record.key_id}", f"{record.session_id} {vehicle_id}"
+        return Parties.first_of(record.key_id), f"{record.session_id} {vehicle_id}"
 
     @staticmethod
-    def key_of(first: str | None) -> str | None:
-        """The id of the API key of which this is the first part of a party."""
-        return None if first is None else first.removeprefix(_KEY)
+    def first_of(key_id: str) -> str:
+        """The first part of the parties of an API key, by its id."""
+        return f"{_KEY}{key_id}"
 
     def is_vehicle(self, scope: Scope, session_id: str) -> bool:
         """Whether a request shows a token of a session, one that counts or one that this gateway signed."""
@@ -73,7 +73,7 @@ class Parties:
             return None
         key_id = self._api_keys.id_of(credential)
         if key_id is not None:
-            return f"{_KEY}{key_id}", ""
+            return self.first_of(key_id), ""
         if self._viewer_tokens.has(credential):
             return "viewers", credential
         named = claimed(credential)

@@ -6,6 +6,7 @@ from contextlib import ExitStack, suppress
 import pytest
 
 from robosac import wire
+from service.arriving.checking import InFrame
 from service.arriving.doors import capacity_check
 from service.deciding import admission as admission_module
 from service.deciding.admission import (
@@ -22,6 +23,7 @@ from service.errors import Kind, Refused
 from service.jobs import Job
 from service.turns import Turns, Work
 from tests.service.conftest import EGO, problem, serve, until
+from tests.service.credentials import KEY, OTHER_KEY
 
 
 def due(left_s):
@@ -150,6 +152,56 @@ async def test_no_more_frames_are_read_at_a_time_than_can_be_answered(served, go
         assert len(refused) >= len(sessions) - asked_for
         for answer in refused:
             problem(answer, 503, "overloaded")
+
+
+@pytest.mark.parametrize("path", ["frames", "messages"])
+async def test_a_frame_is_wanted_from_its_head_on_while_it_comes_and_while_it_is_read(
+    path, messages, good_frame, monkeypatch
+):
+    """A body that takes long to come counts for a moment only."""
+    monkeypatch.setattr(admission_module, "COMING_S", 0.2)
+    wanted = {}
+    async with serve(api_keys=f"{KEY},{OTHER_KEY}", api_key=KEY) as served:
+        session = await served.open(latency_budget_ms=10_000.0)
+        live, admission = served.gateway.sessions.in_use(session.session_id), served.gateway.admission
+        authenticate = type(served.gateway.sessions).authenticate
+
+        def note(when):
+            wanted[when] = list(admission.wanted_by())
+
+        async def noting(*given):
+            note("at its head")
+            await asyncio.sleep(0.15)
+            return await authenticate(*given)
+
+        async def slowly():
+            await asyncio.sleep(0.1)
+            note("as it comes")
+            await asyncio.sleep(0.3)
+            note("later")
+            yield body
+
+        def read(caller, body):
+            note("as it is read")
+            yield
+            raise InFrame(wire.WireError("malformed-msgpack", "", "it is read"), None)
+
+        monkeypatch.setattr(type(served.gateway.sessions), "authenticate", noting)
+        for name in ("read_frame", "read_message"):
+            monkeypatch.setattr(f"service.arriving.frames.{name}", read)
+        if path == "frames":
+            body, token = good_frame(0), session.ego_token
+        else:
+            body, token = wire.pack_message(0, "rsu", messages["rsu"]), session.teammate_tokens["rsu"]
+        problem(await served.post(session, path, slowly(), token), 400, "malformed-msgpack")
+        await asyncio.sleep(0.25)
+        note("at last")
+    assert {when for when, keys in wanted.items() if set(keys) == {live.key}} == {
+        "at its head",
+        "as it comes",
+        "as it is read",
+    }
+    assert wanted["later"] == wanted["at last"] == []
 
 
 def test_a_body_that_takes_long_hides_none_that_comes_after_it():

@@ -17,7 +17,9 @@ from service.arriving.pacing import (
     LATELY_S,
     LIMIT,
     LIMIT_BUSY,
+    LIMIT_GREEDY,
     LOOKED_AT,
+    MEMBERS_SLACK,
     MOST_KEPT_BYTES,
     OF_OTHERS,
     OTHERS,
@@ -47,7 +49,7 @@ class Clock:
 
 def paced(busy=False):
     clock = Clock()
-    return Pacing(lambda scope: STRANGER, lambda besides: busy and besides != "a", clock), clock
+    return Pacing(lambda scope: STRANGER, lambda: ["a"] if busy else [], clock), clock
 
 
 def spend(pacing, clock, seconds=0.5, **share):
@@ -78,7 +80,7 @@ def test_whoever_had_more_than_an_equal_part_waits_until_there_is_time():
 
 def test_those_who_all_want_as_much_do_not_wait():
     pacing, clock = paced(busy=True)
-    spend(pacing, clock, a_ego=0.4 * LIMIT_BUSY, a_mate=0.45 * LIMIT_BUSY, b_ego=0.9 * LIMIT_BUSY)
+    spend(pacing, clock, a_ego=0.4 * LIMIT, a_mate=0.45 * LIMIT, b_ego=0.9 * LIMIT)
     assert not over(pacing, "a_ego", "a_mate", "b_ego")
 
 
@@ -88,12 +90,45 @@ def test_a_member_of_a_key_waits_for_its_own_part_only():
     assert over(pacing, "a_mate", "a_ego", "b_ego") == ["a_mate"]
 
 
-def test_there_is_less_time_while_frames_are_in_hand():
-    part = (LIMIT + SLACK / 2 * LIMIT_BUSY) / 2
+def test_there_is_less_time_for_whoever_had_much_more_than_one_whose_frames_are_in_hand():
+    part = (LIMIT + LIMIT_GREEDY) / 2
     for busy in (False, True):
         pacing, clock = paced(busy)
-        spend(pacing, clock, b_ego=part, a_ego=0.01)
+        spend(pacing, clock, b_ego=part, a_ego=0.8 * part / SLACK)
         assert pacing.is_over(("b", "ego")) is busy
+        pacing, clock = paced(busy)
+        spend(pacing, clock, b_ego=part, a_ego=1.25 * part / SLACK)
+        assert not pacing.is_over(("b", "ego"))
+
+
+def test_what_comes_in_a_burst_makes_nobody_greedy():
+    """Frames of two keys, by turns: one has just had all of the time, and the other before it."""
+    pacing, clock = paced(busy=True)
+    for _ in range(5):
+        for key in ("a", "b"):
+            spend(pacing, clock, 0.02, **{f"{key}_ego": 1.0})
+            spend(pacing, clock, 0.08)
+    clock.now -= 0.08
+    assert not pacing.is_over(("b", "ego"))
+
+
+@pytest.mark.parametrize(("members", "busy"), [(1, False), (8, False), (1, True), (8, True), (50, True)])
+def test_many_who_go_on_one_after_the_other_have_no_more_than_one(members, busy):
+    """Each waits once it had a turn, and would have none of the time soon after."""
+    pacing, clock = paced(busy)
+    waiting, had_s, turn_s = [f"{number}" for number in range(members)], 0.0, 0.005
+    while clock.now < 2.0:
+        pacing.charge(("a", "ego"), 0.0001)
+        for member in list(waiting):
+            if not pacing.is_over(("b", member)):
+                waiting.append(waiting.pop(waiting.index(member)))
+                pacing.charge(("b", member), turn_s)
+                clock.now += turn_s
+                had_s += turn_s
+                break
+        clock.now += 0.002
+    part = LIMIT_GREEDY if busy else LIMIT
+    assert had_s / clock.now < (part + 0.05 if members < 50 else MEMBERS_SLACK * part) + 0.06
 
 
 def test_ones_own_frames_make_one_wait_only_where_there_is_no_other_key():
@@ -135,7 +170,7 @@ class Connection:
 
 async def test_who_had_least_goes_on_first_and_all_do():
     gone_on = []
-    pacing = Pacing(lambda scope: STRANGER, lambda besides: False)
+    pacing = Pacing(lambda scope: STRANGER, lambda: [])
     for party, seconds in ((GREEDY, 0.3), (MODEST, 0.01), (STRANGER, 0.1)):
         pacing.charge(party, seconds)
     for party in (GREEDY, STRANGER, GREEDY, MODEST):
@@ -159,7 +194,7 @@ async def in_order(pacing, *parties):
 
 async def test_whoever_is_over_its_part_holds_up_nobody_who_is_not():
     """A stranger's part is small, so that it may be over with less than somebody else has who is not."""
-    pacing = Pacing(lambda scope: STRANGER, lambda besides: True)
+    pacing = Pacing(lambda scope: STRANGER, lambda: ["another"])
     pacing.charge(MODEST, 0.02)
     pacing.charge(STRANGER, 0.015)
     assert pacing.is_over(STRANGER)
@@ -168,23 +203,24 @@ async def test_whoever_is_over_its_part_holds_up_nobody_who_is_not():
 
 
 async def test_who_had_least_of_its_part_goes_before_who_had_least():
-    pacing = Pacing(lambda scope: STRANGER, lambda besides: False)
+    pacing = Pacing(lambda scope: STRANGER, lambda: [])
     pacing.charge(STRANGER, 0.001)
     pacing.charge(MODEST, 0.002)
     assert await in_order(pacing, STRANGER, MODEST) == [MODEST, STRANGER]
 
 
 async def test_a_member_that_is_over_its_part_holds_up_no_other():
-    pacing = Pacing(lambda scope: STRANGER, lambda besides: True)
+    pacing = Pacing(lambda scope: STRANGER, lambda: ["another"])
     other = (OTHERS, "address 10.0.0.2")
+    pacing.charge(MODEST, 0.02)
     pacing.charge(other, 0.0001)
-    pacing.charge(STRANGER, 0.03)
+    pacing.charge(STRANGER, 0.004)
     assert await in_order(pacing, STRANGER, other) == [other, STRANGER]
 
 
 @pytest.mark.parametrize("addresses", [1, 3000])
 async def test_a_crowd_of_strangers_does_not_go_before_a_key(addresses):
-    gone_on, pacing = [], Pacing(lambda scope: STRANGER, lambda besides: True)
+    gone_on, pacing = [], Pacing(lambda scope: STRANGER, lambda: ["another"])
     pacing.charge(MODEST, 0.03)
     assert pacing.is_over(MODEST)
     for number in range(6000):
@@ -201,7 +237,7 @@ async def test_a_crowd_of_strangers_does_not_go_before_a_key(addresses):
 async def test_things_of_several_members_go_on_at_once_while_there_is_time(reading_takes_s, expected):
     """Each reading of the clock takes so long."""
     readings, gone_on = itertools.count(), []
-    pacing = Pacing(lambda scope: STRANGER, lambda besides: False, lambda: next(readings) * reading_takes_s)
+    pacing = Pacing(lambda scope: STRANGER, lambda: [], lambda: next(readings) * reading_takes_s)
     for number in range(1000):
         assert pacing.wait(Connection((OTHERS, f"address {number}"), gone_on), 1)
     pacing._look.cancel()
@@ -211,7 +247,7 @@ async def test_things_of_several_members_go_on_at_once_while_there_is_time(readi
 
 
 async def test_what_is_gone_takes_nobodys_place():
-    gone_on, pacing = [], Pacing(lambda scope: STRANGER, lambda besides: False)
+    gone_on, pacing = [], Pacing(lambda scope: STRANGER, lambda: [])
     for number in range(1001):
         connection = Connection(GREEDY, gone_on)
         connection.is_gone = number < 1000
@@ -245,7 +281,7 @@ async def test_a_vehicle_is_the_same_party_with_a_new_token(served):
 
 
 async def test_what_waits_is_bounded():
-    pacing = Pacing(lambda scope: STRANGER, lambda besides: False)
+    pacing = Pacing(lambda scope: STRANGER, lambda: [])
     gone_on = []
     assert pacing.wait(Connection(GREEDY, gone_on), MOST_KEPT_BYTES)
     assert not pacing.wait(Connection(MODEST, gone_on), 1)
@@ -258,7 +294,7 @@ class Told(Pacing):
     """Has those wait who show a certain credential, until it is told otherwise."""
 
     def __init__(self):
-        super().__init__(self.by_credential, lambda besides: False)
+        super().__init__(self.by_credential, lambda: [])
         self.held, self.charged = {"greedy"}, {}
 
     def by_credential(self, scope):
@@ -503,7 +539,7 @@ async def test_faults_and_cancelling_pass_through():
 
 
 async def test_whatever_else_waits_goes_on_once_there_is_time_or_is_given_up():
-    pacing, wrong = Pacing(lambda scope: STRANGER, lambda besides: False), []
+    pacing, wrong = Pacing(lambda scope: STRANGER, lambda: []), []
     asyncio.get_running_loop().set_exception_handler(lambda loop, context: wrong.append(context))
     await pacing.turn(GREEDY)
     for party, seconds in ((GREEDY, 0.3), (MODEST, 0.01)):
@@ -529,14 +565,11 @@ async def test_a_keys_own_frames_are_told_from_those_of_others(good_frame):
 
         def key_of(credential):
             headers = [(b"authorization", f"Bearer {credential}".encode())]
-            return parties.key_of(parties.of_loop({"client": ("10.0.0.1", 1), "headers": headers})[0])
+            return parties.of_loop({"client": ("10.0.0.1", 1), "headers": headers})[0]
 
         assert key_of(KEY) == key_of(session.ego_token) == key_of(session.teammate_tokens["rsu"])
         assert len({key_of(one) for one in (KEY, OTHER_KEY, "none")}) == 3
         live = gateway.sessions.in_use(session.session_id)
         admission = gateway.admission
         with admission.frame(live.key, session.session_id, time.perf_counter() + 1.0, 1.0):
-            assert not admission.busy_besides(key_of(KEY))
-            assert all(admission.busy_besides(key_of(one)) for one in (OTHER_KEY, "none"))
-            assert admission.busy_besides(None)
-        assert not admission.busy_besides(None)
+            assert {parties.first_of(key) for key in admission.wanted_by()} == {key_of(KEY)}
