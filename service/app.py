@@ -8,6 +8,7 @@ tune_process()  # before anything imports torch
 
 import asyncio  # noqa: E402
 import contextlib  # noqa: E402
+import itertools  # noqa: E402
 import sys  # noqa: E402
 import time  # noqa: E402
 from collections.abc import AsyncIterator, Callable  # noqa: E402
@@ -166,7 +167,7 @@ def _built(
     of_key = settings.max_inflight_bytes_per_key if len(api_keys) > 1 else None  # one key has all to itself
     viewer_tokens = ViewerTokens(settings, open_to_all=not api_keys)
     parties = Parties(api_keys, viewer_tokens, store.seen, tokens.signed)
-    pacing = Pacing(parties.of_loop, lambda: map(parties.first_of, admission.wanted_by()))
+    pacing = Pacing(parties.of_loop, lambda: itertools.starmap(parties.of_session, admission.wanted_by()))
     return Gateway(
         admission=admission,
         keys=keys,

@@ -287,7 +287,7 @@ async def _read_body(request: Request, caller: Caller, gateway: Gateway, limit: 
     """The body of a tensor request, read only as far as the detector's layout allows; a refusal goes on record."""
     try:
         check_type(request, *MSGPACK_TYPES)
-        gateway.admission.expect(caller.live.key)
+        gateway.admission.expect(caller.live.key, caller.record.session_id)
         async with caller.live.unread[caller.vehicle_id].one_more() as came:
             return await read_bounded(request, limit, came)
     except Refused as refused:

@@ -140,7 +140,7 @@ def capacity_check(admission: Admission, in_use: Callable[[str], LiveSession | N
         live = in_use(found[1]) if found else None
         if not found or live is None:
             return
-        admission.expect(live.key)
+        admission.expect(live.key, found[1])
         if found[2] == "frames":
             admission.check(live.key, found[1], arrival_of(scope) + live.budget_s)
 

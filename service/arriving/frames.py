@@ -111,7 +111,7 @@ class Frames:
     async def _read(self, caller: Caller, body: bytes, read: Callable[[Caller, bytes], Steps[T]]) -> T:
         """What a body holds, read off the event loop where that takes long; a refusal goes on record."""
         steps = read(caller, body)
-        self.admission.expect(caller.live.key)
+        self.admission.expect(caller.live.key, caller.record.session_id)
         try:
             if len(body) <= SMALL_BYTES and _COMPRESSED not in body:
                 return finished(steps)

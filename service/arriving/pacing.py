@@ -11,9 +11,10 @@ from __future__ import annotations
 
 import asyncio
 import functools
+import itertools
 import math
 import time
-from collections import OrderedDict, deque
+from collections import Counter, OrderedDict, deque
 from collections.abc import Awaitable, Callable, Generator, Iterable
 from typing import Any, Protocol
 
@@ -25,25 +26,27 @@ METER = "robosac_meter"
 """In a request's state: takes the time that its answer cost."""
 OTHERS = "others"
 """The first part of the party of whoever shows no credential that counts."""
-Party = tuple[str, str]
-"""A key and who of it, viewers and which, or `OTHERS` and an address."""
+Party = tuple[str, ...]
+"""A key, a session of it and a vehicle of that; a key, and nothing for its own requests; viewers, and which of them; or
+`OTHERS` and an address.
+"""
 
 LATELY_S = 0.05
 """What somebody had counts for about so long."""
 LONG_S = 0.5
-"""And for so long where keys are compared, since what a frame needs comes in a burst, and members of a key, of whom
-many may have a little one after the other.
+"""And for so long where it is asked who had more than others, since what a frame needs comes in a burst, and of many
+each may have a little after the other.
 """
-LIMIT, LIMIT_BUSY, LIMIT_GREEDY = 0.5, 0.25, 0.1
-"""Part of the loop's time from which on it is short of time. The same while frames are in hand, where there is one key
-only; and for whoever had more than `SLACK` times what a key had whose frames are in hand.
+LIMIT, LIMIT_GREEDY = 0.5, 0.1
+"""Part of the loop's time from which on it is short of time; and for whoever had much more than those whose frames are
+wanted.
 """
 SLACK = 2.0
 """How many equal parts somebody may have before it has to wait: those who all want as much are not held up by turns."""
 OF_OTHERS = 0.25
 """Part of the limit that counts as the equal part of all who show no credential."""
 MEMBERS_SLACK = 2.0
-"""How many parts of a party its members may have together, of whom none had more than its own: each may be new."""
+"""How many parts of a key its members may have together, of whom none had more than its own: each may be new."""
 MOST_KEPT_BYTES = 2**25
 """Of what came and waits, of all connections together."""
 _FORGOTTEN_S = 1.0
@@ -101,11 +104,6 @@ class _Had:
     def __init__(self) -> None:
         self.now, self.long = _Part(LATELY_S), _Part(LONG_S)
 
-    @property
-    def at(self) -> float:
-        """When it had some."""
-        return self.now.at
-
     def add(self, seconds: float, now: float) -> None:
         self.now.add(seconds, now)
         self.long.add(seconds, now)
@@ -114,17 +112,21 @@ class _Had:
 class Pacing:
     """Knows what everybody had of the event loop's time lately, and whom it is to be kept from.
 
-    That is whoever had more than `SLACK` equal parts of what there is (`LIMIT`, `LIMIT_BUSY`, `LIMIT_GREEDY`) while all
-    together had as much as that: equal parts for API keys, and of a key's for its vehicles; others have `OF_OTHERS`,
-    and of that each address an equal part. The vehicles of a key, or the addresses, all wait once they had
-    `MEMBERS_SLACK` times their part together. Whoever had least of its part goes on first, its members by turns.
+    That is whoever had more than `SLACK` equal parts of what there is (`LIMIT`) while all together had as much as that:
+    equal parts for API keys, of a key's for its sessions, and of a session's for its vehicles; others have `OF_OTHERS`,
+    and of that each address an equal part. Those of a key, a session or `OTHERS` all wait once they had `MEMBERS_SLACK`
+    times their part together. While frames are wanted, there is less (`LIMIT_GREEDY`) for `OTHERS`, and, of keys that
+    had more than `SLACK` times as much, for whoever had `SLACK` times more than somebody whose frames are wanted: the
+    key than that key, a session than another of its key, and a vehicle than the others of its session on average.
+    Whoever had least of its part goes on first, its members by turns.
 
     Parameters
     ----------
     party_of : callable
         Of a request's scope.
-    busy : callable
-        The first parts of the parties whose frames are in hand, or are being read; any of them more than once.
+    wanted_by : callable
+        The sessions, as the first two parts of their parties, whose frames are in hand or begin to come; any of them
+        more than once.
     clock : callable
         Seconds.
     """
@@ -132,60 +134,93 @@ class Pacing:
     def __init__(
         self,
         party_of: Callable[[Scope], Party],
-        busy: Callable[[], Iterable[str]],
+        wanted_by: Callable[[], Iterable[Party]],
         clock: Callable[[], float] = time.perf_counter,
     ) -> None:
         self.party_of = party_of
-        self._busy = busy
+        self._wanted_by = wanted_by
         self._clock = clock
         self._all = _Part(LATELY_S)
-        self._first: OrderedDict[str, _Had] = OrderedDict()
-        self._members: dict[str, OrderedDict[str, _Had]] = {}
-        self._waiting: dict[str, OrderedDict[str, deque[tuple[Paced, int]]]] = {}
+        self._had: OrderedDict[Party, _Had] = OrderedDict()
+        """Of parties, and of each beginning of one; who had some last comes last."""
+        self._members: Counter[Party] = Counter()
+        """How many had some that begin so, and are one longer."""
+        self._waiting: dict[str, OrderedDict[Party, deque[tuple[Paced, int]]]] = {}
         self._kept = 0
         self._look: asyncio.TimerHandle | None = None
 
     def charge(self, party: Party, seconds: float) -> None:
         """Somebody had so much of the loop's time."""
-        now, (first, member) = self._clock(), party
+        now = self._clock()
         self._all.add(seconds, now)
-        members = self._members.setdefault(first, OrderedDict())
-        for parts, name in ((self._first, first), (members, member)):
-            parts.setdefault(name, _Had()).add(seconds, now)
-            parts.move_to_end(name)
-        _forget(members, now)
-        for gone in _forget(self._first, now):
-            del self._members[gone]
+        for length in range(1, len(party) + 1):
+            of = party[:length]
+            if of not in self._had:
+                self._had[of] = _Had()
+                self._members[of[:-1]] += 1
+            self._had[of].add(seconds, now)
+            self._had.move_to_end(of)
+        self._forget(now)
+
+    def _forget(self, now: float) -> None:
+        """Drop those who had nothing for long; they come first."""
+        while self._had:
+            of = next(iter(self._had))
+            if now - self._had[of].now.at < _FORGOTTEN_S:
+                break
+            del self._had[of]
+            self._members[of[:-1]] -= 1
+            if not self._members[of[:-1]]:
+                del self._members[of[:-1]]
 
     def is_over(self, party: Party) -> bool:
         """Whether the loop is short of time, and a party had more than its part of it."""
-        now, (first, member) = self._clock(), party
-        if first not in self._first:
+        now = self._clock()
+        of_all = self._all.value(now)
+        if of_all < LIMIT_GREEDY:
             return False
-        keys = len(self._first) - (OTHERS in self._first)
-        limit = self._limit(first, keys, now)
-        if self._all.value(now) < limit:
+        limit = LIMIT_GREEDY if self._is_greedy(party, now) else LIMIT
+        if of_all < limit:
             return False
-        part = SLACK * (limit * OF_OTHERS if first == OTHERS else limit / keys)
-        members, of_all = self._members[first], self._first[first].now.value(now)
-        if of_all > MEMBERS_SLACK * part:
-            return True
-        if of_all <= part or member not in members:
-            return False
-        had = members[member]
-        return max(had.now.value(now), had.long.value(now)) > part / len(members)
+        part = SLACK * limit * (OF_OTHERS if party[0] == OTHERS else 1 / self._keys())
+        for length in range(1, len(party) + 1):
+            had = self._had.get(party[:length])
+            if had is None:
+                return False
+            lately = had.now.value(now)
+            if max(lately, had.long.value(now) if length > 1 else 0.0) <= part:
+                return False
+            if lately > MEMBERS_SLACK * part:
+                return True
+            part /= self._members[party[:length]] or 1
+        return True
 
-    def _limit(self, first: str, keys: int, now: float) -> float:
-        """From what part of the time on a party may have to wait."""
-        if keys == 1 and first != OTHERS:
-            return LIMIT_BUSY if any(self._busy()) else LIMIT
-        is_greedy = any(other != first and self._had_much_more(first, other, now) for other in self._busy())
-        return LIMIT_GREEDY if is_greedy else LIMIT
+    def _keys(self) -> int:
+        return max(self._members[()] - ((OTHERS,) in self._had), 1)
 
-    def _had_much_more(self, first: str, other: str, now: float) -> bool:
-        if first == OTHERS or other not in self._first:
-            return True
-        return self._first[first].long.value(now) > SLACK * self._first[other].long.value(now)
+    def _is_greedy(self, party: Party, now: float) -> bool:
+        wanted = itertools.islice(self._wanted_by(), LOOKED_AT)
+        if party[0] == OTHERS:
+            return any(True for _ in wanted)
+        if self._long(party[:1], now) <= SLACK * LIMIT_GREEDY:
+            return False
+        return any(self._had_much_more(party, other, now) for other in wanted)
+
+    def _had_much_more(self, party: Party, other: Party, now: float) -> bool:
+        """Whether a party had more than `SLACK` times what a session had, both of them as far as they differ."""
+        same = 0
+        while same < len(party) and party[: same + 1] == other[: same + 1]:
+            same += 1
+        if same == len(party):
+            return False
+        theirs_s, mine_s = self._long(other[: same + 1], now), self._long(party[: same + 1], now)
+        if same == len(other):  # they are its own, and it is one of the session's vehicles
+            others = self._members[other] - 1
+            theirs_s = (theirs_s - mine_s) / others if others else mine_s
+        return mine_s > SLACK * theirs_s
+
+    def _long(self, of: Party, now: float) -> float:
+        return self._had[of].long.value(now) if of in self._had else 0.0
 
     async def turn(self, party: Party) -> None:
         """Until a party may have more of the time."""
@@ -201,8 +236,8 @@ class Pacing:
         if self._kept + kept > MOST_KEPT_BYTES:
             return False
         self._kept += kept
-        first, member = connection.party
-        self._waiting.setdefault(first, OrderedDict()).setdefault(member, deque()).append((connection, kept))
+        first, *member = connection.party
+        self._waiting.setdefault(first, OrderedDict()).setdefault(tuple(member), deque()).append((connection, kept))
         self._look_later()
         return True
 
@@ -225,14 +260,14 @@ class Pacing:
         members = self._waiting[first]
         for _ in range(min(len(members), LOOKED_AT)):
             member = next(iter(members))
-            if self.is_over((first, member)):
+            if self.is_over((first, *member)):
                 members.move_to_end(member)
             elif (one := self._next_of(first, member)) is not None:
                 one.go_on(self)
             if not members or self._clock() > until:
                 break
 
-    def _next_of(self, first: str, member: str) -> Paced | None:
+    def _next_of(self, first: str, member: Party) -> Paced | None:
         members = self._waiting[first]
         waiting, found = members[member], None
         while waiting and found is None:
@@ -248,22 +283,8 @@ class Pacing:
 
     def _claim(self, first: str) -> float:
         """What a party had of its part; who had least of it goes first."""
-        if first not in self._first:
-            return 0.0
-        keys = max(len(self._first) - (OTHERS in self._first), 1)
-        return self._first[first].now.value(self._clock()) / (OF_OTHERS if first == OTHERS else 1 / keys)
-
-
-def _forget(parts: OrderedDict[str, _Had], now: float) -> list[str]:
-    """Drop those who had nothing for long; they come first."""
-    gone = []
-    while parts:
-        name = next(iter(parts))
-        if now - parts[name].at < _FORGOTTEN_S:
-            break
-        del parts[name]
-        gone.append(name)
-    return gone
+        had = self._had[(first,)].now.value(self._clock()) if (first,) in self._had else 0.0
+        return had / (OF_OTHERS if first == OTHERS else 1 / self._keys())
 
 
 class Metered:

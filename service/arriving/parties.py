@@ -48,19 +48,19 @@ class Parties:
         known = self._known(_credential(scope))
         return known or (_address(scope), "")
 
-    def of_loop(self, scope: Scope) -> tuple[str, str]:
+    def of_loop(self, scope: Scope) -> Party:
         """The party of a request, as `service.arriving.pacing` has it: addresses are members of one."""
         return self._known(_credential(scope)) or (OTHERS, _address(scope))
 
     @staticmethod
-    def of_token(record: SessionRecord, vehicle_id: str) -> tuple[str, str]:
+    def of_token(record: SessionRecord, vehicle_id: str) -> Party:
         """As `of_loop`, of whoever shows a vehicle's token, the present one or one before it."""
-        return Parties.first_of(record.key_id), f"{record.session_id} {vehicle_id}"
+        return *Parties.of_session(record.key_id, record.session_id), vehicle_id
 
     @staticmethod
-    def first_of(key_id: str) -> str:
-        """The first part of the parties of an API key, by its id."""
-        return f"{_KEY}{key_id}"
+    def of_session(key_id: str, session_id: str) -> Party:
+        """How the parties of a session's vehicles begin: with its key's, by the id of that."""
+        return f"{_KEY}{key_id}", session_id
 
     def is_vehicle(self, scope: Scope, session_id: str) -> bool:
         """Whether a request shows a token of a session, one that counts or one that this gateway signed."""
@@ -68,12 +68,12 @@ class Parties:
         record = self._session_of(claimed(credential))
         return (record is not None and record.session_id == session_id) or self._signed(session_id, credential)
 
-    def _known(self, credential: str) -> tuple[str, str] | None:
+    def _known(self, credential: str) -> Party | None:
         if not credential:
             return None
         key_id = self._api_keys.id_of(credential)
         if key_id is not None:
-            return self.first_of(key_id), ""
+            return f"{_KEY}{key_id}", ""
         if self._viewer_tokens.has(credential):
             return "viewers", credential
         named = claimed(credential)

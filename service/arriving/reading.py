@@ -12,7 +12,7 @@ from typing import TypeVar
 
 from robosac.steps import Steps, done_within
 from service.arriving.giving_way import Line, Turn, Waiting
-from service.arriving.pacing import Pacing
+from service.arriving.pacing import Pacing, Party
 from service.arriving.parties import Parties
 from service.engine import Engine
 from service.errors import Kind, Refused
@@ -72,7 +72,7 @@ class Reading:
                 if (read := await asyncio.shield(some)) is not None:  # a thread works on though nobody waits for it
                     return read[0]
 
-    async def _turn(self, caller: Caller, party: tuple[str, str], within_s: float) -> Turn:
+    async def _turn(self, caller: Caller, party: Party, within_s: float) -> Turn:
         try:
             async with asyncio.timeout(within_s):
                 await self.pacing.turn(party)
@@ -81,9 +81,7 @@ class Reading:
             detail = "bodies of other requests took the time that this one had"
             raise Refused(Kind.OVERLOADED, detail, retry_after_s=1) from None
 
-    def _read_some(
-        self, turn: Turn, party: tuple[str, str], work: Work, took_s: list[float], some: asyncio.Task[object]
-    ) -> None:
+    def _read_some(self, turn: Turn, party: Party, work: Work, took_s: list[float], some: asyncio.Task[object]) -> None:
         seconds = sum(took_s) / _CORES
         self.pacing.charge(party, seconds)
         self._engine.put_down(work, seconds)

@@ -95,8 +95,8 @@ class Admission:
         self._turns = Turns() if turns is None else turns
         self._in_hand: set[Work] = set()
         self._waiting: Counter[str] = Counter()
-        self._expected: dict[str, float] = {}
-        """By key, and until when."""
+        self._expected: OrderedDict[tuple[str, str], float] = OrderedDict()
+        """Until when."""
         self._coming: dict[str, tuple[float, Work]] = {}
         """By session, with when it was let in."""
         self._doubted: OrderedDict[str, float] = OrderedDict()
@@ -109,15 +109,19 @@ class Admission:
         """Whether frames are in hand."""
         return bool(self._in_hand)
 
-    def wanted_by(self) -> Iterator[str]:
-        """Whose frames are in hand, or are expected; some keys more than once."""
+    def wanted_by(self) -> Iterator[tuple[str, str]]:
+        """The keys and ids of sessions whose frames are in hand, or are expected; some more than once."""
         now = time.perf_counter()
-        yield from (work.key for work in self._in_hand)
-        yield from (key for key, until in self._expected.items() if until > now)
+        yield from ((work.key, work.session_id) for work in self._in_hand)
+        yield from (session for session, until in self._expected.items() if until > now)
 
-    def expect(self, key: str) -> None:
-        """Something of a vehicle of this key begins to come, or is to be read, which a frame needs."""
-        self._expected[key] = time.perf_counter() + COMING_S
+    def expect(self, key: str, session_id: str) -> None:
+        """Something of a vehicle of this session begins to come, or is to be read, which a frame needs."""
+        now, session = time.perf_counter(), (key, session_id)
+        self._expected[session] = now + COMING_S
+        self._expected.move_to_end(session)
+        while self._expected[first := next(iter(self._expected))] < now:
+            del self._expected[first]
 
     def check(self, key: str, session_id: str, due: float) -> None:
         """Refuse a whole frame, of which nothing is read yet, that is not expected to be answered in time.

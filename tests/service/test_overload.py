@@ -196,7 +196,7 @@ async def test_a_frame_is_wanted_from_its_head_on_while_it_comes_and_while_it_is
         problem(await served.post(session, path, slowly(), token), 400, "malformed-msgpack")
         await asyncio.sleep(0.25)
         note("at last")
-    assert {when for when, keys in wanted.items() if set(keys) == {live.key}} == {
+    assert {when for when, keys in wanted.items() if set(keys) == {(live.key, session.session_id)}} == {
         "at its head",
         "as it comes",
         "as it is read",
