@@ -22,7 +22,7 @@ HEADERS = 128
 HEADER_BYTES = 32 * 1024
 OPEN_PATHS = ("/healthz",)
 _AUTHORITY = re.compile(r"([^:\[\]@/]+|\[[^\[\]]*\])(?::\d*)?")
-_FRAMES_PATH = re.compile(r"/v1/sessions/([^/]+)/(frames|messages)")
+_BODIES_PATH = re.compile(r"/v1/sessions/([^/]+)/(frames|messages)")
 
 
 class Door:
@@ -130,13 +130,14 @@ def _is_loopback(text: str) -> bool:
 
 
 def capacity_check(admission: Admission, in_use: Callable[[str], LiveSession | None]) -> Callable[[Scope], None]:
-    """A check that refuses whole frames beyond capacity, before anything is authenticated or looked up.
+    """A check that refuses whole frames beyond capacity, before anything is authenticated or looked up; and tells the
+    admission that frames and messages begin to come.
 
     ``in_use`` gives what is held of a session that is in use, by its id; None if it is not.
     """
 
     def check(scope: Scope) -> None:
-        found = _FRAMES_PATH.fullmatch(path_of(scope)) if scope["method"] == "POST" else None
+        found = _BODIES_PATH.fullmatch(path_of(scope)) if scope["method"] == "POST" else None
         live = in_use(found[1]) if found else None
         if not found or live is None:
             return

@@ -16,6 +16,7 @@ from robosac.answers import Reason
 from robosac.steps import Steps, finished
 from service.arriving.bodies import SMALL_BYTES
 from service.arriving.checking import InFrame, read_frame, read_message, reason_of
+from service.arriving.parties import Parties
 from service.arriving.reading import Reading
 from service.deciding.admission import Admission
 from service.deciding.answering import Deciding
@@ -132,7 +133,10 @@ class Frames:
                     asked.messages = await self._gathered(asked, until, hung_up)
                     asked.spent("gather", began)
                 with self.admission.frame(caller.live.key, session_id, asked.due, caller.live.budget_s) as work:
-                    return await self.deciding.answer(asked, work)
+                    try:
+                        return await self.deciding.answer(asked, work)
+                    finally:
+                        self.reading.pacing.worked(Parties.of_token(caller.record, caller.vehicle_id), work.had_s)
         except (StoreUnavailable, StoreTooSlow):
             if time.perf_counter() > asked.due:
                 self.metrics.late()

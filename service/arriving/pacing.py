@@ -99,10 +99,10 @@ class _Part:
 
 
 class _Had:
-    """What somebody had of the time just now, and for longer."""
+    """What somebody had of the time just now, and for longer; and for as long what its frames had of the detector's."""
 
     def __init__(self) -> None:
-        self.now, self.long = _Part(LATELY_S), _Part(LONG_S)
+        self.now, self.long, self.worked = _Part(LATELY_S), _Part(LONG_S), _Part(LONG_S)
 
     def add(self, seconds: float, now: float) -> None:
         self.now.add(seconds, now)
@@ -115,10 +115,13 @@ class Pacing:
     That is whoever had more than `SLACK` equal parts of what there is (`LIMIT`) while all together had as much as that:
     equal parts for API keys, of a key's for its sessions, and of a session's for its vehicles; others have `OF_OTHERS`,
     and of that each address an equal part. Those of a key, a session or `OTHERS` all wait once they had `MEMBERS_SLACK`
-    times their part together. While frames are wanted, there is less (`LIMIT_GREEDY`) for `OTHERS`, and, of keys that
-    had more than `SLACK` times as much, for whoever had `SLACK` times more than somebody whose frames are wanted: the
-    key than that key, a session than another of its key, and a vehicle than the others of its session on average.
-    Whoever had least of its part goes on first, its members by turns.
+    times their part together. Whoever had least of its part goes on first, its members by turns.
+
+    While frames are wanted, there is less (`LIMIT_GREEDY`) for `OTHERS`, and, of keys that had more than `SLACK` times
+    as much, for whoever had more than `SLACK` times what somebody had whose frames are wanted: the key than that key, a
+    session than another of its key, and a vehicle than the others of its session on average. But not for whoever had
+    less than its own frames had of the detector's time, of which they have a fair share: else somebody who sends little
+    would keep those away who have many frames decided.
 
     Parameters
     ----------
@@ -161,6 +164,13 @@ class Pacing:
             self._had[of].add(seconds, now)
             self._had.move_to_end(of)
         self._forget(now)
+
+    def worked(self, party: Party, seconds: float) -> None:
+        """A frame of somebody had so much of the detector's time."""
+        now = self._clock()
+        for length in range(1, len(party) + 1):
+            if (had := self._had.get(party[:length])) is not None:
+                had.worked.add(seconds, now)
 
     def _forget(self, now: float) -> None:
         """Drop those who had nothing for long; they come first."""
@@ -208,16 +218,19 @@ class Pacing:
 
     def _had_much_more(self, party: Party, other: Party, now: float) -> bool:
         """Whether a party had more than `SLACK` times what a session had, both of them as far as they differ."""
-        same = 0
-        while same < len(party) and party[: same + 1] == other[: same + 1]:
-            same += 1
-        if same == len(party):
+        length = 1
+        while length <= len(party) and party[:length] == other[:length]:
+            length += 1
+        mine = self._had.get(party[:length])
+        if length > len(party) or mine is None:
             return False
-        theirs_s, mine_s = self._long(other[: same + 1], now), self._long(party[: same + 1], now)
-        if same == len(other):  # they are its own, and it is one of the session's vehicles
+        of_mine, of_theirs = mine.long.value(now), self._long(other[:length], now)
+        if of_mine <= mine.worked.value(now):
+            return False
+        if length > len(other):  # it is one of their vehicles
             others = self._members[other] - 1
-            theirs_s = (theirs_s - mine_s) / others if others else mine_s
-        return mine_s > SLACK * theirs_s
+            of_theirs = (of_theirs - of_mine) / others if others else of_mine
+        return of_mine > SLACK * of_theirs
 
     def _long(self, of: Party, now: float) -> float:
         return self._had[of].long.value(now) if of in self._had else 0.0

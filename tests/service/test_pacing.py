@@ -150,6 +150,15 @@ def test_whoever_has_frames_in_hand_and_sends_little_makes_nobody_wait_who_sends
     assert not over(pacing, "b_ego")
 
 
+@pytest.mark.parametrize("worked", [0.3, 0.4])
+def test_whoever_has_many_frames_decided_does_not_wait_for_those_of_who_sends_little(worked):
+    pacing, clock = paced(busy=True)
+    for _ in range(1000):
+        spend(pacing, clock, 0.002, a_ego_car=0.01, b_ego_car=0.35, b_ego_mate=0.001)
+        pacing.worked(("b", "ego", "car"), worked * 0.002)
+    assert pacing.is_over(("b", "ego", "car")) is (worked < 0.351)
+
+
 def test_one_that_is_alone_waits_for_nobody():
     pacing, clock = paced(busy=True)
     spend(pacing, clock, a_ego_car=0.95)
@@ -571,9 +580,10 @@ async def test_whatever_else_waits_goes_on_once_there_is_time_or_is_given_up():
     assert not wrong
 
 
-async def test_a_keys_own_frames_are_told_from_those_of_others(good_frame):
+async def test_a_keys_own_frames_are_told_from_those_of_others(good_frame, monkeypatch):
     async with serve(api_keys=f"{KEY},{OTHER_KEY}", api_key=KEY) as served:
-        gateway = served.gateway
+        gateway, worked = served.gateway, []
+        monkeypatch.setattr(gateway.frames.reading.pacing, "worked", lambda *told: worked.append(told))
         session = await served.open()
         assert (await served.post(session, "frames", good_frame(0))).status_code == 200
         parties = Parties(gateway.api_keys, gateway.viewer_tokens, gateway.store.seen, gateway.sessions.tokens.signed)
@@ -582,6 +592,9 @@ async def test_a_keys_own_frames_are_told_from_those_of_others(good_frame):
             headers = [(b"authorization", f"Bearer {credential}".encode())]
             return parties.of_loop({"client": ("10.0.0.1", 1), "headers": headers})
 
+        [(worker, seconds)] = worked
+        assert worker == party_of(session.ego_token)
+        assert 0 < seconds < 60
         shown = (KEY, session.ego_token, session.teammate_tokens["rsu"])
         assert len({party_of(one)[0] for one in shown}) == 1
         assert len({party_of(one) for one in shown}) == 3
