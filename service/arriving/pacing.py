@@ -11,7 +11,6 @@ from __future__ import annotations
 
 import asyncio
 import functools
-import itertools
 import math
 import time
 from collections import Counter, OrderedDict, deque
@@ -209,7 +208,7 @@ class Pacing:
         return max(self._members[()] - ((OTHERS,) in self._had), 1)
 
     def _is_greedy(self, party: Party, now: float) -> bool:
-        wanted = itertools.islice(self._wanted_by(), LOOKED_AT)
+        wanted = self._wanted_by()
         if party[0] == OTHERS:
             return any(True for _ in wanted)
         if self._long(party[:1], now) <= SLACK * LIMIT_GREEDY:

@@ -30,6 +30,15 @@ def due(left_s):
     return time.perf_counter() + left_s
 
 
+class Clock:
+    """Time that goes on as it does, and jumps."""
+
+    ahead_s = 0.0
+
+    def perf_counter(self):
+        return time.perf_counter() + self.ahead_s
+
+
 def taking(admission, key, session_id, left_s):
     """Take a frame on that has so much time left."""
     return admission.frame(key, session_id, due(left_s), left_s)
@@ -159,8 +168,9 @@ async def test_a_frame_is_wanted_from_its_head_on_while_it_comes_and_while_it_is
     path, messages, good_frame, monkeypatch
 ):
     """A body that takes long to come counts for a moment only."""
-    monkeypatch.setattr(admission_module, "COMING_S", 0.2)
-    wanted = {}
+    monkeypatch.setattr(admission_module, "COMING_S", 60.0)
+    clock, wanted = Clock(), {}
+    monkeypatch.setattr(admission_module, "time", clock)
     async with serve(api_keys=f"{KEY},{OTHER_KEY}", api_key=KEY) as served:
         session = await served.open(latency_budget_ms=10_000.0)
         live, admission = served.gateway.sessions.in_use(session.session_id), served.gateway.admission
@@ -171,13 +181,13 @@ async def test_a_frame_is_wanted_from_its_head_on_while_it_comes_and_while_it_is
 
         async def noting(*given):
             note("at its head")
-            await asyncio.sleep(0.15)
+            clock.ahead_s += 45.0
             return await authenticate(*given)
 
         async def slowly():
-            await asyncio.sleep(0.1)
+            clock.ahead_s += 30.0
             note("as it comes")
-            await asyncio.sleep(0.3)
+            clock.ahead_s += 90.0
             note("later")
             yield body
 
@@ -194,7 +204,7 @@ async def test_a_frame_is_wanted_from_its_head_on_while_it_comes_and_while_it_is
         else:
             body, token = wire.pack_message(0, "rsu", messages["rsu"]), session.teammate_tokens["rsu"]
         problem(await served.post(session, path, slowly(), token), 400, "malformed-msgpack")
-        await asyncio.sleep(0.25)
+        clock.ahead_s += 90.0
         note("at last")
     assert {when for when, keys in wanted.items() if set(keys) == {(live.key, session.session_id)}} == {
         "at its head",

@@ -159,6 +159,14 @@ def test_whoever_has_many_frames_decided_does_not_wait_for_those_of_who_sends_li
     assert pacing.is_over(("b", "ego", "car")) is (worked < 0.351)
 
 
+def test_whoever_has_frames_of_many_sessions_hides_no_other_among_them():
+    clock = Clock()
+    wanted = [*(("b", f"{number}") for number in range(200)), ("a", "ego")]
+    pacing = Pacing(lambda scope: STRANGER, lambda: wanted, clock)
+    spend(pacing, clock, 2.0, b_0=0.4, a_ego=0.01)
+    assert pacing.is_over(("b", "0"))
+
+
 def test_one_that_is_alone_waits_for_nobody():
     pacing, clock = paced(busy=True)
     spend(pacing, clock, a_ego_car=0.95)
