@@ -163,7 +163,7 @@ def test_whoever_has_frames_of_many_sessions_hides_no_other_among_them():
     clock = Clock()
     wanted = [*(("b", f"{number}") for number in range(200)), ("a", "ego")]
     pacing = Pacing(lambda scope: STRANGER, lambda: wanted, clock)
-    spend(pacing, clock, 2.0, b_0=0.4, a_ego=0.01)
+    spend(pacing, clock, a_ego=0.01, **{f"b_{number}": 0.4 / 200 for number in range(200)})
     assert pacing.is_over(("b", "0"))
 
 
