@@ -40,28 +40,38 @@ class Standby:
     ) -> None:
         self._events = events
         self._send = send
-        self._sent: OrderedDict[int, bytes] = OrderedDict()
+        self._sent: OrderedDict[int, tuple[bytes, int]] = OrderedDict()
+        self._known: tuple[int, frozenset[int]] | None = None
+        self.streams = 0
+        """How many were asked for: what a vehicle began to send before the latest may have gone elsewhere."""
         self.standing = asyncio.Event()
         """Set while the gateway knows that the vehicle stands by."""
         self.sent_again: list[int] = []
         """Frames."""
 
-    def sent(self, frame: int, body: bytes) -> None:
-        """A message was taken by the gateway."""
-        self._sent[frame] = body
+    async def sent(self, frame: int, body: bytes, streams: int) -> None:
+        """A message was taken by the gateway, which the vehicle began to send when so many ``streams`` were asked for.
+
+        If the stream ended meanwhile, nobody knows which process took it, and it is sent again.
+        """
+        self._sent[frame] = body, streams
         if len(self._sent) > KEPT_FRAMES:
             self._sent.popitem(last=False)
+        if self._known is not None and streams < self.streams:
+            await self._send_again({frame: body}, *self._known)
 
     async def run(self) -> None:
         """Stand by until the session is over, or the token is worth nothing any more."""
         pause_s = FIRST_PAUSE_S
         while True:
-            taken = dict(self._sent)  # what is sent from now on goes where the stream goes, or later
+            self.streams += 1  # what is sent from now on goes where the stream goes, or later
             stood = False
             try:
                 async for event, said in self._events():
                     if event == "standing":
-                        await self._send_again(taken, said)
+                        self._known = _known(said)
+                        before = {f: body for f, (body, streams) in self._sent.items() if streams < self.streams}
+                        await self._send_again(before, *self._known)
                         stood, pause_s = True, FIRST_PAUSE_S
                         self.standing.set()
                 if stood:
@@ -71,16 +81,13 @@ class Standby:
             except RequestRefused:
                 return
             finally:
+                self._known = None
                 self.standing.clear()
             await asyncio.sleep(pause_s)
             pause_s = min(2 * pause_s, LONGEST_PAUSE_S)
 
-    async def _send_again(self, taken: dict[int, bytes], said: dict[str, Any]) -> None:
-        try:
-            answered, waiting = int(said["answered"]), frozenset(said["waiting"])
-        except (TypeError, KeyError, ValueError) as error:
-            raise ProtocolError("not what a gateway says to whoever stands by") from error
-        for frame, body in sorted(taken.items()):
+    async def _send_again(self, bodies: dict[int, bytes], answered: int, waiting: frozenset[int]) -> None:
+        for frame, body in sorted(bodies.items()):
             if frame > answered and frame not in waiting:
                 try:
                     await self._send(body)
@@ -89,3 +96,10 @@ class Standby:
                 except GatewayError:  # the next stream tells what is still to be sent
                     return
                 self.sent_again.append(frame)
+
+
+def _known(said: dict[str, Any]) -> tuple[int, frozenset[int]]:
+    try:
+        return int(said["answered"]), frozenset(said["waiting"])
+    except (TypeError, KeyError, ValueError) as error:
+        raise ProtocolError("not what a gateway says to whoever stands by") from error

@@ -145,14 +145,16 @@ class VehicleClient:
 
     async def send_body(self, body: bytes) -> None:
         """As `send`, with a body that is packed already."""
+        standby = self._standby
+        streams = 0 if standby is None else standby.streams
         content = (await self._post("messages", body)).content
         try:
             accepted = _Accepted.model_validate(wire.unpack(content, trusted=True))
         except (wire.WireError, ValidationError) as error:
             raise ProtocolError(f"not a receipt: {error}") from error
-        if self._standby is not None and accepted.frame is not None:
-            self._standby.sent(accepted.frame, body)
         await self._keep(accepted.receipt)
+        if standby is not None and accepted.frame is not None:
+            await standby.sent(accepted.frame, body, streams)
 
     async def ask(self, frame: int, message: Message, truth: Truth | None = None) -> FrameAnswer:
         """As the ego: post the own message and get the frame's answer, once the teammates' messages are in.

@@ -11,6 +11,7 @@ import pytest
 from opentelemetry.sdk.trace import TracerProvider
 
 from clients.client import GatewayClient, OpenedSession, VehicleClient
+from clients.continuity import Traffic
 from robosac import wire
 from robosac.detectors import Detector, EmbeddedDetector, load
 from robosac.detectors.loading import warm_up
@@ -160,6 +161,14 @@ async def until(condition: Callable[[], Any], within_s: float = 20.0) -> None:
     while not condition():
         assert time.monotonic() < end
         await asyncio.sleep(0.001)
+
+
+async def answered_since(traffic: Traffic, frames: int) -> None:
+    """Wait until every session had so many frames answered since now."""
+    before, end = [len(session.acknowledged) for session in traffic.sessions], time.monotonic() + 90
+    while any(len(one.acknowledged) < was + frames for one, was in zip(traffic.sessions, before, strict=True)):
+        assert time.monotonic() < end, [phase.as_dict() for phase in traffic.phases]
+        await asyncio.sleep(0.05)
 
 
 def problem(response: httpx.Response, status: int, slug: str) -> dict[str, Any]:

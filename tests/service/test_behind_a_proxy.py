@@ -20,6 +20,7 @@ from clients.continuity import Traffic, affinity, prepare
 from clients.errors import GatewayUnreachable
 from clients.load_test import DEFENSE
 from clients.proxied import configured, program, proxied
+from tests.service.conftest import answered_since, until
 
 CONFIG = Path(__file__).parents[2] / "deploy" / "haproxy.cfg"
 KEY = "a-key-of-the-proxied-gateway"
@@ -68,6 +69,10 @@ def test_only_the_shipped_configuration_is_changed():
         configured("frontend gateway\n    bind :80\n", [1, 2], 3, None)
 
 
+async def proxy_said(folder, text):
+    await until(lambda: text in (folder / "haproxy.log").read_text(), within_s=60.0)
+
+
 async def test_sessions_go_on_while_one_process_is_restarted_and_the_other_killed(tmp_path, certificate, monkeypatch):
     async with proxied(CONFIG, tmp_path, f"sqlite:///{tmp_path}/robosac.db", KEY, 2, certificate) as gateways:
         with pytest.raises(httpx.ConnectError, match="certificate"):  # nobody vouches for it but the test
@@ -93,13 +98,17 @@ async def test_sessions_go_on_while_one_process_is_restarted_and_the_other_kille
             traffic = Traffic(gateways.client, prepare(2), rate_hz=3.0, budget_ms=20_000.0)
             await traffic.open(4, DEFENSE)
             traffic.begin("both")
-            await asyncio.sleep(1.0)
+            await answered_since(traffic, 2)
             traffic.begin("restart")
-            await gateways.restart(0, gently=True)
-            await asyncio.sleep(1.5)  # until the proxy has seen it twice
+            await gateways.end(0, gently=True)
+            await answered_since(traffic, 2)
+            await proxy_said(tmp_path, "Server sessions/p1 is DOWN")
+            await gateways.begin(0)
+            await proxy_said(tmp_path, "Server sessions/p1 is UP")
+            await answered_since(traffic, 1)
             traffic.begin("kill")
             await gateways.end(1, gently=False)
-            await asyncio.sleep(1.0)
+            await answered_since(traffic, 2)
             await traffic.stop()
             wrong, writers = await traffic.check()
     assert wrong == []

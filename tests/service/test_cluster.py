@@ -20,7 +20,7 @@ from clients.load_test import DEFENSE
 from clients.local_gateway import free_port
 from service.arriving.doors import Door
 from service.cluster import check_routed
-from tests.service.conftest import problem
+from tests.service.conftest import answered_since, problem
 from tests.service.store.conftest import postgres  # noqa: F401 (a fixture)
 
 START_S = 240.0
@@ -56,14 +56,6 @@ async def served(url, tmp_path):
     finally:
         process.send_signal(signal.SIGTERM)
         assert process.wait(60) == 0
-
-
-async def answered_since(traffic, frames):
-    """Wait until every session had so many frames answered since now."""
-    before, end = [len(session.acknowledged) for session in traffic.sessions], time.monotonic() + 90
-    while any(len(one.acknowledged) < was + frames for one, was in zip(traffic.sessions, before, strict=True)):
-        assert time.monotonic() < end, [phase.as_dict() for phase in traffic.phases]
-        await asyncio.sleep(0.05)
 
 
 @pytest.mark.skipif(find_spec("ray") is None, reason="Ray is not installed")

@@ -150,8 +150,35 @@ async def test_what_is_answered_or_waits_is_not_sent_again():
 
     standby = Standby(events, send)
     for frame in range(5):
-        standby.sent(frame, b"%d" % frame)
+        await standby.sent(frame, b"%d" % frame, 0)
     running = asyncio.create_task(standby.run())
     await until(lambda: standby.sent_again == [2, 4])
     running.cancel()
     assert posted == [b"2", b"4"]
+
+
+async def test_what_was_being_sent_when_the_stream_ended_is_sent_again():
+    posted, ended = [], asyncio.Event()
+
+    async def events():
+        yield "standing", {"answered": 3, "waiting": [], "gateway": "b"}
+        await ended.wait()
+        ended.clear()
+
+    async def send(body):
+        posted.append(body)
+
+    standby = Standby(events, send)
+    running = asyncio.create_task(standby.run())
+    await until(standby.standing.is_set)
+    in_hand = standby.streams
+    await standby.sent(4, b"4", in_hand)
+    assert posted == []
+    ended.set()
+    await until(lambda: standby.streams > in_hand and standby.standing.is_set())
+    assert posted == [b"4"]
+    await standby.sent(3, b"3", in_hand)  # which the first process took, and passes to nobody
+    await standby.sent(5, b"5", in_hand)
+    await standby.sent(6, b"6", standby.streams)
+    running.cancel()
+    assert (posted, standby.sent_again) == ([b"4", b"5"], [4, 5])
