@@ -1,8 +1,8 @@
 """What somebody with a valid key can do to an honest ego: ``robosac adversary``.
 
-For each attack a fresh gateway is started on loopback, with one API key for the honest ego and another for the
-attacker. The ego posts frames at a fixed rate, at first alone, and then beside the attack, which runs in a process of
-its own. Whether a frame was in time is told by the ego's own clock.
+For each attack a fresh gateway is started on loopback. The attacker has an API key of its own, or the honest ego's, or
+no more than the token of one of the ego's teammates. The ego posts frames at a fixed rate, at first alone, and then
+beside the attack, which runs in a process of its own. Whether a frame was in time is told by the ego's own clock.
 
 Attackers have machines of their own. So where there are several cores, and the system lets one choose, the gateway has
 all but the last, the ego and the attack share that one, and the ego goes first there.
@@ -22,6 +22,7 @@ from collections.abc import Sequence
 from concurrent.futures import ProcessPoolExecutor
 from contextvars import ContextVar
 from dataclasses import dataclass, field
+from enum import StrEnum
 from pathlib import Path
 from secrets import token_urlsafe
 from typing import Annotated, Any
@@ -36,12 +37,15 @@ from clients import trial
 from clients.client import LIMITS, GatewayClient, VehicleClient
 from clients.cores import Cores
 from clients.errors import GatewayError
-from clients.hostile import BROKEN, FAULTS, FAULTY, Attack, Target, run_attack, strange_frame
-from clients.load_test import WARM_UP_FRAMES, Bodies, new_ego, prepare
+from clients.hostile import BROKEN, FAULTS, FAULTY, OF_TEAMMATES, Attack, Target, run_attack, strange_frame
+from clients.load_test import DEFENSE, EGO, TEAM, WARM_UP_FRAMES, Bodies, prepare
 from clients.local_gateway import GatewayProcess
 
 REPORT = "adversary.json"
 ONLY_HELP = f"Attacks to play, such as --only '{Attack.IDLE}' --only '{Attack.LONG}'; by default all."
+BY_HELP = (
+    "Who attacks: somebody with a key of its own; with the ego's; or one of the ego's teammates, with its token alone."
+)
 HONEST_HZ = 5.0
 CLOCK_MS = 5.0
 """What the ego's clock sees more than the gateway's, on one machine: the way there and back."""
@@ -60,12 +64,23 @@ class _Noting(httpx.AsyncHTTPTransport):
         return await super().handle_async_request(request)
 
 
+class By(StrEnum):
+    """Who attacks."""
+
+    OTHER = "another-key"
+    SAME = "same-key"
+    """Another session of the ego's own API key."""
+    TEAMMATE = "teammate"
+    """In the ego's own session."""
+
+
 @dataclass(frozen=True)
 class Plan:
-    """How long each part takes, and the honest ego's budget."""
+    """How long each part takes, the honest ego's budget, and who attacks."""
 
     seconds: float
     budget_ms: float
+    by: By
 
 
 @dataclass
@@ -161,22 +176,25 @@ async def play(
 ) -> Result:
     """One attack on a gateway of its own."""
     honest_key, key, viewer = (token_urlsafe(32) for _ in range(3))
+    key = honest_key if plan.by is By.SAME else key
     with tempfile.TemporaryDirectory(prefix="robosac-") as name:
         folder = Path(name)
         url, settings = f"sqlite:///{folder}/robosac.db", {"ROBOSAC_VIEWER_TOKENS": viewer}
         with cores.of_gateways():
-            process = GatewayProcess(folder / "gateway.log", url, f"{honest_key},{key}", settings=settings)
+            process = GatewayProcess(folder / "gateway.log", url, ",".join({honest_key, key}), settings=settings)
         try:
             await process.ready()
             noting = _Noting(limits=LIMITS)
             async with GatewayClient(process.url, honest_key, transport=noting) as gateway:
-                ego = await new_ego(gateway, plan.budget_ms)
+                opened = await gateway.open_session(EGO, TEAM, defense=DEFENSE, latency_budget_ms=plan.budget_ms)
+                ego = gateway.vehicle(opened.session_id, EGO, opened.ego_token)
+                mate = (TEAM[0], opened.teammate_tokens[TEAM[0]]) if plan.by is By.TEAMMATE else None
                 for frame in range(WARM_UP_FRAMES):
                     await ego.post_frame_body(bodies.numbered(frame))
                 before, during = Seen(plan.budget_ms), Seen(plan.budget_ms)
                 frame = await _drive(ego, bodies, WARM_UP_FRAMES, before, plan.seconds, process)
                 database, honest = str(folder / "robosac.db"), bodies.numbered(0)
-                target = Target(process.url, key, database, process.pid, strange, honest, ego.session_id, viewer)
+                target = Target(process.url, key, database, process.pid, strange, honest, ego.session_id, viewer, mate)
                 loop = asyncio.get_running_loop()
                 attacking = loop.run_in_executor(pool, run_attack, attack, target, plan.seconds)
                 ends = time.perf_counter() + FAULTY * plan.seconds
@@ -208,7 +226,7 @@ async def play_all(attacks: Sequence[Attack], plan: Plan, bodies: Bodies, consol
 
 def show(console: Console, results: Sequence[Result], plan: Plan) -> None:
     """Print what came of it."""
-    title = f"One honest ego at {HONEST_HZ:g} Hz, budget {plan.budget_ms:g} ms, by its own clock"
+    title = f"One honest ego at {HONEST_HZ:g} Hz, budget {plan.budget_ms:g} ms, by its own clock; attacks by: {plan.by}"
     columns = ["tested: before", "during", "belied", "refused", "broken", "cores: before", "during", "MiB"]
     columns.append("recovered after")
     table = trial.a_table(title, ["attack", *columns])
@@ -239,6 +257,7 @@ def main(
     at_least: Annotated[
         float, typer.Option(min=0.0, max=1.0, help="Share of frames to be tested in time during an attack.")
     ] = 0.95,
+    by: Annotated[By, typer.Option(help=BY_HELP)] = By.OTHER,
 ) -> None:
     """Attack gateways of one's own with a valid key, and measure what an honest ego beside notices.
 
@@ -247,10 +266,13 @@ def main(
     """
     torch.set_num_threads(1)
     console = Console()
+    attacks = only or [attack for attack in Attack if by is not By.TEAMMATE or attack in OF_TEAMMATES]
+    if by is By.TEAMMATE and (others := set(attacks) - OF_TEAMMATES):
+        raise typer.BadParameter(f"no teammate's attack: {', '.join(sorted(others))}", param_hint="'--only'")
     trial.make_folder(out, "--out", REPORT, force)
-    plan = Plan(seconds, budget_ms)
+    plan = Plan(seconds, budget_ms, by)
     bodies = prepare(True, 3, console)
-    results = trial.run(play_all(only or list(Attack), plan, bodies, console), console, "The adversary")
+    results = trial.run(play_all(attacks, plan, bodies, console), console, "The adversary")
     show(console, results, plan)
     trial.write([_as_dict(result) for result in results], out, REPORT, console)
     enough = [r.during.share(r.during.tested) >= at_least for r in results if r.attack not in FAULTS]

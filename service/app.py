@@ -26,7 +26,8 @@ from service.arriving.frames import Frames  # noqa: E402
 from service.arriving.giving_way import GivesWay, Line  # noqa: E402
 from service.arriving.hanging_up import HangingUp  # noqa: E402
 from service.arriving.limits import BodyLimit, Unfinished  # noqa: E402
-from service.arriving.pacing import Metered, Pacing  # noqa: E402
+from service.arriving.metering import Metered  # noqa: E402
+from service.arriving.pacing import Pacing  # noqa: E402
 from service.arriving.parties import Parties  # noqa: E402
 from service.arriving.reading import Reading  # noqa: E402
 from service.deciding.admission import KEY_FRAMES, Admission  # noqa: E402

@@ -17,7 +17,7 @@ import httpx
 from clients.hostile import connections, faults, forging, requests, sessions, stolen
 from clients.hostile.attacker import BROKEN, STRANGERS, Attacker, Target, strange_frame
 
-__all__ = ["BROKEN", "FAULTS", "FAULTY", "STRANGERS", "Attack", "Target", "run_attack", "strange_frame"]
+__all__ = ["BROKEN", "FAULTS", "FAULTY", "OF_TEAMMATES", "STRANGERS", "Attack", "Target", "run_attack", "strange_frame"]
 
 FAULTY = 0.5
 """Part of the time for which a fault lasts; the rest shows how the gateway recovers."""
@@ -51,7 +51,9 @@ class Attack(StrEnum):
     TEAM = "joining and leaving"
     """Teammates join, with keys of their own, and leave."""
     TOKENS = "tokens in a loop"
-    """An ego asks for one token after the other."""
+    """A teammate asks for one token after the other."""
+    STREAMS = "streams in a loop"
+    """A teammate stands by on one stream after the other."""
     AUDIT = "audit in a loop"
     """A log is read, again and again."""
     METRICS = "metrics in a loop"
@@ -102,6 +104,7 @@ _PLAYED: dict[Attack, Callable[[Attacker], Awaitable[object]]] = {
     Attack.OPENINGS: requests.large_openings,
     Attack.TEAM: requests.joining,
     Attack.TOKENS: requests.tokens,
+    Attack.STREAMS: connections.streams,
     Attack.AUDIT: requests.audit,
     Attack.METRICS: requests.metrics,
     Attack.PAGES: requests.pages,
@@ -117,6 +120,8 @@ _PLAYED: dict[Attack, Callable[[Attacker], Awaitable[object]]] = {
     Attack.STOLEN: stolen.tokens,
     Attack.FORGED: forging.logs,
 }
+OF_TEAMMATES = frozenset({Attack.SMALL, Attack.TOKENS, Attack.STREAMS, Attack.CHUNKS, Attack.DRIPPING, Attack.LISTS})
+"""Attacks for which nothing is needed but a teammate's token."""
 FAULTS: Mapping[Attack, Callable[[Target], AbstractContextManager[None]]] = {
     Attack.DATABASE: faults.locked_database,
     Attack.DISK: faults.full_disk,

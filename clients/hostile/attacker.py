@@ -41,6 +41,8 @@ class Target:
     """Of the honest ego."""
     viewer_token: str = ""
     """Lets one watch it."""
+    teammate: tuple[str, str] | None = None
+    """Who of the honest session's teammates attacks, if one does, and its token."""
 
 
 def strange_frame(body: bytes) -> bytes:
@@ -96,6 +98,13 @@ class Attacker:
         response.raise_for_status()
         opened: dict[str, Any] = response.json()
         return opened
+
+    async def as_teammate(self) -> tuple[str, str, str]:
+        """A session, who the attacker is in it, and its token: in the honest one, or in a new one of its own."""
+        if self.target.teammate is not None:
+            return self.target.session_id, *self.target.teammate
+        session = await self.open(["mate"])
+        return session["session_id"], "mate", session["teammate_tokens"]["mate"]
 
     async def ask(self, method: str, path: str, credential: str | None = None, **options: Any) -> httpx.Response:
         """One request."""

@@ -72,10 +72,9 @@ async def headers(attacker: Attacker) -> None:
 
 async def chunks(attacker: Attacker) -> None:
     """Send a body in chunks of a byte, to where a message may be as large."""
-    session = await attacker.open(["mate"])
-    path = f"/v1/sessions/{session['session_id']}/messages"
+    session_id, _, token = await attacker.as_teammate()
     fields = (
-        f"POST {path} HTTP/1.1\r\nHost: localhost\r\nAuthorization: Bearer {session['teammate_tokens']['mate']}\r\n"
+        f"POST /v1/sessions/{session_id}/messages HTTP/1.1\r\nHost: localhost\r\nAuthorization: Bearer {token}\r\n"
         f"Content-Type: {MSGPACK}\r\nTransfer-Encoding: chunked\r\n\r\n"
     )
     request = fields.encode() + b"1\r\n\xc1\r\n" * CHUNKED_BYTES + b"0\r\n\r\n"
@@ -84,9 +83,9 @@ async def chunks(attacker: Attacker) -> None:
 
 async def dripping(attacker: Attacker) -> None:
     """Send bodies as many small writes, to where a message may be as large."""
-    session = await attacker.open(["mate"])
-    url, path = attacker.target.url, f"/v1/sessions/{session['session_id']}/messages"
-    head = post_head(url, path, CHUNKED_BYTES, session["teammate_tokens"]["mate"], Connection="close")
+    session_id, _, token = await attacker.as_teammate()
+    url, path = attacker.target.url, f"/v1/sessions/{session_id}/messages"
+    head = post_head(url, path, CHUNKED_BYTES, token, Connection="close")
 
     async def one() -> None:
         async with connected(url) as (reader, writer):
@@ -101,6 +100,20 @@ async def dripping(attacker: Attacker) -> None:
                 answer.cancel()
                 await asyncio.gather(answer, return_exceptions=True)
             attacker.answers[str(status)] += 1
+
+    await attacker.again_and_again(CONNECTIONS, one)
+
+
+async def streams(attacker: Attacker) -> None:
+    """Stand by on one stream after the other: each ends the one before."""
+    session_id, _, token = await attacker.as_teammate()
+    head = f"GET /v1/sessions/{session_id}/standby HTTP/1.1\r\nHost: localhost\r\nAuthorization: Bearer {token}\r\n\r\n"
+
+    async def one() -> None:
+        async with connected(attacker.target.url) as (reader, writer):
+            writer.write(head.encode())
+            line = await reader.readline()
+            attacker.answers[line.split(b" ")[1].decode() if line else "hung up"] += 1
 
     await attacker.again_and_again(CONNECTIONS, one)
 

@@ -17,13 +17,12 @@ LARGE_BYTES = 250_000
 
 async def small_messages(attacker: Attacker) -> None:
     """Messages that are none."""
-    session = await attacker.open(["mate"])
-    token = session["teammate_tokens"]["mate"]
+    session_id, _, token = await attacker.as_teammate()
     bodies = [b"\xc1", b"\x80", b"{}", b"\x83" * 64]
 
     async def one() -> None:
         for body in bodies:
-            await attacker.post(session["session_id"], "messages", token, body)
+            await attacker.post(session_id, "messages", token, body)
 
     await attacker.again_and_again(AT_A_TIME, one)
 
@@ -81,15 +80,15 @@ async def joining(attacker: Attacker) -> None:
 
 async def tokens(attacker: Attacker) -> None:
     """One token after the other."""
-    sessions = [await attacker.open(["mate"]) for _ in range(FEW)]
+    mates = [await attacker.as_teammate() for _ in range(FEW)]
 
     async def one() -> None:
-        session = sessions.pop()
+        session_id, name, token = mates.pop()
         try:
-            answer = await attacker.ask("POST", f"/v1/sessions/{session['session_id']}/token", session["ego_token"])
-            session["ego_token"] = answer.json().get("token", session["ego_token"])
+            answer = await attacker.ask("POST", f"/v1/sessions/{session_id}/token", token)
+            token = answer.json().get("token", token)
         finally:
-            sessions.append(session)
+            mates.append((session_id, name, token))
 
     await attacker.again_and_again(FEW, one)
 

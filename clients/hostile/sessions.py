@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import asyncio
+import itertools
 
 import msgpack
 import numpy as np
@@ -65,18 +66,18 @@ async def stale(attacker: Attacker) -> None:
 
 async def long_accepts(attacker: Attacker) -> None:
     """Send good messages, with a header that is a list of thousands."""
-    opened = [(await attacker.open(["mate"]), [FAR_AHEAD]) for _ in range(FEW)]
+    opened = [await attacker.as_teammate() for _ in range(FEW)]
+    frames = itertools.count(FAR_AHEAD, -1)  # earlier ones take the place of later ones
     message, packing = _nothing(attacker), wire.Packing("int8", compress=True)
 
     async def one() -> None:
-        session, number = opened.pop()
+        session_id, name, token = mate = opened.pop()
         try:
-            headers = {"Accept": LONG_ACCEPT, "Content-Type": MSGPACK} | bearer(session["teammate_tokens"]["mate"])
-            body = wire.pack_message(number[0], "mate", message, packing=packing)
-            await attacker.ask("POST", f"/v1/sessions/{session['session_id']}/messages", content=body, headers=headers)
-            number[0] -= 1  # earlier ones take the place of later ones
+            headers = {"Accept": LONG_ACCEPT, "Content-Type": MSGPACK} | bearer(token)
+            body = wire.pack_message(next(frames), name, message, packing=packing)
+            await attacker.ask("POST", f"/v1/sessions/{session_id}/messages", content=body, headers=headers)
         finally:
-            opened.append((session, number))
+            opened.append(mate)
 
     await attacker.again_and_again(FEW, one)
 

@@ -17,7 +17,7 @@ from pydantic import BaseModel, ValidationError
 
 from robosac.wire.bodies import named_once
 from service.arriving.limits import read_bounded
-from service.arriving.pacing import METER
+from service.arriving.metering import METER
 from service.errors import Kind, Refused
 
 JSON = "application/json"
@@ -70,7 +70,7 @@ async def read_json(request: Request, model: type[Model], context: Any = None) -
         return await asyncio.to_thread(_timed, took_s, body, model, context)
     finally:  # hardly anything goes on meanwhile
         if (meter := request.scope.get("state", {}).get(METER)) is not None:
-            meter(sum(took_s))
+            meter.elsewhere(sum(took_s))
 
 
 def described(model: type[BaseModel]) -> dict[str, Any]:

@@ -6,7 +6,6 @@ Nothing that takes long to import may be imported here: a server needs this befo
 
 from __future__ import annotations
 
-import functools
 import re
 import time
 from asyncio import TimerHandle, Transport
@@ -15,7 +14,8 @@ from collections.abc import Sequence
 from uvicorn.protocols.http.httptools_impl import HttpToolsProtocol, RequestResponseCycle
 
 from service.arriving.arrival import note_first_byte
-from service.arriving.pacing import KEY, METER, OTHERS, Pacing, Party
+from service.arriving.metering import METER, Meter
+from service.arriving.pacing import KEY, OTHERS, Pacing, Party
 from service.arriving.waiting import waited_s, waits
 
 HEAD_BYTES = 64 * 1024
@@ -27,10 +27,6 @@ PIECES, PIECE_BYTES = 128, 64
 """From so many pieces on, those of a body have so many bytes on average."""
 AROUND_BYTES = 64 * 1024
 """What may come between the pieces of a body, as their lengths do: so much, or as much as the body has."""
-
-
-MADE_S, BYTE_S = 3e-4, 1e-9
-"""Of the event loop's time what is not measured: to make and end a connection, to take a byte from its socket."""
 
 
 _CREDENTIAL = re.compile(rb"\r\nAuthorization:[ \t]*((?:Bearer|DPoP) [^\r\n]{1,4096})\r\n", re.IGNORECASE)
@@ -77,7 +73,7 @@ class BoundedHTTP(HttpToolsProtocol):
         self._pacing = self.app_state.get(KEY)
         if self._pacing is not None:
             self.party = self._pacing.party_of({"client": self.client, "headers": []})
-            self._pacing.charge(self.party, MADE_S)
+            self._pacing.had_since(self.party)
 
     def data_received(self, data: bytes) -> None:
         pacing = self._pacing
@@ -91,6 +87,7 @@ class BoundedHTTP(HttpToolsProtocol):
             self._unset_keepalive_if_required()
             self._kept, self._kept_since = data, time.perf_counter()
             self.transport.pause_reading()
+            pacing.had_since(self.party)
         else:
             self.transport.abort()
 
@@ -120,11 +117,10 @@ class BoundedHTTP(HttpToolsProtocol):
         self.party = pacing.party_of({"client": self.client, "headers": headers})
 
     def _take_metered(self, data: bytes, pacing: Pacing) -> None:
-        began = time.thread_time()
         self._take(data)
         if self._in_head or self.cycle is not None:
             self._waited_s = 0.0  # what comes next did not wait
-        pacing.charge(self.party, time.thread_time() - began + BYTE_S * len(data))
+        pacing.had_since(self.party)
 
     def _take(self, data: bytes) -> None:
         begins_in_head = self._in_head or self.cycle is None  # and not with the end of a body
@@ -164,7 +160,7 @@ class BoundedHTTP(HttpToolsProtocol):
         super().on_headers_complete()
         self._unanswered = [cycle for cycle in (*self._unanswered, self.cycle) if not cycle.response_complete]
         if self._pacing is not None:
-            self.scope["state"][METER] = functools.partial(self._pacing.charge, self.party)
+            self.scope["state"][METER] = Meter(self._pacing, self.party)
         if len(self.pipeline) > PIPELINED:
             self._refuse("429 Too Many Requests", f"At most {PIPELINED} requests may wait on a connection.")
 
@@ -201,6 +197,8 @@ class BoundedHTTP(HttpToolsProtocol):
         self._forget_unread()
         self._give_up()
         super().connection_lost(exc)
+        if self._pacing is not None:
+            self._pacing.had_since(self.party)
 
     def pause_writing(self) -> None:
         super().pause_writing()

@@ -1,8 +1,8 @@
 """The event loop's time, shared by those who send: whoever took more than the others lately is read from later.
 
-What comes costs time before anybody can say what it is worth: connections, heads, pieces of bodies, refusals. So the
-time is measured that the loop spends on each connection and on its requests, and once the loop is short of time,
-nothing more is read from those who had most. What was read of them last is kept, and the rest waits in the kernel.
+What comes costs time before anybody can say what it is worth: connections, heads, pieces of bodies, refusals. So it
+is measured what the loop does for each connection and its requests, and once the loop is short of time, nothing more is
+read from those who had most. What was read of them last is kept, and the rest waits in the kernel.
 
 Nothing that takes long to import may be imported here: a server needs this before the application.
 """
@@ -10,19 +10,16 @@ Nothing that takes long to import may be imported here: a server needs this befo
 from __future__ import annotations
 
 import asyncio
-import functools
 import math
 import time
 from collections import Counter, OrderedDict, deque
-from collections.abc import Awaitable, Callable, Generator, Iterable
-from typing import Any, Protocol
+from collections.abc import Callable, Iterable
+from typing import Protocol
 
-from starlette.types import ASGIApp, Receive, Scope, Send
+from starlette.types import Scope
 
 KEY = "robosac_pacing"
 """In the state that the lifespan shares with servers."""
-METER = "robosac_meter"
-"""In a request's state: takes the time that its answer cost."""
 OTHERS = "others"
 """The first part of the party of whoever shows no credential that counts."""
 Party = tuple[str, ...]
@@ -150,6 +147,16 @@ class Pacing:
         self._waiting: dict[str, OrderedDict[Party, deque[tuple[Paced, int]]]] = {}
         self._kept = 0
         self._look: asyncio.TimerHandle | None = None
+        self._told_at_s = math.inf
+        """Of the loop's thread, how much time it had had when it was last told who had it."""
+
+    def had_since(self, party: Party) -> None:
+        """Somebody had the loop's time since this was last called: nobody tells of what the loop does between what is
+        somebody's, and most of that is to receive, and to send, for whoever comes next.
+        """
+        now_s = time.thread_time()
+        since_s, self._told_at_s = now_s - self._told_at_s, now_s
+        self.charge(party, max(since_s, 0.0))
 
     def charge(self, party: Party, seconds: float) -> None:
         """Somebody had so much of the loop's time."""
@@ -297,54 +304,3 @@ class Pacing:
         """What a party had of its part; who had least of it goes first."""
         had = self._had[(first,)].now.value(self._clock()) if (first,) in self._had else 0.0
         return had / (OF_OTHERS if first == OTHERS else 1 / self._keys())
-
-
-class Metered:
-    """Middleware that has the loop's time measured that a request's answer takes, where its server wants to know.
-
-    Parameters
-    ----------
-    app : ASGI app
-    pacing : Pacing
-        What such a server is lent.
-    """
-
-    def __init__(self, app: ASGIApp, pacing: Pacing) -> None:
-        self._app = app
-        self._pacing = pacing
-
-    async def __call__(self, scope: Scope, receive: Receive, send: Send) -> None:
-        if scope["type"] == "lifespan" and "state" in scope:
-            scope["state"][KEY] = self._pacing
-        meter = scope["state"].get(METER) if scope["type"] == "http" and "state" in scope else None
-        answer = self._app(scope, receive, send)
-        await (answer if meter is None else _Steps(answer, meter))
-
-
-class _Steps:
-    """Awaits something, and tells of each of its steps how long the thread had it."""
-
-    def __init__(self, awaited: Awaitable[None], took: Callable[[float], None]) -> None:
-        self._awaited = awaited
-        self._took = took
-
-    def __await__(self) -> Generator[Any, Any, None]:
-        steps = self._awaited.__await__()
-        step: Callable[[], Any] = steps.__next__
-        while True:
-            began = time.thread_time()
-            try:
-                waits_for = step()
-            except StopIteration:
-                return
-            finally:
-                self._took(time.thread_time() - began)
-            try:
-                yield waits_for
-            except GeneratorExit:
-                steps.close()
-                raise
-            except BaseException as error:
-                step = functools.partial(steps.throw, error)
-            else:
-                step = steps.__next__

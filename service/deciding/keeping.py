@@ -5,6 +5,7 @@ from __future__ import annotations
 import asyncio
 import contextlib
 import time
+from collections.abc import Mapping
 from dataclasses import dataclass, field
 
 from robosac import wire
@@ -19,7 +20,6 @@ from service.errors import GivenUp, StoreTooSlow, StoreUnavailable
 from service.keeping.patience import GRACE_S, Patience, ask_for_the_exception
 from service.keeping.record import SessionRecord
 from service.keeping.store import Store
-from service.sessions.live import Refusals
 from service.sessions.sessions import Sessions
 
 
@@ -78,8 +78,8 @@ class _Write:
     asked: Asked
     present: Present
     result: FusionResult
-    counted: Refusals
-    """Refusals since the decision before."""
+    unlogged: Mapping[str, int]
+    """Refusals without a record since the decision before."""
     late: tuple[int, ...]
     """Frames before it that were answered too late, though their records say otherwise."""
     is_too_late: bool = False
@@ -115,7 +115,7 @@ class _Write:
     def undo(self) -> None:
         """It is not kept: the session is as it was before the frame."""
         live = self.asked.caller.live
-        live.refusals.add(self.counted)
+        live.unlogged.update(self.unlogged)
         live.late[:0] = self.late
         live.gathering.reopen(self.asked.frame)
 
@@ -131,7 +131,7 @@ class _Write:
             out_of_time=self.result.out_of_time,
             fault=self.result.fault,
             state=dict(self.result.state),
-            unlogged_refusals=dict(self.counted.unlogged),
+            unlogged_refusals=dict(self.unlogged),
             late=self.late,
             next_seed_commitment=commitment(next_seed),
             gateway=self.keeping.sessions.moving.name,
@@ -140,7 +140,7 @@ class _Write:
     def _remember(self) -> None:
         """What the next frame is judged by."""
         asked, live = self.asked, self.asked.caller.live
-        live.equivocations.clear()
+        live.allow_more_records()
         live.team_changes, live.unsure = 0, None
         live.session.remember(self.result)
         live.answered, live.ego_proof = asked.frame, asked.ego.proof

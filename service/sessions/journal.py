@@ -49,8 +49,8 @@ class Journal:
     async def equivocation(self, caller: Caller, frame: int, first: Proof, second: Received) -> None:
         """A vehicle said two different things about one frame."""
         session_id, vehicle_id = caller.record.session_id, caller.vehicle_id
-        caller.live.equivocations[vehicle_id] += 1
-        proven = caller.live.equivocations[vehicle_id] <= EQUIVOCATIONS_LOGGED  # however much was refused before
+        proven = caller.live.equivocations[vehicle_id] < EQUIVOCATIONS_LOGGED  # however much was refused before
+        caller.live.equivocations[vehicle_id] += proven
         if self._counted(caller.live, vehicle_id, Reason.REPLAYED, proven=proven):
             logger.warning("equivocation", session_id=session_id, vehicle_id=vehicle_id, frame=frame)
             event = Equivocation(vehicle_id=vehicle_id, frame=frame, first=first, second=second.proof)
@@ -70,8 +70,8 @@ class Journal:
         self.metrics.refused(reason.value)
         if proven:
             return True
-        is_logged = live.refusals.logged[who] < REFUSALS_LOGGED
-        (live.refusals.logged if is_logged else live.refusals.unlogged)[who] += 1
+        is_logged = live.refusals[who] < REFUSALS_LOGGED
+        (live.refusals if is_logged else live.unlogged)[who] += 1
         return is_logged
 
     async def _append(
@@ -80,8 +80,8 @@ class Journal:
         try:
             await self.store.log(session_id, event, *checks)
         except (AuditFull, ShareFull):
-            live.refusals.unlogged[who] += 1
+            live.unlogged[who] += 1
         except TokenReplaced:
-            live.refusals.unlogged[STRANGERS] += 1
+            live.unlogged[STRANGERS] += 1
         except SessionOver:
             pass

@@ -22,9 +22,11 @@ from service.sessions.unread import Unread
 RENEWALS = 16
 """Tokens that a vehicle may take in a while, see `service.sessions.teams`."""
 REFUSALS_LOGGED = 16
-"""Refused messages of one vehicle between two frames that get a record each; the others are counted."""
+"""Refused messages of one vehicle that get a record each, and one more with each frame; the others are counted. Every
+record is a transaction, and the ego's decisions are kept on the same thread.
+"""
 EQUIVOCATIONS_LOGGED = 4
-"""Equivocations of one vehicle between two frames that get a record each whatever else of it was refused."""
+"""Likewise of its equivocations, whatever else of it was refused."""
 QUIET_S = 30.0
 """After so long without a request it is looked whether what waits is of any use."""
 STRANGERS = "?"
@@ -36,19 +38,6 @@ class Standing:
     """A vehicle that stands by, until its stream is over."""
 
     over: asyncio.Event = field(default_factory=asyncio.Event)
-
-
-@dataclass
-class Refusals:
-    """How many there were since the last decision, by vehicle: with a record of their own, and without one."""
-
-    logged: Counter[str] = field(default_factory=Counter)
-    unlogged: Counter[str] = field(default_factory=Counter)
-
-    def add(self, more: Refusals) -> None:
-        """Count others with these."""
-        self.logged += more.logged
-        self.unlogged += more.unlogged
 
 
 @dataclass
@@ -79,7 +68,10 @@ class LiveSession:
     ego_proof: Proof | None = None
     lock: asyncio.Lock = field(default_factory=asyncio.Lock)
     last_used: float = field(default_factory=time.monotonic)
-    refusals: Refusals = field(default_factory=Refusals)
+    unlogged: Counter[str] = field(default_factory=Counter)
+    """Refusals without a record of their own since the last decision, by vehicle."""
+    refusals: Counter[str] = field(default_factory=Counter)
+    """Those with one, less one for each frame since."""
     late: list[int] = field(default_factory=list)
     """Frames whose records say that they were in time, and whose answers were late: the next record tells."""
     unsure: tuple[int, str] | None = None
@@ -87,6 +79,7 @@ class LiveSession:
     kept it all the same.
     """
     equivocations: Counter[str] = field(default_factory=Counter)
+    """As ``refusals``."""
     renewals: defaultdict[str, deque[float]] = field(
         default_factory=lambda: defaultdict(partial(deque, maxlen=RENEWALS))
     )
@@ -152,14 +145,20 @@ class LiveSession:
 
     def count_on(self, before: LiveSession) -> None:
         """Count what there was before since the last decision."""
-        self.refusals, self.late, self.equivocations = before.refusals, before.late, before.equivocations
+        self.unlogged, self.refusals, self.equivocations = before.unlogged, before.refusals, before.equivocations
+        self.late = before.late
         self.renewals, self.team_changes, self.unsure = before.renewals, before.team_changes, before.unsure
         self.unrecorded = before.unrecorded
 
-    def count_anew(self) -> Refusals:
-        """Refusals since the last decision; all counts begin again, unless they are given back."""
-        counted, self.refusals = self.refusals, Refusals()
+    def count_anew(self) -> Counter[str]:
+        """``unlogged``, which begins again, unless it is given back."""
+        counted, self.unlogged = self.unlogged, Counter()
         return counted
+
+    def allow_more_records(self) -> None:
+        """A frame was answered: every vehicle may get one more."""
+        self.refusals -= Counter(list(self.refusals))
+        self.equivocations -= Counter(list(self.equivocations))
 
 
 @dataclass(frozen=True)

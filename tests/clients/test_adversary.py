@@ -9,8 +9,10 @@ from collections import Counter
 import httpx
 import msgpack
 import pytest
+import typer
+from typer.testing import CliRunner
 
-from clients.adversary import RECOVERED_WITHIN, Result, Seen
+from clients.adversary import RECOVERED_WITHIN, Result, Seen, main
 from clients.hostile import BROKEN, STRANGERS, Attack, Target, forging, stolen, strange_frame
 from clients.hostile.attacker import Attacker
 from clients.hostile.forging import FORGERIES, NAMED
@@ -44,6 +46,38 @@ def test_attacks_are_played_and_told(tmp_path):
         assert result["before"]["belied"] == result["during"]["belied"] == 0
         assert result["broken"] == []
         assert 50 < result["memory_mib"] < 4000
+
+
+def test_a_teammate_attacks_from_within_the_session(tmp_path):
+    command = [sys.executable, "-m", "clients.adversary", "--seconds", "2", "--budget-ms", "1000", "--at-least", "0.8"]
+    only = ["--only", Attack.STREAMS.value, "--only", Attack.TOKENS.value]
+    command += [*only, "--by", "teammate", "--out", str(tmp_path)]
+    done = subprocess.run(command, check=False, capture_output=True, text=True)
+    assert done.returncode == 0, done.stdout + done.stderr
+    assert "attacks by: teammate" in " ".join(done.stdout.split())
+    streams, tokens = json.loads((tmp_path / "adversary.json").read_text())
+    assert streams["attacker"]["200"] > 10
+    assert set(tokens["attacker"]) == {"201", "401", "429"}  # renewed, spoken with a replaced one, renewed too often
+
+
+def test_a_teammate_cannot_do_what_needs_a_key():
+    options = ["--by", "teammate", "--only", Attack.MANY.value, "--only", Attack.SMALL.value]
+    app = typer.Typer()
+    app.command()(main)
+    refused = CliRunner().invoke(app, options)
+    assert refused.exit_code == 2
+    assert "no teammate's attack: many sessions" in " ".join(refused.output.split())
+
+
+async def test_whoever_has_a_key_is_a_teammate_in_a_session_of_its_own():
+    def answer(request):
+        assert json.loads(request.content)["teammates"] == ["mate"]
+        return httpx.Response(201, json={"session_id": "own", "teammate_tokens": {"mate": "token"}})
+
+    for teammate, expected in ((("rsu", "its token"), ("5e55", "rsu", "its token")), (None, ("own", "mate", "token"))):
+        target = Target("http://gateway", "key", "", 0, b"", b"", "5e55", teammate=teammate)
+        async with httpx.AsyncClient(base_url=target.url, transport=httpx.MockTransport(answer)) as http:
+            assert await Attacker(http, target, Counter()).as_teammate() == expected
 
 
 @pytest.mark.parametrize(

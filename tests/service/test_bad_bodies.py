@@ -1,11 +1,14 @@
+from collections import Counter
+
 import msgpack
 import numpy as np
 import pytest
 
+from clients.errors import FrameConflict
 from robosac import wire
 from robosac.audit import verify
 from robosac.detectors import Message
-from tests.service.conftest import problem, serve
+from tests.service.conftest import EGO, problem, serve
 
 
 def altered(body, path, value):
@@ -294,6 +297,29 @@ async def test_a_flood_of_refused_messages_is_counted_not_recorded(served, messa
     records = await served.ego(session).audit()
     assert sum(record["event"] == "message_refused" for record in records) == 16
     assert records[-1]["unlogged_refusals"] == {"car-2": 24}
+
+
+async def test_whoever_is_refused_on_and_on_gets_one_record_a_frame(served, messages, benign, good_frame):
+    """Each record is a transaction, which the session's own decisions wait for."""
+    session = await served.open(gather_ms=20)
+    told = []
+    for frame in range(4):
+        before = len(await served.ego(session).audit())
+        for _ in range(20):
+            await served.post(session, "messages", b"junk", session.teammate_tokens["car-2"])
+        await served.teammate(session, "car-3").send(frame, messages["car-3"])
+        for _ in range(20):
+            with pytest.raises(FrameConflict, match="equivocation"):
+                await served.teammate(session, "car-3").send(frame, messages["car-4"])
+        await served.ego(session).ask(frame, messages[EGO])
+        records = (await served.ego(session).audit())[before:]
+        events = Counter(f"{record['event']} {record['vehicle_id']}" for record in records[:-1])
+        told.append((events, records[-1]["unlogged_refusals"]))
+    refused, proven = "message_refused car-2", "equivocation car-3"
+    assert told == [
+        ({refused: 16, proven: 20}, {"car-2": 4}),
+        *[({refused: 1, proven: 2}, {"car-2": 19, "car-3": 18})] * 3,
+    ]
 
 
 async def test_a_client_that_goes_away_in_mid_body_is_no_error_of_the_gateway(caplog):

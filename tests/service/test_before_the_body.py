@@ -4,6 +4,7 @@ import asyncio
 import json
 import sys
 import threading
+from types import SimpleNamespace
 
 import pytest
 from cryptography.hazmat.primitives.asymmetric.ed25519 import Ed25519PrivateKey
@@ -14,9 +15,10 @@ from starlette.responses import StreamingResponse
 
 from robosac.signatures import show_public_key
 from service.app import create_app
-from service.arriving import bodies, pacing
+from service.arriving import bodies
 from service.arriving.doors import HEADER_BYTES, HEADERS, TARGET_BYTES
 from service.arriving.limits import UNREAD_BYTES, BodyLimit, Unfinished
+from service.arriving.metering import METER
 from service.schemas import SessionRequest
 from service.settings import Settings
 from tests.service.conftest import problem, serve
@@ -207,7 +209,7 @@ async def test_what_is_read_on_a_thread_counts_as_its_senders():
         return {"type": "http.request", "body": json.dumps({"text": ["x"] * 2000}).encode()}
 
     took = []
-    state = {pacing.METER: took.append}
+    state = {METER: SimpleNamespace(elsewhere=took.append)}
     request = Request({"type": "http", "headers": [(b"content-type", b"application/json")], "state": state}, receive)
     with pytest.raises(RequestValidationError):
         await bodies.read_json(request, Noting)

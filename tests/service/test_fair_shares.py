@@ -149,24 +149,16 @@ async def test_the_teammates_of_one_session_do_not_take_the_room_of_all(messages
 async def test_the_sessions_of_one_key_do_not_take_the_room_of_another_key(messages):
     settings = {"max_pending_bytes": 2**22, "max_pending_bytes_per_key": 2**21, "max_pending_frames": 30}
     async with serve(api_keys="a" * 20 + "," + "b" * 20, **settings) as served:
-
-        async def opened(key):
-            body = {"ego_id": EGO, "teammates": TEAM}
-            headers = {"Authorization": f"Bearer {key * 20}"}
-            return SessionCreated.model_validate(
-                (await served.http.post("/v1/sessions", json=body, headers=headers)).json()
-            )
-
         refused = None
         for _ in range(12):
-            greedy = served.teammate(await opened("a"), "rsu")
+            greedy = served.teammate(await open_one(served, "a", TEAM), "rsu")
             for frame in range(2):
                 try:
                     await greedy.send(frame, messages["rsu"])
                 except Exception as error:
                     refused = error
         assert "ROBOSAC_MAX_PENDING_BYTES_PER_KEY" in str(refused)
-        modest = await opened("b")
+        modest = await open_one(served, "b", TEAM, latency_budget_ms=20_000)
         for name in TEAM:
             await served.teammate(modest, name).send(0, messages[name])
         assert set((await served.ego(modest).ask(0, messages[EGO])).accepted) == set(TEAM)
@@ -245,7 +237,7 @@ async def test_openings_of_one_key_do_not_keep_another_from_opening():
 async def test_waiting_messages_of_one_teammate_leave_room_to_the_others_of_its_session(messages):
     settings = {"max_pending_bytes": 2**22, "max_pending_bytes_per_key": 2**21, "max_pending_frames": 30}
     async with serve(api_keys="a" * 20 + "," + "b" * 20, **settings) as served:
-        session = await open_one(served, "a", TEAM)
+        session = await open_one(served, "a", TEAM, latency_budget_ms=20_000)
 
         async def send_ahead():
             for frame in range(31):

@@ -6,6 +6,7 @@ import itertools
 import logging
 import socket
 import time
+from types import SimpleNamespace
 
 import pytest
 import uvicorn
@@ -13,6 +14,7 @@ import uvloop
 
 from service.arriving.arrival import Arrival, arrival_of
 from service.arriving.connections import _CREDENTIAL, PIPELINED, BoundedHTTP
+from service.arriving.metering import METER, Metered
 from service.arriving.pacing import (
     LATELY_S,
     LIMIT,
@@ -22,7 +24,6 @@ from service.arriving.pacing import (
     OF_OTHERS,
     OTHERS,
     SLACK,
-    Metered,
     Pacing,
 )
 from service.arriving.parties import Parties
@@ -479,6 +480,28 @@ async def test_the_loops_time_is_measured_and_no_other(port, pacing):
     assert pacing.charged["idle"] < 0.02
 
 
+def test_what_the_loop_does_between_is_put_down_to_whoever_comes_next():
+    pacing = Told()
+    burn(0.02)  # before anybody was there
+    for who in ("greedy", "modest", "greedy"):
+        pacing.had_since(("key", who))
+        burn(0.02)
+    assert pacing.charged["modest"] == pytest.approx(0.02, abs=0.01)
+    assert pacing.charged["greedy"] == pytest.approx(0.02, abs=0.01)
+
+
+async def test_connections_are_put_down_to_whose_they_are(port, pacing):
+    async with connected(port) as (reader, writer):
+        writer.write(request("modest"))
+        await answer(reader)
+        before = pacing.charged["modest"]
+        del pacing.charged["nobody"]
+    async with asyncio.timeout(10.0):
+        while pacing.charged["modest"] == before:
+            await asyncio.sleep(0.001)
+    assert "nobody" not in pacing.charged
+
+
 @pytest.mark.parametrize("refused", [False, True])
 async def test_each_request_of_a_connection_is_put_down_to_its_own_sender(port, pacing, refused):
     """A proxy sends for many. An answer may come before the body does."""
@@ -558,7 +581,7 @@ async def test_faults_and_cancelling_pass_through():
         await asyncio.sleep(0)
         raise KeyError("fault")
 
-    scope = {"type": "http", "state": {"robosac_meter": seen.append}}
+    scope = {"type": "http", "state": {METER: SimpleNamespace(step=lambda: seen.append("step"))}}
     task = asyncio.create_task(Metered(failing, None)(scope, None, None))
     await asyncio.sleep(0.01)
     task.cancel()

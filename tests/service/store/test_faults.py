@@ -52,8 +52,10 @@ class Ego:
     @classmethod
     async def of(cls, served, good_frame):
         ego = cls(served, await served.open(latency_budget_ms=BUDGET_MS, gather_ms=0), good_frame)
-        for _ in range(3):
-            assert await ego.post()
+        in_a_row = 0
+        while in_a_row < 3:
+            in_a_row = in_a_row + 1 if await ego.post() else 0
+            assert ego.driven.next_frame < 60
         return ego
 
     async def post(self):
