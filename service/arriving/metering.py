@@ -1,4 +1,7 @@
-"""Whose the event loop's time was: whoever's request, or connection, it had just done something for."""
+"""Whose the event loop's time was: whoever's request, or connection, it had just done something for.
+
+Nothing that takes long to import may be imported here: a server needs this before the application.
+"""
 
 from __future__ import annotations
 
