@@ -299,7 +299,7 @@ async def test_a_flood_of_refused_messages_is_counted_not_recorded(served, messa
     assert records[-1]["unlogged_refusals"] == {"car-2": 24}
 
 
-async def test_whoever_is_refused_on_and_on_gets_one_record_a_frame(served, messages, benign, good_frame):
+async def test_whoever_is_refused_on_and_on_gets_one_record_a_frame(served, messages):
     """Each record is a transaction, which the session's own decisions wait for."""
     session = await served.open(gather_ms=20)
     told = []
